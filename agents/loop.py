@@ -15,7 +15,7 @@ from ncs_gym import Channel
 from ncs_gym.registration import from_json
 from ncs_gym.validation import shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
-from shields.runtime.lost_guarantee import LostGuarantee
+from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import DEFAULT_HORIZON, MODES
 
 

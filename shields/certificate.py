@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,16 +15,12 @@ from ncs_gym import ChannelContract, Ellipsoid
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, as_setting, read_only, shown
 from shields.certificate_text import (
     METHODS,
-    assumptions_of,
-    claim_text,
     contract_text,
     counted,
-    interruption_of,
     missing_polytope_of,
-    numbers_text,
+    provenance_rows,
     size_of,
     table,
-    tolerance_of,
 )
 from shields.errors import CertificateError
 from shields.json_documents import content_of, document_of, read_content, write_document
@@ -202,21 +198,16 @@ class Certificate(ReadOnlyArrays):
         """Raises ValueError unless exactly the fields of the certificate's method are given."""
         if self.method not in ("certified", "paper"):
             raise ValueError(f"its method must be 'certified' or 'paper', got {shown(self.method)}")
-        other = "paper" if self.method == "certified" else "certified"
-        given = {name for names in _FIELDS.values() for name in names if getattr(self, name) is not None}
-        given -= set() if self.proofs else {"proofs"}
-        wrong = [name for name in _FIELDS[self.method] if name not in given]
-        wrong += [name for name in _FIELDS[other] if name in given]
         if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
-        if wrong:
+        given = {name for names in _FIELDS.values() for name in names if getattr(self, name) is not None}
+        given -= set() if self.proofs else {"proofs"}
+        if wrong := [name for names in _FIELDS.values() for name in names if name in given ^ {*_FIELDS[self.method]}]:
             raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
-        if self.updates is not None and self.method == "paper":
-            raise ValueError("one of method 'paper' has no channel contract")
-        if self.between_samples is not None and (self.method == "paper" or type(self.between_samples) is not int):
-            raise ValueError("its between_samples must be a whole number, and one of method 'paper' has none")
-        if self.polytope is not None and (self.method == "paper" or not isinstance(self.polytope, Polytope)):
-            raise ValueError("its polytope must be a Polytope, and one of method 'paper' has none")
+        for name, kind in (("updates", Updates), ("polytope", Polytope), ("between_samples", int)):
+            value = getattr(self, name)
+            if value is not None and (self.method == "paper" or type(value) is not kind):
+                raise ValueError(f"its {name} must be of type {kind.__name__}, and one of method 'paper' has none")
 
     def _check_error_sets(self, n: int) -> None:
         """Raises ValueError unless there is a proof for every age, and all error sets have n dimensions."""
@@ -322,29 +313,28 @@ class Certificate(ReadOnlyArrays):
         return hash(self.checksum)
 
     def __str__(self) -> str:
-        (m, n), recorded = self.K.shape, self.provenance
+        (m, n), recorded, points = self.K.shape, self.provenance, self.between_samples
+        claim = f"at all times ({points} of each step, and a bound on what is between them)"
+        if points is None:
+            claim = "at the sampling instants; nothing is claimed of the times between them"
+        safe_set = ""
+        if self.polytope is not None:
+            safe_set = f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; inside it the ellipsoid "
+        widths = ", ".join(f"{width:.4g}" for width in np.sqrt(np.diag(self.L)))
         rows = [
             ("method", METHODS[self.method]),
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
-            ("safe set", self._safe_set_text()),
-            ("claim", claim_text(self.between_samples)),
+            ("safe set", f"{safe_set}x'Mx <= 1, that reaches |x_i| <= {widths}"),
+            ("claim", f"in the safe box {claim}"),
             ("size", size_of(recorded)),
             ("polytope", missing_polytope_of(recorded) if self.proofs and self.polytope is None else ""),
             ("fallback", "u = K x_hat"),
             ("contract", contract_text(self.method, self.contract)),
-            ("tolerance", tolerance_of(recorded)),
-            ("assumes", assumptions_of(recorded)),
-            ("interrupted", interruption_of(recorded)),
+            *provenance_rows(recorded),
         ]
         return table(
             "Certificate of a robust control invariant set; shields.verify(certificate, plant) checks it", rows
         )
-
-    def _safe_set_text(self) -> str:
-        ellipsoid = f"x'Mx <= 1, that reaches |x_i| <= {numbers_text(np.sqrt(np.diag(self.L)))}"
-        if self.polytope is None:
-            return ellipsoid
-        return f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; inside it the ellipsoid {ellipsoid}"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.
@@ -363,13 +353,21 @@ class Certificate(ReadOnlyArrays):
         """
         if isinstance(given, cls):
             return given
-        if not isinstance(given, Mapping):
-            return cls.load(given)  # pyright: ignore[reportArgumentType]
+        is_document = isinstance(given, Mapping)
         try:
-            text = json.dumps(given)
+            if is_document:
+                content = content_of(json.dumps(given), "document", "certificate", _FORMAT)
+            else:
+                content = read_content(given, "certificate", _FORMAT)  # pyright: ignore[reportArgumentType]
         except (TypeError, ValueError, RecursionError) as error:
-            raise CertificateError("what is given is no document of a certificate") from error
-        return cls._in(lambda: content_of(text, "document", "certificate", _FORMAT), "the document")
+            raise CertificateError(str(error)) from error
+        try:
+            return cls(**_fields_of(content))
+        except CertificateError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            name = "the document" if is_document else given
+            raise CertificateError(f"{name} is not a certificate: an entry is missing or of a wrong kind") from error
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Certificate:
@@ -378,21 +376,7 @@ class Certificate(ReadOnlyArrays):
         Raises:
             CertificateError: If the file is missing, not a certificate, truncated or altered.
         """
-        return cls._in(lambda: read_content(path, "certificate", _FORMAT), str(path))
-
-    @classmethod
-    def _in(cls, read: Callable[[], Any], name: str) -> Certificate:
-        """Returns the certificate in a content that is read; `name` is what messages call it."""
-        try:
-            content = read()
-        except ValueError as error:
-            raise CertificateError(str(error)) from error
-        try:
-            return cls(**_fields_of(content))
-        except CertificateError:
-            raise
-        except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"{name} is not a certificate: an entry is missing or of a wrong kind") from error
+        return cls.read(path)
 
 
 def _content_of(certificate: Certificate) -> dict[str, Any]:
@@ -401,6 +385,15 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
     Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
     """
     c, last = certificate, certificate.multipliers
+    ages = None
+    if (updates := c.updates) is not None:
+        sets = {
+            "shapes": [*c.error_shapes.tolist(), updates.last.tolist()],
+            "rates": [proof.rate for proof in c.proofs],
+            **{name: getattr(updates, name).tolist() for name in ("gains", "shares", "noise")},
+        }
+        by_age = {name: [getattr(proof, name).tolist() for proof in c.proofs] for name in ("shares", "inputs")}
+        ages = {"contract": asdict(updates.contract), "sets": sets, **by_age}
     optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
     optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
     return optional | {
@@ -409,7 +402,7 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         "Sigma": None if c.Sigma is None else c.Sigma.tolist(),
         "D": None if c.D is None else c.D.tolist(),
         "multipliers": None if last is None else asdict(last),
-        "ages": None if c.updates is None else _content_by_age(c.proofs, c.updates),
+        "ages": ages,
         "method": c.method,
         "fingerprint": c.fingerprint,
         "kappa": c.kappa,
@@ -417,21 +410,6 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         "epsilon": c.epsilon,
         "epsilon_up": c.epsilon_up,
         "provenance": c.provenance,
-    }
-
-
-def _content_by_age(proofs: tuple[Proof, ...], updates: Updates) -> dict[str, Any]:
-    return {
-        "contract": asdict(updates.contract),
-        "sets": {
-            "shapes": [*(proof.Sigma.tolist() for proof in proofs), updates.last.tolist()],
-            "rates": [proof.rate for proof in proofs],
-            "gains": updates.gains.tolist(),
-            "shares": updates.shares.tolist(),
-            "noise": updates.noise.tolist(),
-        },
-        "shares": [proof.shares.tolist() for proof in proofs],
-        "inputs": [proof.inputs.tolist() for proof in proofs],
     }
 
 
@@ -454,20 +432,17 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     if content.get("polytope") is not None:
         fields["polytope"] = polytope_of(content["polytope"])
     own = Sigma, stated.error, [stated.state, stated.estimate, stated.disturbance], stated.inputs
-    if ages is None:
-        return fields | {"proofs": _proofs([own])}
-    sets = ages["sets"]
-    *shapes, last = sets["shapes"]
-    rows = list(zip(shapes, sets["rates"], ages["shares"], ages["inputs"], strict=True))
-    if list(own) != list(rows[-1]):
-        raise ValueError("what is repeated of the largest age differs")
-    contract = ChannelContract(**ages["contract"])
-    updates = Updates(contract=contract, last=last, gains=sets["gains"], shares=sets["shares"], noise=sets["noise"])
-    return fields | {"proofs": _proofs(rows), "updates": updates}
-
-
-def _proofs(rows: list[tuple[Any, Any, Any, Any]]) -> tuple[Proof, ...]:
-    return tuple(Proof(Sigma=Sigma, rate=rate, shares=shares, inputs=inputs) for Sigma, rate, shares, inputs in rows)
+    rows: list[tuple[Any, Any, Any, Any]] = [own]
+    if ages is not None:
+        sets = ages["sets"]
+        *shapes, last = sets["shapes"]
+        rows = list(zip(shapes, sets["rates"], ages["shares"], ages["inputs"], strict=True))
+        if list(own) != list(rows[-1]):
+            raise ValueError("what is repeated of the largest age differs")
+        by_age = {name: sets[name] for name in ("gains", "shares", "noise")}
+        fields["updates"] = Updates(contract=ChannelContract(**ages["contract"]), last=last, **by_age)
+    fields["proofs"] = tuple(Proof(Sigma=Sigma, rate=rate, shares=shares, inputs=u) for Sigma, rate, shares, u in rows)
+    return fields
 
 
 def _as_array(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:

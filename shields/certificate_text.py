@@ -5,8 +5,6 @@ from __future__ import annotations
 import textwrap
 from typing import Any
 
-import numpy as np
-
 from ncs_gym import ChannelContract
 from ncs_gym.validation import printable
 
@@ -54,13 +52,6 @@ def table(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def claim_text(between_samples: int | None) -> str:
-    """Returns when the state is claimed to be in the safe box."""
-    if between_samples is None:
-        return "in the safe box at the sampling instants; nothing is claimed of the times between them"
-    return f"in the safe box at all times ({between_samples} of each step, and a bound on what is between them)"
-
-
 def contract_text(method: str, contract: ChannelContract | None, input_delay: int = 0) -> str:
     """Returns what the channel has to promise.
 
@@ -80,35 +71,20 @@ def contract_text(method: str, contract: ChannelContract | None, input_delay: in
     return f"the newest sample is never older than {age}{of}; samples are {rounding}"
 
 
-def tolerance_of(recorded: dict[str, Any]) -> str:
-    """Returns the largest tolerated disturbance, if it is recorded."""
-    return _text(
-        recorded.get("tolerated_scale"),
-        "some set exists for disturbances and estimation errors up to {:.2f} times those assumed",
-    )
-
-
-def assumptions_of(recorded: dict[str, Any]) -> str:
-    """Returns the plant's assumptions, if they are recorded."""
-    given = recorded.get("assumptions")
-    return " ".join(each for each in given if isinstance(each, str)) if isinstance(given, list) else ""
+def provenance_rows(recorded: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns what the provenance of a certificate says of how it was made, named, and empty where it says nothing."""
+    scale = "some set exists for disturbances and estimation errors up to {:.2f} times those assumed"
+    given, stage = recorded.get("assumptions"), recorded.get("interrupted_at")
+    assumed = " ".join(each for each in given if isinstance(each, str)) if isinstance(given, list) else ""
+    stopped = f"the synthesis was stopped at {stage}: other sets may be larger" if isinstance(stage, str) else ""
+    tolerance = _text(recorded.get("tolerated_scale"), scale)
+    return [("tolerance", tolerance), ("assumes", assumed), ("interrupted", stopped)]
 
 
 def missing_polytope_of(recorded: dict[str, Any]) -> str:
     """Returns why there is no polytope."""
     reason = recorded.get("no_polytope")
     return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else "none was sought"
-
-
-def interruption_of(recorded: dict[str, Any]) -> str:
-    """Returns where the synthesis was interrupted, if it was."""
-    stage = recorded.get("interrupted_at")
-    return f"the synthesis was stopped at {stage}: other sets may be larger" if isinstance(stage, str) else ""
-
-
-def numbers_text(values: np.ndarray) -> str:
-    """Returns numbers as people read them."""
-    return ", ".join(f"{value:.4g}" for value in values)
 
 
 def counted(number: int, noun: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.linalg import null_space
 from torch import nn
 
 from ncs_gym import LinearPlant
@@ -153,7 +154,10 @@ def projection_jacobians(
             test, room = rows_of.test, rows_of.room[:, e] - rows_of.rounding[e] - shield.projection_margin
             center = np.abs(test.moved @ estimates[e] + test.effect @ u)
             active = np.vstack([active, test.effect[center >= room - ATTAINED * np.maximum(room, 1e-3)]])
-        found[e] = _jacobian(_null_space(active, limits), ball, wanted[:, e] - u)
+        free = np.eye(len(limits))
+        if len(active):
+            free = null_space(active / np.linalg.norm(active, axis=1, keepdims=True), rcond=1e-9)
+        found[e] = _jacobian(free, ball, wanted[:, e] - u)
     return found * limits / limits[:, None]  # d(u / limits) / d(w / limits)
 
 
@@ -169,14 +173,6 @@ def _jacobian(free: np.ndarray, ball: tuple[np.ndarray, np.ndarray] | None, move
     inverse = np.linalg.inv(np.eye(free.shape[1]) + multiplier * effect.T @ effect)
     along = inverse @ normal
     return free @ (inverse - np.outer(along, along) / float(normal @ along)) @ free.T
-
-
-def _null_space(active: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Returns orthonormal columns of the inputs that active rows, shape (k, m), leave free, shape (m, m - rank)."""
-    if not len(active):
-        return np.eye(len(limits))
-    sizes, rows = np.linalg.svd(active / np.linalg.norm(active, axis=1, keepdims=True))[1:]
-    return rows[np.count_nonzero(sizes > 1e-9) :].T
 
 
 def _numbers(value: Any, name: str) -> np.ndarray:

@@ -363,7 +363,7 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
         rho = 1.0 / example.kappa
     bounds = PaperBounds(example.kappa, rho, epsilon_up, example.epsilon, _misread_alpha(example))
     problem = OptimizationProblem(plant)
-    found = problem.solution(bounds, with_margin=with_misread_margin, with_error=with_misread_margin)
+    found = problem.solution(bounds, with_error=with_misread_margin)
     if found is None:
         raise ArithmeticError(f"the solver found no optimum of OP at u_max = {u_max:g}")
     return found.L, found.K

@@ -76,7 +76,6 @@ class _PlantNode:
             self._leave()
 
     def _join(self, message: Message, time: float) -> None:
-        """Begins to belong to an episode, at the step of the message."""
         self.episode, self._challenge = message.episode, _drawn()
         self.clock.join(message.episode, time, message.stamp - PRELUDE)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from ncs_gym import LinearPlant
 from ncs_gym.validation import as_number
-from shields.paper.bounds import SMALLEST_GAP, PaperBounds, PaperModel
+from shields.paper.bounds import SMALLEST_GAP, PaperModel
 from shields.paper.optimization_problem import OPSolution, OptimizationProblem
 
 # Relative tightening of every constraint, so that what the solver returns meets the printed ones in exact arithmetic.
@@ -58,23 +58,16 @@ def search_grid(
     """
     if search not in ("first", "largest"):
         raise ValueError(f"search must be 'first' or 'largest', got {search!r}")
-    problem = OptimizationProblem(plant)
-    found = (problem.solution(bounds, slack=_SLACK) for bounds in _feasible_points(plant, problem, dkappa, drho))
-    solutions = (solution for solution in found if solution is not None)
+    problem, model = OptimizationProblem(plant), PaperModel(plant)
+
+    def solution_at(kappa: float, rho: float) -> OPSolution | None:
+        bounds = model.at(kappa, rho)
+        is_feasible = problem.largest_eigenvalue(bounds) >= bounds.alpha * (1.0 + _REQUIRED_SLACK)
+        return problem.solution(bounds, slack=_SLACK) if is_feasible else None
+
+    solutions = filter(None, (solution_at(*point) for point in kappa_rho_grid(dkappa, drho)))
     if search == "largest":
         solutions = sorted(solutions, key=lambda solution: solution.log_det, reverse=True)
-    for solution in solutions:
-        if accept(solution):
-            return solution
-    raise LookupError("OP has no solution on the grid")
-
-
-def _feasible_points(
-    plant: LinearPlant, problem: OptimizationProblem, dkappa: float, drho: float
-) -> Iterator[PaperBounds]:
-    """Yields the constants of OP at the grid points where it is feasible with some slack in (C2)."""
-    model = PaperModel(plant)
-    for kappa, rho in kappa_rho_grid(dkappa, drho):
-        bounds = model.at(kappa, rho)
-        if problem.largest_eigenvalue(bounds) >= bounds.alpha * (1.0 + _REQUIRED_SLACK):
-            yield bounds
+    if (accepted := next(filter(accept, solutions), None)) is None:
+        raise LookupError("OP has no solution on the grid")
+    return accepted

@@ -153,7 +153,6 @@ class PaperModel:
 
 
 def _largest(covariance: np.ndarray) -> float:
-    """Returns the largest eigenvalue of a covariance."""
     return max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0)
 
 
@@ -163,12 +162,10 @@ def _uplink(p0: float, q_bar: float, quantile: float, g2: float, rest: float) ->
 
 
 def _state(norm: float, g2: float, epsilon_up: float) -> float:
-    """Returns the bound of Theorem 3 for the norm |A|_2."""
     return (g2**0.5 + norm) ** 2 * epsilon_up
 
 
 def _alpha(gamma: float, epsilon: float, kappa: float) -> float:
-    """Returns alpha of Definition 4."""
     if kappa == 1.0:
         return 0.0
     # 1 - sqrt(kappa) = (1 - kappa) / (1 + sqrt(kappa)) keeps its digits near kappa = 1.

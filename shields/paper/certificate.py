@@ -113,7 +113,6 @@ def _diagnosis(plant: LinearPlant) -> Infeasible:
 
 
 def _tolerated(gamma: float, noise: float) -> str:
-    """Returns in sentences which gamma, and which scale of Q, make OP feasible while everything else stays."""
     by_gamma = f"enough to lower gamma to {gamma:.3g}" if gamma > 0.0 else "not enough to lower gamma, even to 0"
     by_noise = f"enough to scale Q by {noise:.3g}" if noise > 0.0 else "not enough to lower Q, even to 0"
     return f"With Q unchanged it is {by_gamma}; with gamma unchanged it is {by_noise}"

@@ -19,11 +19,15 @@ _ROUNDING = Fraction(1, 10**12)
 
 
 def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Yields (C1)-(C7) for a certificate of method "paper" whose shapes fit the plant.
+    """Yields (C1)-(C7) for a certificate of method "paper".
 
     U and tau are eliminated: (C4)-(C6) can be met for input i exactly if
     u_max^2 / 2 - K_i L K_i' - |K_i L|^2 eps_up / alpha^2 >= 0.
     """
+    fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
+    yield flag("shapes: L (n, n), K (m, n)", fits)
+    if not fits:
+        return
     if unknown := unknown_bounds(plant):
         yield flag(f"bounds: the paper's theorems do not know {' and '.join(unknown)}", False)
         return
@@ -67,5 +71,5 @@ def _smallest_eigenvalue(L: np.ndarray) -> Fraction:
 
 def _blocks(top: Matrix, corner: Matrix, bottom: Matrix) -> Matrix:
     """Returns the matrix [top, corner'; corner, bottom]."""
-    upper = [left + right for left, right in zip(top, transpose(corner), strict=True)]
-    return upper + [left + right for left, right in zip(corner, bottom, strict=True)]
+    rows = zip([*top, *corner], [*transpose(corner), *bottom], strict=True)
+    return [left + right for left, right in rows]

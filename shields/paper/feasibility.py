@@ -74,26 +74,21 @@ class FeasibilityScan:
         Raises:
             LookupError: If no gain contracts any ellipsoid at any point: (C1) alone has no solution.
         """
-        return self._ranked(plant, model)[0]
+        return self._ranked(model or PaperModel(plant))[0]
 
     def full_ratio(self, plant: LinearPlant, model: PaperModel | None = None) -> float:
-        """Returns the largest lambda_min(L)/alpha on all of OP over the most promising points; at least 1: feasible.
-
-        Args:
-            plant: The plant whose uncertainty counts.
-            model: Constants of OP; those of the plant by default.
-        """
+        """Returns the largest lambda_min(L)/alpha on all of OP over the most promising points; at least 1: feasible."""
         model, best = model or PaperModel(plant), 0.0
-        for point in self._ranked(plant, model)[:_CONFIRMED_POINTS]:
+        for point in self._ranked(model)[:_CONFIRMED_POINTS]:
             bounds = model.at(point.kappa, point.rho)
             best = max(best, self._problem.largest_eigenvalue(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
             if best >= 1.0:
                 break
         return best
 
-    def _ranked(self, plant: LinearPlant, model: PaperModel | None = None) -> list[Feasibility]:
+    def _ranked(self, model: PaperModel) -> list[Feasibility]:
         """Returns all points of the scan in order of falling ratio."""
-        points, model = [], model or PaperModel(plant)
+        points = []
         for kappa, rho, eigenvalue in self._points:
             alpha = model.at(kappa, rho).alpha
             ratio = eigenvalue / alpha if alpha > 0.0 else np.inf
@@ -106,7 +101,7 @@ class FeasibilityScan:
         """Returns the largest t in [0, high] with OP feasible for plant_at(t), confirmed on all of OP; 0.0 if none is.
 
         Args:
-            plant_at: Returns the plant whose uncertainty grows with t.
+            plant_at: Returns the plant, whose uncertainty grows with t.
             high: A value of t for which OP is infeasible.
         """
         low = 0.0
@@ -154,16 +149,8 @@ def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:
 
 def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
     """Returns the largest common factor on gamma, Q and P0 for which OP is feasible; 0.0 if there is none."""
-
-    def scaled(factor: float) -> LinearPlant:
-        return replace(
-            plant,
-            gamma=factor * plant.gamma,
-            process_noise_cov=factor * plant.process_noise_cov,
-            initial_cov=factor * plant.initial_cov,
-        )
-
-    return scan.largest(scaled, 1.0)
+    names = ("gamma", "process_noise_cov", "initial_cov")
+    return scan.largest(lambda factor: replace(plant, **{name: factor * getattr(plant, name) for name in names}), 1.0)
 
 
 def largest_noise_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:

@@ -99,23 +99,20 @@ class OptimizationProblem:
         Returns:
             The eigenvalue [square of the states' unit]; minus infinity if none exceeds the solver's inaccuracy.
         """
-        self._set(bounds, slack=0.0, with_margin=False, with_error=with_error)
+        self._set(bounds, slack=0.0, with_error=with_error)
         _, largest, _ = self._at(bounds.rho)
         eigenvalue = float(value_of(self._beta)) if _solved(largest, {cp.OPTIMAL}) else -np.inf
         return self._size**2 * eigenvalue if eigenvalue > _SMALLEST_EIGENVALUE else -np.inf
 
-    def solution(
-        self, bounds: PaperBounds, *, slack: float = 0.0, with_margin: bool = True, with_error: bool = True
-    ) -> OPSolution | None:
+    def solution(self, bounds: PaperBounds, *, slack: float = 0.0, with_error: bool = True) -> OPSolution | None:
         """Returns the solution of OP at one (kappa, rho); None if the solver finds none.
 
         Args:
             bounds: kappa, rho and the constants of OP at them.
             slack: Relative tightening of the constraints.
-            with_margin: False drops (C2).
-            with_error: False drops the communication error from the input limit, as in `largest_eigenvalue`.
+            with_error: False drops (C2), and the communication error from the input limit as in `largest_eigenvalue`.
         """
-        self._set(bounds, slack=slack, with_margin=with_margin, with_error=with_error)
+        self._set(bounds, slack=slack, with_error=with_error)
         L, _, problem = self._at(bounds.rho)
         if not _solved(problem, {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}, **_ACCURATE) or L.value is None:
             return None
@@ -130,12 +127,12 @@ class OptimizationProblem:
         """Returns the programs for a rho; (C7) with rho = 1 says L = beta I, which leaves no interior to a matrix L."""
         return self._of_balls if rho == 1.0 else self._general
 
-    def _set(self, bounds: PaperBounds, *, slack: float, with_margin: bool, with_error: bool) -> None:
+    def _set(self, bounds: PaperBounds, *, slack: float, with_error: bool) -> None:
         less, more = 1.0 - slack, 1.0 + slack
         has_error = with_error and bounds.epsilon_up > 0.0
         self._kappa.value, self._share.value = less * bounds.kappa, less
         self._rho.value = less / more * bounds.rho
-        self._alpha.value = more * bounds.alpha / self._size**2 if with_margin else 0.0
+        self._alpha.value = more * bounds.alpha / self._size**2 if with_error else 0.0
         self._error.value = (bounds.epsilon_up / less) ** 0.5 * self._size / bounds.alpha if has_error else 0.0
 
 

@@ -1,7 +1,9 @@
-"""Follows, step by step, whether the proof of safety holds; for one control loop or for many at once."""
+"""Follows, step by step, whether the proof of safety holds, for one control loop or for many; says where it is lost."""
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -9,6 +11,8 @@ import numpy as np
 
 from ncs_gym.network import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH, inputs_under_way
+from ncs_gym.validation import shown
+from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
 from shields.runtime.one_step import FARTHEST, PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
@@ -34,6 +38,7 @@ EXPLANATIONS = (
     LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
+ON_UNPROVED = ("ignore", "warn", "raise")
 
 
 class MonitorState(NamedTuple):
@@ -116,8 +121,7 @@ class GuaranteeMonitor:
         """Returns the state at the start of an episode.
 
         Args:
-            known_inside: Whether every possible start lies in S (`starts_inside`), or in the box with a certified plan
-                stored.
+            known_inside: Whether every possible start lies in S, or in the box with a certified plan stored.
             unmoved: Whether the environment has not moved since.
             report: What is observed.
         """
@@ -127,10 +131,7 @@ class GuaranteeMonitor:
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
 
-        Args:
-            state: What `start` returned.
-            earlier: Of x_0 .. x_{c-1}, whether it is known to be in S, or in the box in mode "lookahead", and what is
-                observed of it.
+        That is of x_0 .. x_{c-1} whether it is known to be in S (`known_inside`), and what is observed of it.
         """
         broken, wait = state.broken, state.wait
         for ahead, (inside, report) in enumerate(earlier):
@@ -171,9 +172,7 @@ class GuaranteeMonitor:
     def reasons(self, state: MonitorState, age: Any = 0) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does.
 
-        Args:
-            state: What is known.
-            age: Steps since the newest sample used was taken, which tells a broken contract from other large errors.
+        The age of the newest sample used tells a broken contract from other large errors.
         """
         reason = state.broken
         if not self._has_error_set:
@@ -190,7 +189,6 @@ class GuaranteeMonitor:
         return _first(reason, is_large, LARGE_ERROR)
 
     def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
-        """Returns what broke, with inputs under way at a start that are not known to lie within their limits."""
         if not self._under_way:
             return broken
         sizes = (np.abs(report.estimate) + report.errors.half_widths)[-self._under_way :]
@@ -220,8 +218,65 @@ class GuaranteeMonitor:
         return MonitorState(broken, inside, errors.certified, wait)
 
 
+class LostGuarantee:
+    """Says once per episode and reason that the state is not proved safe.
+
+    What is noted is said by `tell`, which comes after everything else in a step: when it raises, the step has happened.
+
+    Args:
+        on_unproved: "ignore" says nothing; "warn" warns the first caller outside this package; "raise" raises.
+        count: Number of control loops side by side.
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+
+    def __init__(self, on_unproved: str, count: int = 1) -> None:
+        if not (isinstance(on_unproved, str) and on_unproved in ON_UNPROVED):
+            raise ValueError(f"on_unproved must be one of {list(ON_UNPROVED)}, got {shown(on_unproved)}")
+        self.on_unproved = on_unproved
+        self._said = np.zeros((count, len(EXPLANATIONS)), np.bool_)
+        self._news: frozenset[int] = frozenset()
+
+    def saved(self) -> dict[str, Any]:
+        """Returns all that changes, as attributes to be put back."""
+        return {"_said": self._said.copy(), "_news": self._news}
+
+    def begin(self, restarted: Any = slice(None)) -> None:
+        """Begins episodes, in which nothing has been said, in the loops chosen by a mask or index."""
+        self._said[restarted] = False
+
+    def note(self, codes: Any, loops: Any = 0) -> None:
+        """Takes in why some loops are not proved safe, as indices of `EXPLANATIONS`: 0 for those that are."""
+        if self.on_unproved == "ignore":
+            return
+        codes = np.asarray(codes)
+        fresh = (codes > 0) & ~self._said[loops, codes]
+        if np.count_nonzero(fresh):
+            self._said[loops, codes] = True
+            self._news |= set(codes[fresh].tolist())
+
+    def tell(self) -> None:
+        """Says what was noted since the last call and is new.
+
+        Raises:
+            GuaranteeLostError: If there is something new and that is to be raised.
+        """
+        news, self._news = sorted(self._news), frozenset()
+        for code in news:
+            text = f"the state is not proved safe now: {EXPLANATIONS[code]} (docs/shield.md says what the reasons mean)"
+            if self.on_unproved == "raise":
+                raise GuaranteeLostError(text)
+            warnings.warn(text, GuaranteeLostWarning, stacklevel=_levels_to_the_caller())
+
+    def tell_of(self, reason: str) -> None:
+        """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
+        if reason:
+            self.note(CODES[reason])
+            self.tell()
+
+
 def _not(condition: Any) -> Any:
-    """Returns the opposite of one truth value, or of every one of an array."""
     return not condition if isinstance(condition, bool) else ~condition
 
 
@@ -231,7 +286,6 @@ def _rows_all(conditions: np.ndarray) -> Any:
 
 
 def _all(conditions: Any) -> bool:
-    """Returns whether one truth value, or every one of an array, holds."""
     return conditions is True or np.count_nonzero(conditions) == np.size(conditions)
 
 
@@ -240,3 +294,11 @@ def _first(broken: Any, condition: Any, explanation: str) -> Any:
     if condition is False or not np.count_nonzero(condition):  # the usual case
         return broken
     return broken + (broken == 0) * condition * CODES[explanation]
+
+
+def _levels_to_the_caller() -> int:
+    """Returns the stack level, as `warnings.warn` in `tell` counts it, of the first caller outside this package."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shields."):
+        level, frame = level + 1, frame.f_back
+    return level

@@ -78,17 +78,46 @@ class OneStepTest:
         D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
         self.D = read_only(0.5 * (D + D.T))
 
+    @np.errstate(all="ignore")  # what overflows is found below, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
-        """Returns what `predicted_errors` does."""
-        return predicted_errors(self, shapes, certified_shapes)
+        """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
 
-    def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> ReachableSets:
-        """Returns the sets of next states that N estimates allow.
+        Sigma_pred is the trace-smallest G (A Sigma_k A'/nu + D/(1-nu)) G', enlarged by the rounding of computing it.
 
         Args:
-            estimates: x_hat, shape (n, N).
-            errors: What is known of the Sigma_k of each.
+            shapes: Sigma_k, shape (k, n, n).
+            certified_shapes: Shapes of the certified error sets, shape (l, n, n).
         """
+        symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
+        half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
+        identity = self.rounding * np.eye(self.plant.n)
+        spread = half_widths @ self.columns
+        moved = self.moved @ symmetric @ self.moved.T + (spread**2)[:, None, None] * identity
+        second = np.trace(self.D) ** 0.5
+        first = np.maximum(np.abs(np.trace(moved, axis1=1, axis2=2)) ** 0.5, SMALLEST_MULTIPLIER * second)[
+            :, None, None
+        ]
+        squares, axes = _eigh(moved * (1.0 + second / first) + self.D * (1.0 + first / second))
+        h = np.sqrt(squares[:, -1])
+        radius = 1.0 - h - self.rounding * (spread + self.pushed)
+        weights = np.where(radius[:, None] >= SMALLEST_RADIUS, (h * (1.0 - h))[:, None] / (h[:, None] - squares), 1.0)
+        weighting = np.sqrt(weights)[:, :, None] * axes.swapaxes(1, 2)
+        own_spread = half_widths @ self.own_columns
+        own = _eigh(self.root @ symmetric @ self.root.T)[0][:, -1] + self.rounding * own_spread**2
+        usable &= np.all(np.isfinite(weighting), axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
+        unusable = np.where(usable, 0.0, np.nan)
+        return PredictedErrors(
+            weighting=np.ascontiguousarray(np.where(usable[:, None, None], weighting, 0.0).transpose(1, 2, 0)),
+            radius=radius + unusable,
+            half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
+            own=(np.sqrt(np.maximum(own, 0.0)) + unusable)[None],
+            room=np.empty((0, len(shapes))),
+            certified=inside & usable,
+            shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
+        )
+
+    def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> ReachableSets:
+        """Returns the sets of next states that N estimates allow, shape (n, N)."""
         reach = self.columns @ np.abs(estimates)
         radius = errors.radius - self.rounding * reach
         near, small = reach < FARTHEST, radius < SMALLEST_RADIUS
@@ -101,22 +130,17 @@ class OneStepTest:
     def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> ReachableSet | None:
         """Returns what `reachable` does for one estimate, shape (n,), and one error shape; None if nothing passes."""
         radius = errors.radius - self.rounding * float(self.columns.dot(np.abs(estimate)))
-        return (
-            ReachableSet(self, self.moved.dot(estimate), errors.weighting, radius)
-            if radius >= SMALLEST_RADIUS
-            else None
-        )
+        if not radius >= SMALLEST_RADIUS:  # neither NaN
+            return None
+        return ReachableSet(self, self.moved.dot(estimate), errors.weighting, radius)
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
 
-        Args:
-            estimates: x_hat, shape (n, N) or (n,).
-            errors: What is known of the Sigma_k of each.
-            margin: In units of S.
+        Of estimates of shape (n, N), or of one of shape (n,).
         """
-        level = norms(self.root.dot(estimates)) + errors.largest
+        level = norms(self.root.dot(estimates)) + errors.own[0]
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
     def keeps_between(
@@ -168,10 +192,7 @@ class ReachableSets(NamedTuple):
         return worst
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
-
-        NaN where there is none.
-        """
+        """Returns the inputs within the limits, (m, N), closest to given ones with a slack of `margin`, else NaN."""
         effect = (self.weighting[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
         offset = (self.weighting * self.offset).sum(axis=1)
         return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
@@ -208,19 +229,26 @@ class ReachableSet(NamedTuple):
 class PredictedErrors(NamedTuple):
     """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
 
+    The norm of S is weighted, a polytope and the grid between samples are judged row by row; what a test does not need
+    has no entries. Radius, half_widths, own and room are NaN for an unusable shape.
+
     Attributes:
         weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
-        radius: 1 - h less the rounding that does not depend on the estimate, shape (k,); NaN for an unusable shape.
-        half_widths: Largest error of each state, shape (n, k); NaN for an unusable shape.
-        largest: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (k,); NaN for an unusable shape.
+        room: 1 - sqrt(g A Sigma_k A' g') - sqrt(g D g') less the rounding that does not depend on the estimate, for
+            rows g, shape (r, k).
+        radius: 1 - h less that rounding; of a polytope the least room, shape (k,).
+        half_widths: Largest error of each state, shape (n, k).
+        own: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope sqrt(g Sigma_k
+            g'), shape (r, k).
         certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
         shape: Sigma_k itself, shape (n, n, k); the filter keeps it in mode "lookahead" alone, else (0, n, k).
     """
 
     weighting: np.ndarray
+    room: np.ndarray
     radius: Any
     half_widths: np.ndarray
-    largest: Any
+    own: np.ndarray
     certified: Any
     shape: np.ndarray
 
@@ -228,9 +256,9 @@ class PredictedErrors(NamedTuple):
         """Returns those of environments that have the shapes with these numbers, shape (N,)."""
         return self._make(array.take(numbers, axis=-1) for array in self)
 
-    def single(self) -> Self:
-        """Returns the first without a last axis."""
-        return self._make(array.item(0) if array.ndim == 1 else array[..., 0].copy() for array in self)
+    def single(self, number: int = 0) -> Self:
+        """Returns one of them without a last axis."""
+        return self._make(array.item(number) if array.ndim == 1 else array[..., number].copy() for array in self)
 
     def batch(self) -> Self:
         """Returns a single one as a batch of one."""
@@ -239,43 +267,6 @@ class PredictedErrors(NamedTuple):
     def followed_by(self, other: Self) -> Self:
         """Returns these shapes and then the others."""
         return self._make(np.concatenate(pair, axis=-1) for pair in zip(self, other, strict=True))
-
-
-@np.errstate(all="ignore")  # what overflows is found below, what underflows does not count
-def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
-    """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
-
-    Sigma_pred is the trace-smallest G (A Sigma_k A'/nu + D/(1-nu)) G', enlarged by the rounding of computing it.
-
-    Args:
-        test: The one-step test, in whose norm |z|_M = |G z| errors are measured.
-        shapes: Sigma_k, shape (k, n, n).
-        certified_shapes: Shapes of the certified error sets, shape (l, n, n).
-    """
-    symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
-    half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
-    identity = test.rounding * np.eye(test.plant.n)
-    spread = half_widths @ test.columns
-    moved = test.moved @ symmetric @ test.moved.T + (spread**2)[:, None, None] * identity
-    second = np.trace(test.D) ** 0.5
-    first = np.maximum(np.abs(np.trace(moved, axis1=1, axis2=2)) ** 0.5, SMALLEST_MULTIPLIER * second)[:, None, None]
-    squares, axes = _eigh(moved * (1.0 + second / first) + test.D * (1.0 + first / second))
-    h = np.sqrt(squares[:, -1])
-    radius = 1.0 - h - test.rounding * (spread + test.pushed)
-    weights = np.where(radius[:, None] >= SMALLEST_RADIUS, (h * (1.0 - h))[:, None] / (h[:, None] - squares), 1.0)
-    weighting = np.sqrt(weights)[:, :, None] * axes.swapaxes(1, 2)
-    own_spread = half_widths @ test.own_columns
-    own = _eigh(test.root @ symmetric @ test.root.T)[0][:, -1] + test.rounding * own_spread**2
-    usable &= np.all(np.isfinite(weighting), axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
-    unusable = np.where(usable, 0.0, np.nan)
-    return PredictedErrors(
-        weighting=np.ascontiguousarray(np.where(usable[:, None, None], weighting, 0.0).transpose(1, 2, 0)),
-        radius=radius + unusable,
-        half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
-        largest=np.sqrt(np.maximum(own, 0.0)) + unusable,
-        certified=inside & usable,
-        shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
-    )
 
 
 def judged_shapes(shapes: np.ndarray, certified_shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

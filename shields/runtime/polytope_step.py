@@ -1,6 +1,7 @@
-"""The one-step test of a polytope: which inputs keep every possible next state in it.
+"""The one-step test row by row: which inputs keep every possible next state in a polytope, or between two samples.
 
-The supports of errors and disturbances add up, so the test is exact for what is known, row by row.
+The supports of errors and disturbances add up, so the test is exact for what is known. Between samples the rows are
+those of the box at the times of a grid (docs/shield_proof.md).
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import numpy as np
 from ncs_gym import LinearPlant
 from ncs_gym.validation import read_only
 from shields.polytope import Polytope
-from shields.runtime.between_samples import grid_test, supports
 from shields.runtime.one_step import (
     FARTHEST,
     SMALLEST_RADIUS,
@@ -28,6 +28,8 @@ from shields.runtime.projection import closest_between
 ALTERNATIONS = 8
 # Entries of an array that are worked on together: as many as a processor keeps near.
 BLOCK = 524_288
+# Outward rounding of rows that are divided by what is left of the box.
+_OUTWARD = 1.0 + 1e-12
 
 
 class PolytopeTest:
@@ -80,13 +82,8 @@ class PolytopeTest:
         self.disturbed = read_only(np.concatenate([disturbed, grid.disturbed]))
 
     @np.errstate(all="ignore")  # what overflows leaves no room, what underflows does not count
-    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> Any:
-        """Returns the `PolytopeErrors` of error shapes Sigma_k: what the test and the guarantee need of them.
-
-        Args:
-            shapes: Sigma_k, shape (k, n, n).
-            certified_shapes: Shapes of the certified error sets, shape (l, n, n).
-        """
+    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
+        """Returns what the test and the guarantee need of error shapes; see `OneStepTest.predicted`."""
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
         spread, own_spread = half_widths @ self.columns, half_widths @ self.own_columns
@@ -95,7 +92,8 @@ class PolytopeTest:
         own = supports(self.root, symmetric, self.rounding * own_spread**2)
         usable &= np.isfinite(room).all(axis=0) & np.isfinite(own).all(axis=0)
         unusable = np.where(usable, 0.0, np.nan)
-        return PolytopeErrors(
+        return PredictedErrors(
+            weighting=np.empty((0, 0, len(shapes))),
             room=np.ascontiguousarray(room + unusable),
             radius=room.min(axis=0) + unusable,
             half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
@@ -104,18 +102,13 @@ class PolytopeTest:
             shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
         )
 
-    def reachable(self, estimates: np.ndarray, errors: Any) -> Any:
-        """Returns the `PolytopeSets` of next states that N estimates allow.
-
-        Args:
-            estimates: x_hat, shape (n, N).
-            errors: What is known of the Sigma_k of each.
-        """
+    def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> Any:
+        """Returns the `PolytopeSets` of next states that N estimates allow, shape (n, N)."""
         reach = self.columns @ np.abs(estimates)
         rounding = np.where(reach < FARTHEST, self.rounding * reach, np.nan)  # what is too far out is unknown
         return PolytopeSets(self, estimates, errors.room, rounding, errors.radius - rounding)
 
-    def reachable_alone(self, estimate: np.ndarray, errors: Any) -> Any:
+    def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> Any:
         """Returns the `PolytopeSet` of one estimate, shape (n,), and one error shape; None if nothing passes."""
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         if not errors.radius - rounding >= SMALLEST_RADIUS:  # neither NaN
@@ -123,56 +116,21 @@ class PolytopeTest:
         return PolytopeSet(self, estimate, self.moved.dot(estimate), errors.room - rounding)
 
     @np.errstate(all="ignore")
-    def knows_inside(self, estimates: np.ndarray, errors: Any, margin: float) -> np.ndarray:
-        """Returns whether |g x_hat| + sqrt(g Sigma_k g') <= 1 - margin for all rows, which proves that x is in P.
-
-        Args:
-            estimates: x_hat, shape (n, N) or (n,).
-            errors: What is known of the Sigma_k of each.
-            margin: In units of P.
-        """
+    def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
+        """Returns whether |g x_hat| + sqrt(g Sigma_k g') <= 1 - margin for all rows, which proves that x is in P."""
         level = (np.abs(self.root.dot(estimates)) + errors.own).max(axis=0)
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
     @np.errstate(all="ignore")
-    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float, u: np.ndarray | None = None) -> bool:
-        """Returns whether the box is kept between this sample and the next one, if that counts.
-
-        Args:
-            estimate: x_hat, shape (n,).
-            errors: What is known of its Sigma_k.
-            margin: In units of the box.
-            u: The input until then, within the limits, shape (m,); none by default.
-        """
+    def keeps_between(
+        self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
+    ) -> bool:
+        """Returns whether the box is kept between this sample and the next, if that counts, with input u or none."""
         first = len(self.root)
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.moved[first:].dot(estimate)
         values = values if u is None else values + self.effect[first:].dot(u)
         return bool((np.abs(values) <= errors.room[first:] - rounding - margin).all())
-
-
-class PolytopeErrors(NamedTuple):
-    """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
-
-    Attributes:
-        room: 1 - sqrt(g A Sigma_k A' g') - sqrt(g D g') less the rounding that does not depend on the estimate, shape
-            (r, k); NaN for an unusable shape.
-        radius: The least of these, shape (k,).
-        half_widths: Largest error of each state, shape (n, k); NaN for an unusable shape.
-        own: sqrt(g Sigma_k g'), shape (r, k); NaN for an unusable shape.
-        certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
-        shape: Sigma_k itself, shape (n, n, k), or (0, n, k) where nobody asks for it.
-    """
-
-    room: np.ndarray
-    radius: Any
-    half_widths: np.ndarray
-    own: np.ndarray
-    certified: Any
-    shape: np.ndarray
-
-    of, single, batch = PredictedErrors.of, PredictedErrors.single, PredictedErrors.batch
-    followed_by = PredictedErrors.followed_by
 
 
 class PolytopeSets(NamedTuple):
@@ -197,10 +155,7 @@ class PolytopeSets(NamedTuple):
         return PolytopeSets(self.test, *(array.take(chosen, axis=-1) for array in self[1:]))
 
     def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
-
-        Both are the least room - |g (A x_hat + B u)| over the rows: x+ is in P unless it is negative.
-        """
+        """Returns what `ReachableSets.slack` does, twice: the least room - |g (A x_hat + B u)| over the rows, (N,)."""
         joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
         block = max(1, BLOCK // len(self.test.moved))
         for start in range(0, len(least), block):
@@ -219,10 +174,7 @@ class PolytopeSets(NamedTuple):
         return (self.room - center - worst[:, None]).min(axis=0) - self.rounding
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
-
-        NaN where there is none.
-        """
+        """Returns the closest inputs with a slack of `margin`, as `ReachableSets.closest` does."""
         limits, count = self.test.plant.u_max, inputs.shape[1]
         block = max(1, BLOCK // (len(self.test.moved) * len(limits)))
         if len(limits) > 1 and count > block:
@@ -250,38 +202,25 @@ class EllipsoidOnGrid(OneStepTest):
         self.grid = PolytopeTest(None, plant)
         self.shift = max(self.shift, self.grid.shift)
 
-    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> Any:
-        """Returns the `GridErrors` of error shapes."""
+    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
+        """Returns what `OneStepTest.predicted` does, and what is left of the grid's rows as `room`."""
         room = self.grid.predicted(shapes, certified_shapes[:0]).room
-        return GridErrors(*super().predicted(shapes, certified_shapes), room=room)
+        return super().predicted(shapes, certified_shapes)._replace(room=room)
 
-    def reachable(self, estimates: np.ndarray, errors: Any) -> Any:
+    def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> Any:
         """Returns the `SetsOnGrid` of next states and of states until then."""
         return SetsOnGrid(super().reachable(estimates, errors), self.grid.reachable(estimates, errors))
 
-    def reachable_alone(self, estimate: np.ndarray, errors: Any) -> Any:
+    def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> Any:
         """Returns what `reachable` does for one estimate, shape (n,); None if nothing passes."""
         first, grid = super().reachable_alone(estimate, errors), self.grid.reachable_alone(estimate, errors)
         return None if first is None or grid is None else SetOnGrid(first, grid)
 
-    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float, u: np.ndarray | None = None) -> bool:
+    def keeps_between(
+        self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
+    ) -> bool:
         """Returns what `PolytopeTest.keeps_between` does."""
         return self.grid.keeps_between(estimate, errors, margin, u)
-
-
-class GridErrors(NamedTuple):
-    """`PredictedErrors`, and the `room` of `PolytopeErrors` for the rows of the grid, shape (g, k)."""
-
-    weighting: np.ndarray
-    radius: Any
-    half_widths: np.ndarray
-    largest: Any
-    certified: Any
-    shape: np.ndarray
-    room: np.ndarray
-
-    of, single, batch = PredictedErrors.of, PredictedErrors.single, PredictedErrors.batch
-    followed_by = PredictedErrors.followed_by
 
 
 class SetsOnGrid(NamedTuple):
@@ -362,3 +301,53 @@ class PolytopeSet(NamedTuple):
         """Returns what `PolytopeSets.closest` does for plants with a single input."""
         sets = PolytopeSets(self.test, self.estimate[:, None], self.room[:, None], np.zeros(1), self.room[:1])
         return float(sets.closest(np.array([[u]]), margin)[0, 0])
+
+
+class GridTest(NamedTuple):
+    """|row (A_tau x_hat + B_tau u)| + support of A_tau e + disturbed <= 1 at the times tau_i, i = 1..N-1.
+
+    Rows are those of the box, divided by what eta leaves of it; no rows for a plant that counts at samples alone.
+
+    Attributes:
+        moved: Rows on x_hat, shape (g, n).
+        effect: Rows on u, shape (g, m).
+        disturbed: Support of the disturbances, shape (g,).
+        at_samples: Rows on the state at a sampling instant, shape (k, n), from which the box is kept until the first of
+            these times: those of the box divided by what eta and the disturbances leave, or the box's own.
+    """
+
+    moved: np.ndarray
+    effect: np.ndarray
+    disturbed: np.ndarray
+    at_samples: np.ndarray
+
+
+@np.errstate(all="ignore")  # what is not finite leaves no room
+def grid_test(plant: LinearPlant) -> GridTest:
+    """Returns the test of a plant's grid."""
+    rows, grid = plant.box_rows, plant.grid_rows
+    if grid is None:
+        return GridTest(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0), rows)
+    D, rounding = plant.disturbance.shape_matrix, 8.0 * plant.n * float(np.finfo(float).eps)
+    left = (1.0 - grid.remainder) / _OUTWARD
+    rho = supports(rows, D[None], rounding * (np.abs(rows) @ np.sqrt(np.diag(D)))[:, None] ** 2)[:, 0]
+    at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
+    count = len(grid.state) - 1
+    return GridTest(
+        moved=read_only((grid.state[1:] / left[:, None]).reshape(-1, plant.n)),
+        effect=read_only((grid.input[1:] / left[:, None]).reshape(-1, plant.m)),
+        disturbed=read_only(np.tile(np.where(left > 0.0, rho / left, np.inf), count)),
+        at_samples=read_only(rows / at_samples[:, None]),
+    )
+
+
+def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
+    """Returns upper bounds of sqrt(g S g') for rows g, (r, n), and shapes S, (k, n, n): shape (r, k).
+
+    Args:
+        rows: g, shape (r, n).
+        shapes: S, shape (k, n, n).
+        rounding: What computing g S g' is off by at most, for all rows, shape (k,) or a number, or shape (r, 1).
+    """
+    squares = ((rows @ shapes) * rows).sum(axis=-1).T
+    return np.sqrt(np.maximum(squares, 0.0) + rounding)

@@ -109,15 +109,7 @@ def _onto_balls(
     With effect = U diag(r) V' and s = r^2 the minimizer for multiplier t is c_i + (w_i - c_i) / (1 + t s_i) in the axes
     V, c the center of the test; 1 / sqrt(excess) is concave and increasing in t (as in trust-region methods).
 
-    Args:
-        start: Shape (m, F).
-        offset: Shape (n, F).
-        effect: Shape (n, m, F).
-        radius: Shape (F,).
-        free: Shape (m, F).
-
-    Returns:
-        Shape (m, F).
+    Shapes are those of `closest_admissible` for F problems.
     """
     reached = offset + (effect * start).sum(axis=1)
     images, axes = _orthogonal_images(effect * free)
@@ -137,10 +129,7 @@ def _onto_balls(
 def _multipliers(s: np.ndarray, away: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Returns t >= 0, shape (F,), with sum_i s_i (away_i / (1 + t s_i))^2 <= reach, by Newton's method.
 
-    Args:
-        s: Shape (k, F).
-        away: Shape (k, F).
-        reach: Shape (F,); where it is negative the result means nothing.
+    Where the reach is negative the result means nothing.
     """
     multiplier = np.zeros(len(reach))
     for _ in range(NEWTON_STEPS):
@@ -211,13 +200,8 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     face = np.sign(values[row, problem]) * room[row, problem]
     foot = start + normals * ((face - values[row, problem]) / (normals * normals).sum(axis=0))
     usable = np.isfinite(foot).all(axis=0)
-    row, problem, foot, start, normals = (
-        row[usable],
-        problem[usable],
-        foot[:, usable],
-        start[:, usable],
-        normals[:, usable],
-    )
+    row, problem = row[usable], problem[usable]
+    foot, start, normals = foot[:, usable], start[:, usable], normals[:, usable]
     # Directions in the plane of the face, shape (m, m - 1, F).
     if len(normals) == 2:
         plane = (np.stack([-normals[1], normals[0]]) / np.hypot(*normals))[:, None]

@@ -24,8 +24,14 @@ from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_INPUT, UNKNOWN_START, LoopObservation
-from shields.runtime.lost_guarantee import LostGuarantee
+from shields.runtime.guarantee import (
+    LATE_INPUT,
+    NOT_CONFIRMED,
+    OTHER_INPUT,
+    UNKNOWN_START,
+    LoopObservation,
+    LostGuarantee,
+)
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, starts_known
@@ -184,17 +190,12 @@ class SafeLoop:
             age += ", older than the contract allows"
         proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
         proved += "" if self._echo_age is not None else ", if everything that is decided is applied"
-        is_started = self._phase is not _Phase.STOPPED
+        is_started, delay = self._phase is not _Phase.STOPPED, counted(self._input_delay, "step")
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
             ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
             ("contract", contract_text(certificate.method, self._contract, self._input_delay)),
-            (
-                "downlink",
-                f"inputs take effect {counted(self._input_delay, 'step')} after the decision"
-                if self._input_delay
-                else "",
-            ),
+            ("downlink", f"inputs take effect {delay} after the decision" if self._input_delay else ""),
             ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
             ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),
         ]
@@ -326,7 +327,9 @@ class SafeLoop:
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
         self._phase = _Phase.STOPPED
-        decision = self._monitored.decide(self._clipped(proposed))
+        limits = self._filter.plant.u_max
+        u = _as_input(proposed, limits.shape)  # what is none is decided as such
+        decision = self._monitored.decide(np.empty(0) if u is None else np.minimum(np.maximum(u, -limits), limits))
         self._inputs.commit(decision.input)
         if self._requests is not None or ask:
             requests = require_on_request(self._requests)
@@ -462,28 +465,17 @@ class SafeLoop:
             self._begin(starts_known(self._filter, None, self._input_delay))
 
     def _report(self) -> LoopObservation:
-        """Returns what the estimator says now."""
         return self._monitored.reported(*self._predicted(), self._estimator.alarm, self._estimator.age)
 
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
         return self._estimator.predicted(self._inputs.pending[: self._input_delay])
 
-    def _clipped(self, proposed: Any) -> np.ndarray:
-        """Returns a copy of the proposal within the limits, (m,); as it is, or empty, where it is no finite input."""
-        plant, numbers = self._filter.plant, as_numbers(proposed)
-        if numbers is None:
-            return np.empty(0)
-        numbers = numbers.copy()  # read once: another thread may write into it
-        numbers = numbers.reshape(1) if numbers.ndim == 0 else numbers
-        if numbers.shape != (plant.m,) or not np.isfinite(numbers).all():
-            return numbers
-        return np.minimum(np.maximum(numbers, -plant.u_max), plant.u_max)
 
-
-def _as_input(applied: Any, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Returns the input reported by the actuator, shape (m,); None if it is none."""
-    numbers = as_numbers(applied)
-    if numbers is not None:
-        numbers = numbers.reshape(1).copy() if numbers.ndim == 0 else numbers.copy()
-    return numbers if numbers is not None and numbers.shape == shape and np.isfinite(numbers).all() else None
+def _as_input(given: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Returns a copy of an input, shape (m,); None if it is no finite one."""
+    numbers = as_numbers(given)
+    if numbers is None:
+        return None
+    numbers = numbers.reshape(1).copy() if numbers.ndim == 0 else numbers.copy()  # read once: others may write into it
+    return numbers if numbers.shape == shape and np.isfinite(numbers).all() else None

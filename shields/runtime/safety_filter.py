@@ -13,7 +13,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
-from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
+from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step import (
     MOST_INPUTS_WITH_VERTICES,
     OneStepTest,
@@ -72,7 +72,7 @@ class SafetyFilter(ReadOnlyArrays):
     mode: str = "project"
     horizon: int | None = None
     test: OneStepTest | PolytopeTest = field(init=False, repr=False)
-    lookahead: Lookahead | None = field(init=False, repr=False)
+    lookahead: Lookahead | None = field(init=False, repr=False, default=None)
     _no_plan: np.ndarray = field(init=False, repr=False)
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
 
@@ -91,25 +91,16 @@ class SafetyFilter(ReadOnlyArrays):
         test = kind(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
         object.__setattr__(self, "test", test)
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
-        object.__setattr__(self, "lookahead", self._lookahead())
         object.__setattr__(self, "_remembered", {})
+        if self.mode == "lookahead":
+            from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
 
-    def _lookahead(self) -> Lookahead | None:
-        """Returns what mode "lookahead" needs, with the default horizon if none is given; None in other modes.
-
-        Raises:
-            ValueError: If the horizon is wrong, or given for another mode.
-        """
-        if self.mode != "lookahead":
-            if self.horizon is not None:
-                raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
-            return None
-        from shields.runtime.backup_plans import Lookahead  # the solver, which other modes do without
-
-        given = DEFAULT_HORIZON if self.horizon is None else self.horizon
-        horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
-        object.__setattr__(self, "horizon", horizon)
-        return Lookahead(self.test, self.certificate.K, horizon, MARGIN)
+            given = DEFAULT_HORIZON if self.horizon is None else self.horizon
+            horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
+            object.__setattr__(self, "horizon", horizon)
+            object.__setattr__(self, "lookahead", Lookahead(self.test, self.certificate.K, horizon, MARGIN))
+        elif self.horizon is not None:
+            raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
 
     @cached_property
     def projection_margin(self) -> float:
@@ -153,7 +144,7 @@ class SafetyFilter(ReadOnlyArrays):
         return one._replace(input=np.array(one.input), reason=REASONS[one.reason], plan=plan)
 
     def _decide_single(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
-        """Returns the decision in the common cases: one that passes or begins a plan, and a projected single input."""
+        """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected."""
         alone = self.test.reachable_alone(estimate, errors)
         pairs = zip(proposed.tolist(), self.test.limits, strict=True)
         if alone is None or not all([-limit <= u <= limit for u, limit in pairs]):
@@ -162,7 +153,10 @@ class SafetyFilter(ReadOnlyArrays):
         if slack >= MARGIN:
             return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
         if self.lookahead is not None:
-            return self.lookahead.keep_alone(estimate, errors, proposed, margin)
+            plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
+            if plan is None:
+                return None
+            return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
         if self.mode != "project" or self.plant.m > 1:
             return None
         closest = self._expressible(np.array([alone.closest(proposed.item(), self.projection_margin)]))
@@ -341,7 +335,6 @@ class SafetyFilter(ReadOnlyArrays):
         return np.where(np.isfinite(gained).all(axis=0), self._expressible(gained), np.nan)
 
     def _expressible(self, inputs: np.ndarray) -> np.ndarray:
-        """Returns the nearest u_max * float32 actions, shape (m, N) or (m,)."""
         limits = self.plant.u_max if inputs.ndim == 1 else self.plant.u_max[:, None]
         return expressible(inputs, limits)
 

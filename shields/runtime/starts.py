@@ -14,9 +14,8 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
-from shields.runtime.between_samples import grid_test
-from shields.runtime.guarantee import LoopObservation
 from shields.runtime.one_step import PredictedErrors
+from shields.runtime.polytope_step import grid_test
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 from shields.verification.rational_matrix import (
     is_positive_semidefinite,
@@ -62,19 +61,15 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
 
 
 def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
-    """Returns whether all possible starts lie in the safe box, decided in exact arithmetic.
+    """Returns whether all starts in an ellipsoid, or one state, shape (n,), lie in the safe box, in exact arithmetic.
 
-    Where the box counts between samples, they have to lie in a smaller one, in which disturbances cannot leave it.
-
-    Args:
-        plant: Gives the rows c_i.
-        initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
+    E(P) does exactly if c_i P c_i' <= 1 for all rows. Where the box counts between samples, they have to lie in a
+    smaller one, in which disturbances cannot leave it.
     """
     return _between(grid_test(plant).at_samples, initial)
 
 
 def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
-    """Returns whether |g x| <= 1 for all rows g, shape (r, n), and all possible starts."""
     if not isinstance(initial, Ellipsoid) and (verdict := _surely_between(bounds, initial)) is not None:
         return verdict  # a thousand times faster than in rational arithmetic
     rows = rational(bounds)
@@ -94,32 +89,19 @@ def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
     return False if (products - room > 1.0).any() else None
 
 
-def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:
-    """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
-    if initial is None:
-        return StartKnown(False, False)
-    inside = starts_inside(safety_filter.certificate, initial)
-    return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))
-
-
 def starts_known(
     safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None, input_delay: int
 ) -> tuple[StartKnown, ...]:
-    """Returns what is known of x_0 .. x_c, given where starts are possible.
+    """Returns what is known of x_0 .. x_c, given possible starts: an ellipsoid, one state, shape (n,), or None for any.
 
     x_0 is decided in exact arithmetic. With x_0 in {z} + E(P), x_1 lies in {A z} + E(A P A'/nu + D/(1-nu)) for every nu
     in (0, 1), and so on; whether that lies in the safe set, or in the box, is decided by the tests that judge
     estimates, with their margins for rounding.
-
-    Args:
-        safety_filter: Gives the safe set, the box and the plant.
-        initial: An ellipsoid, one state, shape (n,), or None for any start.
-        input_delay: c.
     """
-    known = [start_known(safety_filter, initial)]
     if initial is None:
-        return tuple(known * (input_delay + 1))
-    plant = safety_filter.plant
+        return (StartKnown(False, False),) * (input_delay + 1)
+    plant, inside = safety_filter.plant, starts_inside(safety_filter.certificate, initial)
+    known = [StartKnown(inside, inside or starts_in_box(plant, initial))]
     if isinstance(initial, Ellipsoid):
         center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
@@ -143,12 +125,8 @@ def known_inside(
 ) -> bool:
     """Returns whether one of the states x_0 .. x_{c-1} is known to be in the safe set; in mode "lookahead" in the box.
 
-    Args:
-        safety_filter: Gives both.
-        known: What is known of it from where starts are possible.
-        estimate: Its estimate, shape (n,).
-        errors: What is known of the error shape of that.
-        u: The input that acts then, decided before, shape (m,); none at the start of an episode.
+    Either from where starts are possible, or from its estimate, shape (n,), and from the input u that acts then, shape
+    (m,), decided before; there is none at the start of an episode.
     """
     if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
         return True
@@ -157,46 +135,14 @@ def known_inside(
     return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
 
 
-def first_observations(
-    safety_filter: SafetyFilter,
-    known: list[tuple[StartKnown, ...]],
-    earlier: list[tuple[np.ndarray, PredictedErrors]],
-) -> list[tuple[np.ndarray, LoopObservation]]:
-    """Returns of x_0 .. x_{c-1} in k environments whether each is known to be inside, (k,), and what is observed.
-
-    Args:
-        safety_filter: Gives the safe set and the box.
-        known: What is known of x_0 .. x_c in each of the environments from where its starts are possible.
-        earlier: Of x_0 .. x_{c-1}, estimates, shape (n, k), and what is known of the error shapes.
-    """
-    found = []
-    for ahead, (estimates, errors) in enumerate(earlier):
-        each = (errors.of(np.array([e])).single() for e in range(len(known)))
-        columns = np.ascontiguousarray(estimates.T)
-        inside = [
-            known_inside(safety_filter, start[ahead], estimate, own)
-            for start, estimate, own in zip(known, columns, each, strict=True)
-        ]
-        no_alarm = np.zeros(len(known), np.bool_)
-        found.append((np.array(inside, np.bool_), LoopObservation(estimates, errors, no_alarm)))
-    return found
-
-
 def first_store(
     safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors, known: StartKnown
 ) -> tuple[np.ndarray, bool]:
     """Returns what is stored before the first decision, shape (k, m), and whether the state is proved safe.
 
-    The state is that at which the first decision takes effect, without a downlink the start.
-
-    It is where it is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what
-    starts are possible or by the estimate, and a first plan is certified.
-
-    Args:
-        safety_filter: Decides.
-        estimate: x_hat_0, shape (n,).
-        errors: What is known of Sigma_0.
-        known: What is known of the start.
+    The state is that at which the first decision takes effect, without a downlink the start. It is proved safe where it
+    is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what starts are
+    possible or by the estimate, shape (n,), and a first plan is certified.
     """
     lookahead = safety_filter.lookahead
     if lookahead is None or known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN):
@@ -206,7 +152,6 @@ def first_store(
 
 
 def _in_box(safety_filter: SafetyFilter, center: np.ndarray, errors: PredictedErrors) -> bool:
-    """Returns whether {center} + E(shape) lies in the box; only mode "lookahead" asks."""
     return safety_filter.lookahead is not None and safety_filter.lookahead.knows_in_box(center, errors)
 
 

@@ -8,15 +8,12 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
-from ncs_gym import Channel
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.validation import as_number, setting
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
@@ -27,20 +24,9 @@ from shields.runtime.guarantee import (
     LoopObservation,
     MonitorState,
 )
-from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.one_step import PredictedErrors, norms
-from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.starts import StartKnown, first_observations, first_store, starts_known
-from shields.runtime.wrapper import (
-    annotation_of,
-    certificate_for,
-    environment_behind,
-    hint_for,
-    premises_of,
-    recorded_certificate,
-    require_same,
-    warned_of,
-)
+from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
+from shields.runtime.wrapper import BaseShield
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
 
@@ -53,7 +39,7 @@ class Clock(NamedTuple):
     ticks: int
 
 
-class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
+class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
     """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
 
     Every info value has N as its first axis; `shield_reason` is an array of str objects, read-only while
@@ -77,12 +63,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             wrong.
     """
 
-    certificate: Certificate = setting("certificate")
-    filter: SafetyFilter = setting("filter")
-    mode: str = setting("mode", "_filter.mode")
-    horizon: int | None = setting("horizon", "_filter.horizon")
-    on_unproved: str = setting("on_unproved", "_lost.on_unproved")
-    channel: Channel = setting("channel", "_inner.channel")
+    _wanted, _wrappers, _refused = NCSVectorEnv, VectorWrapper, (VectorActionWrapper,)
 
     def __init__(
         self,
@@ -93,23 +74,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         horizon: int | None = None,
         on_unproved: str = "warn",
     ) -> None:
-        recorded = recorded_certificate(certificate)
-        certificate = None if certificate is None else Certificate.read(certificate)
-        given = {"certificate": recorded, "mode": mode, "penalty": penalty, "horizon": horizon}
-        RecordConstructorArgs.__init__(self, **given, on_unproved=on_unproved)
-        inner = self._inner = self._environment_in(env)
-        if env.single_action_space != inner.single_action_space:
-            raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
-        VectorWrapper.__init__(self, env)
-        self.penalty = as_number(penalty, "penalty", low=0.0)
-        self._lost = LostGuarantee(on_unproved, self.num_envs)
-        self._certificate = (
-            certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
-        )
-        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
+        self._make(env, certificate, mode, penalty, horizon, on_unproved)
+        inner = self._inner
+        self._look_at({*inner.episode_channels})
         self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
-        self._input_delay = 0 if inner.downlink_protocol is None else inner.downlink_protocol.input_delay
-        self._channels = warned_of({*inner.episode_channels}, set(), self._certificate, self._input_delay)
         self._start_known = starts_known(self._filter, inner.single.initial_set, self._input_delay)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = (
@@ -125,7 +93,6 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
         self._interrupted = Clock(np.full(count, -1), np.full(count, -1), -2)
         self._clock: Clock | None = None
-        self._made_for = premises_of(inner, inner.single)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -138,7 +105,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
         if self._inner.render_mode is not None:
-            self._inner.annotate(annotation_of(self._filter, None, 0, NO_PLAN, intervened=False))
+            self._annotate(None, 0, NO_PLAN, intervened=False)
         try:
             # gymnasium's annotation leaves out the lists that its own vector environments take.
             observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
@@ -146,14 +113,12 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
                 self._clock = before  # refused before anything moved
             raise
-        inner = self._environment_in(self.env)
-        require_same(self._made_for, premises_of(inner, inner.single))
-        self._channels = warned_of({*inner.episode_channels}, self._channels, self._certificate, self._input_delay)
+        self._require_same()
+        self._look_at({*self._inner.episode_channels})
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
-        known = inner.known
-        self._report = self._observed(known)
+        self._report = self._observed(self._inner.known)
         nothing, none = np.zeros((self._filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
         kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
@@ -184,14 +149,16 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self._filter.mode != "monitor" and np.count_nonzero(decided.intervened):
             actions = overridden(actions, decided, self._filter.plant.u_max)
         if self._inner.render_mode is not None:
-            self._annotate(decided, proposed)
+            e = self._inner.rendered_env
+            plan, acted = decided.plan[..., e], bool(decided.intervened[e])
+            plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
+            self._annotate(proposed[:, e].copy(), int(self._interventions[e]) + acted, plan, intervened=acted)
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
         if np.count_nonzero(restarted):
-            channels = {*self._inner.episode_channels}
-            self._channels = warned_of(channels, self._channels, self._certificate, self._input_delay)
+            self._look_at({*self._inner.episode_channels})
         known = self._inner.known
         self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)
@@ -222,24 +189,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._lost.tell()
         return observation, rewards, terminated, truncated, info
 
-    @staticmethod
-    def _environment_in(env: VectorEnv) -> NCSVectorEnv:
-        """Returns the environment behind all wrappers, none of which may stand between it and a shield."""
-        refused = VectorActionWrapper, VectorSafetyShield
-        return environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint_for(env))
-
     def _observed(self, known: Known) -> LoopObservation:
-        """Returns what decisions and the guarantee need of what the innermost environment knows."""
         errors = self._errors_of(self._inner.error_shapes[1])
         return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age)
-
-    def _annotate(self, decided: Decision, proposed: np.ndarray) -> None:
-        """Tells the picture of the step that follows what the shield does in the environment that is drawn."""
-        e = self._inner.rendered_env
-        plan, acted = decided.plan[..., e], bool(decided.intervened[e])
-        plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
-        count = int(self._interventions[e]) + acted
-        self._inner.annotate(annotation_of(self._filter, proposed[:, e].copy(), count, plan, intervened=acted))
 
     def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns what is known of the error shapes with these numbers in the environment's table."""
@@ -261,7 +213,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if len(self._stored):
             self._stored[..., restarted] = np.nan
             for e in np.flatnonzero(restarted & ~is_safe).tolist():
-                estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.of(np.array([e])).single()
+                estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.single(e)
                 plan, is_safe[e] = first_store(self._filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
         started = self._monitor.start(is_safe, begun, self._report)
@@ -274,8 +226,14 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _cover(self, chosen: np.ndarray, known: list[tuple[StartKnown, ...]]) -> None:
         """Takes in what is known of the steps before the first decisions take effect, where episodes began."""
-        ahead = [(mean, self._errors_of(numbers)) for mean, numbers in self._inner.estimates_ahead(chosen)[:-1]]
-        earlier = first_observations(self._filter, [known[e] for e in chosen.tolist()], ahead)
+        earlier, no_alarm = [], np.zeros(len(chosen), np.bool_)
+        for ahead, (means, numbers) in enumerate(self._inner.estimates_ahead(chosen)[:-1]):
+            errors = self._errors_of(numbers)
+            inside = [
+                known_inside(self._filter, known[e][ahead], means[:, k].copy(), errors.single(k))
+                for k, e in enumerate(chosen.tolist())
+            ]
+            earlier.append((np.array(inside, np.bool_), LoopObservation(means, errors, no_alarm)))
         covered = self._monitor.cover(MonitorState(*(array[chosen] for array in self._state)), earlier)
         for kept, new in zip(self._state, covered, strict=True):
             kept[chosen] = new
@@ -316,7 +274,6 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             return sets.slack(np.zeros((self._filter.plant.m, len(chosen))))[1]
 
     def _read_clock(self) -> Clock:
-        """Returns how often the environments moved until now."""
         inner = self._inner
         return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 

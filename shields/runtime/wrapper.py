@@ -1,11 +1,11 @@
-"""The shield as a Gymnasium wrapper."""
+"""The shield as a Gymnasium wrapper, and what it has in common with that of vector environments."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
 from math import hypot
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -20,13 +20,12 @@ from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN
-from shields.runtime.guarantee import LoopObservation
-from shields.runtime.lost_guarantee import LostGuarantee
+from shields.runtime.guarantee import LoopObservation, LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, starts_known
 
-T = TypeVar("T")
+E = TypeVar("E", NCSEnv, NCSVectorEnv)
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
@@ -40,7 +39,104 @@ PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_con
 _synthesized: dict[tuple[str, ChannelContract | None, str | None], Certificate] = {}
 
 
-class SafetyShield(gym.Wrapper, RecordConstructorArgs):
+class BaseShield(RecordConstructorArgs, Generic[E]):
+    """What the shields have in common: their settings, and that what they wrap stays what they were made for."""
+
+    certificate: Certificate = setting("certificate")
+    filter: SafetyFilter = setting("filter")
+    mode: str = setting("mode", "_filter.mode")
+    horizon: int | None = setting("horizon", "_filter.horizon")
+    on_unproved: str = setting("on_unproved", "_lost.on_unproved")
+    channel: Channel = setting("channel", "_inner.channel")
+
+    # Class of the innermost environment, base class of the wrappers around it, and those that may not be inside.
+    _wanted: type[E]
+    _wrappers: Any
+    _refused: tuple[type, ...]
+    env: Any
+
+    def _make(
+        self, env: Any, certificate: Any, mode: str, penalty: float, horizon: int | None, on_unproved: str
+    ) -> None:
+        """Records the settings, and makes the filter for the environment inside."""
+        if isinstance(certificate, os.PathLike):
+            certificate = os.fspath(certificate)
+        if not (certificate is None or isinstance(certificate, Certificate | Mapping | str)):
+            wanted = "a Certificate, its document or path, or None"
+            raise ValueError(f"certificate must be {wanted}, got {shown(certificate)}")
+        recorded = certificate.document if isinstance(certificate, Certificate) else certificate
+        given = {"mode": mode, "penalty": penalty, "horizon": horizon, "on_unproved": on_unproved}
+        RecordConstructorArgs.__init__(self, certificate=recorded, **given)
+        read = None if certificate is None else Certificate.read(certificate)
+        inner = self._inner = self._environment_in(env)
+        for space in ("action_space", "single_action_space"):
+            if getattr(env, space, None) != getattr(inner, space, None):
+                raise ValueError(f"a wrapper inside the shield changes the action space to {getattr(env, space)}")
+        self._wrappers.__init__(self, env)
+        self.penalty = as_number(penalty, "penalty", low=0.0)
+        self._lost = LostGuarantee(on_unproved, getattr(inner, "num_envs", 1))
+        self._certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
+        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
+        self._input_delay = 0 if inner.downlink_protocol is None else inner.downlink_protocol.input_delay
+        self._channels: set[Channel] = set()
+        self._made_for = self._premises(inner)
+
+    def _environment_in(self, env: Any) -> E:
+        """Returns the innermost environment after looking at every wrapper around it.
+
+        Raises:
+            ValueError: If a wrapper changes or repeats actions, or the innermost environment is of another class.
+        """
+        layer = env
+        while isinstance(layer, self._wrappers):
+            if isinstance(layer, (*self._refused, BaseShield)):
+                raise ValueError(
+                    f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the "
+                    "shield around the environment first"
+                )
+            layer = layer.env
+        if not isinstance(layer, self._wanted):
+            wanted = self._wanted.__name__
+            raise ValueError(f"the shield needs an {wanted} inside, got {type(layer).__name__}{_hint_for(env)}")
+        return layer
+
+    @staticmethod
+    def _premises(inner: Any) -> dict[str, Any]:
+        """Returns what a proof rests on, by name: the environment and its settings, of a vector those of either."""
+        single = getattr(inner, "single", inner)
+        premises = {name: getattr(single, name) for name in PREMISES}
+        of_vector = {f"{name} of the vector": getattr(inner, name, premises[name]) for name in PREMISES}
+        return {"environment": inner} | premises | of_vector
+
+    def _require_same(self) -> None:
+        now = self._premises(self._environment_in(self.env))
+        for name, value in self._made_for.items():
+            if now[name] is not value:
+                why = f"the {name} is not the one that the shield was made for"
+                raise ValueError(f"{why}: wrap the environment in a shield of its own")
+
+    def _look_at(self, channels: set[Channel]) -> None:
+        """Warns the caller's caller of channels of the present episodes that are new and break the contract."""
+        for channel in channels - self._channels:
+            warn_of_broken_contract(self._certificate.contract, channel, self._input_delay, stacklevel=4)
+        self._channels = channels
+
+    def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
+        """Tells the picture of the step that follows, or of a reset, what the shield does in it."""
+        self._inner.annotate(
+            Annotation(
+                safe_set=self._certificate.safe_set,
+                label=self._filter.mode,
+                proposed=proposed,
+                intervened=intervened,
+                interventions=interventions,
+                protects=self._filter.mode != "monitor",
+                plan=None if self._filter.lookahead is None else plan.copy(),
+            )
+        )
+
+
+class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
     """Overrides an action whenever the safe set could be left (docs/shield.md).
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
@@ -88,12 +184,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             is wrong.
     """
 
-    certificate: Certificate = setting("certificate")
-    filter: SafetyFilter = setting("filter")
-    mode: str = setting("mode", "_filter.mode")
-    horizon: int | None = setting("horizon", "_filter.horizon")
-    on_unproved: str = setting("on_unproved", "_lost.on_unproved")
-    channel: Channel = setting("channel", "_inner.channel")
+    _wanted, _wrappers, _refused = NCSEnv, gym.Wrapper, REFUSED
 
     def __init__(
         self,
@@ -104,27 +195,13 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         horizon: int | None = None,
         on_unproved: str = "warn",
     ) -> None:
-        recorded = recorded_certificate(certificate)
-        certificate = None if certificate is None else Certificate.read(certificate)
-        given = {"certificate": recorded, "mode": mode, "penalty": penalty, "horizon": horizon}
-        RecordConstructorArgs.__init__(self, **given, on_unproved=on_unproved)
-        inner = self._inner = self._environment_in(env)
-        if env.action_space != inner.action_space:
-            raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
-        gym.Wrapper.__init__(self, env)
-        self.penalty = as_number(penalty, "penalty", low=0.0)
-        self._lost = LostGuarantee(on_unproved)
-        self._certificate = (
-            certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
-        )
-        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
-        self._monitored = MonitoredFilter(self._filter, inner.downlink_protocol)
-        self._channels = warned_of({inner.channel}, set(), self._certificate, self._monitored.input_delay)
+        self._make(env, certificate, mode, penalty, horizon, on_unproved)
+        self._look_at({self._inner.channel})
+        self._monitored = MonitoredFilter(self._filter, self._inner.downlink_protocol)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
-        self._made_for = premises_of(inner, inner)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`.
@@ -142,19 +219,16 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
-        inner = self._environment_in(self.env)
-        require_same(self._made_for, premises_of(inner, inner))
-        self._channels = warned_of(
-            {inner.episode_channel}, self._channels, self._certificate, self._monitored.input_delay
-        )
-        clock, report = self._read_clock(), self._observed(inner.known)
-        start = self._inner.start
+        self._require_same()
+        self._look_at({self._inner.episode_channel})
+        clock, known, start = self._read_clock(), self._inner.known, self._inner.start
+        report = self._observed(known)
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
-            self._start, self._known = start, starts_known(self._filter, start, self._monitored.input_delay)
+            self._start, self._known = start, starts_known(self._filter, start, self._input_delay)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.estimates_ahead()[:-1])
         self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
-        margin = self._filter.margin(report.estimate, inner.known.error_shape, u)
+        margin = self._filter.margin(report.estimate, known.error_shape, u)
         self._clock = clock
         info = info | self._info(u, u, margin, intervened=False)
         self._lost.begin()
@@ -189,22 +263,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self._lost.tell_of(info["shield_reason"])
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
-    @staticmethod
-    def _environment_in(env: gym.Env) -> NCSEnv:
-        """Returns the environment behind all wrappers, none of which may stand between it and a shield."""
-        return environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
-
     def _observed(self, known: Known) -> LoopObservation:
-        """Returns what the decision and the guarantee need of what the innermost environment knows."""
         return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age)
 
     def _read_clock(self) -> tuple[int, int]:
-        """Returns the number of episodes begun and of steps taken in this one."""
         return self._inner.episodes, self._inner.steps
-
-    def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
-        """Tells the picture of the step that follows what the shield does in it."""
-        self._inner.annotate(annotation_of(self._filter, proposed, interventions, plan, intervened=intervened))
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._monitored.reason
@@ -220,36 +283,6 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             "episode_interventions": self._interventions,
             "episode_guaranteed": self._proved / (self._inner.steps + 1),
         }
-
-
-def annotation_of(
-    safety_filter: SafetyFilter, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool
-) -> Annotation:
-    """Returns what a picture shows of a shield in a step, or at a reset, where nothing is proposed."""
-    return Annotation(
-        safe_set=safety_filter.certificate.safe_set,
-        label=safety_filter.mode,
-        proposed=proposed,
-        intervened=intervened,
-        interventions=interventions,
-        protects=safety_filter.mode != "monitor",
-        plan=None if safety_filter.lookahead is None else plan.copy(),
-    )
-
-
-def recorded_certificate(given: Any) -> Any:
-    """Returns what a spec says of a certificate that is given: JSON values.
-
-    Raises:
-        ValueError: If it is neither a certificate, nor its document, nor a path.
-    """
-    if given is None or isinstance(given, Mapping):
-        return given
-    if isinstance(given, Certificate):
-        return given.document
-    if isinstance(given, (str, os.PathLike)):
-        return os.fspath(given)
-    raise ValueError(f"certificate must be a Certificate, its document or path, or None, got {shown(given)}")
 
 
 def certificate_for(
@@ -271,48 +304,13 @@ def certificate_for(
     """
     key = plant.fingerprint, contract, safe_set
     if key not in _synthesized:
-        from shields.synthesis import synthesize  # the solver, which who has a certificate does without
+        from shields.synthesis import synthesize  # imported here: who has a certificate needs no solver
 
         _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
     return _synthesized[key]
 
 
-def warned_of(now: set[Channel], before: set[Channel], certificate: Certificate, input_delay: int) -> set[Channel]:
-    """Returns the channels of the present episodes; warns the caller's caller of new ones that break the contract.
-
-    Args:
-        now: These channels.
-        before: Those that were looked at before.
-        certificate: Rests on a contract.
-        input_delay: c.
-    """
-    for channel in now - before:
-        warn_of_broken_contract(certificate.contract, channel, input_delay, stacklevel=4)
-    return now
-
-
-def premises_of(inner: NCSEnv | NCSVectorEnv, single: NCSEnv) -> dict[str, Any]:
-    """Returns what a shield's proof rests on, by name: an environment and its settings.
-
-    Args:
-        inner: The innermost environment.
-        single: Of a vector, the scalar environment with its settings; else the same.
-    """
-    premises = {name: getattr(single, name) for name in PREMISES}
-    of_vector = {f"{name} of the vector": getattr(inner, name, premises[name]) for name in PREMISES}
-    return {"environment": inner} | premises | of_vector
-
-
-def require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raises ValueError unless what `premises_of` returned for a shield is what it returns now."""
-    for name, value in before.items():
-        if now[name] is not value:
-            raise ValueError(
-                f"the {name} is not the one that the shield was made for: wrap the environment in a shield of its own"
-            )
-
-
-def hint_for(env: Any) -> str:
+def _hint_for(env: Any) -> str:
     """Returns which shield an environment takes that the other one refuses, or what to read if neither takes it."""
     inner = getattr(env, "unwrapped", None)
     if isinstance(inner, NCSEnv):
@@ -322,29 +320,3 @@ def hint_for(env: Any) -> str:
     if isinstance(inner, VectorEnv):
         return ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
     return ", which has no linear model with bounds: docs/own_plant.md says how one is given to it"
-
-
-def environment_behind(env: Any, wrappers: type, refused: tuple[type, ...], wanted: type[T], hint: str = "") -> T:
-    """Returns the innermost environment after looking at every wrapper around it.
-
-    Args:
-        env: Environment or vector environment.
-        wrappers: Base class of its wrappers.
-        refused: Wrappers that may not be inside a shield.
-        wanted: Class of the innermost environment.
-        hint: What to do about another one.
-
-    Raises:
-        ValueError: If a wrapper is refused, or the innermost environment is of another class.
-    """
-    layer = env
-    while isinstance(layer, wrappers):
-        if isinstance(layer, refused):
-            raise ValueError(
-                f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the shield "
-                "around the environment first"
-            )
-        layer = layer.env
-    if not isinstance(layer, wanted):
-        raise ValueError(f"the shield needs an {wanted.__name__} inside, got {type(layer).__name__}{hint}")
-    return layer

@@ -9,9 +9,18 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.verification.conditions import Condition, flag, scalar_condition
-from shields.verification.polytope_conditions import ACTION_ROUNDING, half_widths, reach, root_above
-from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational, scale
+from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
+from shields.verification.polytope_conditions import half_widths, reach, root_above
+from shields.verification.rational_matrix import (
+    Matrix,
+    add,
+    congruence,
+    multiply,
+    quadratic,
+    rational,
+    scale,
+    weighted_size,
+)
 
 # A series ends where what is left of it is below this, next to what a row reaches; one that is longer is not summed.
 _SMALLEST_TAIL, _MOST_TERMS = Fraction(1, 2**100), 1000
@@ -67,7 +76,7 @@ def _closed_loop_conditions(
             pushed = rational(rows.input[i, j])
             image = add(rational(rows.state[i, j]), multiply(pushed, K))[0]
             left = allowed - root_above(max(quadratic(pushed, error) for error in errors))
-            left -= ACTION_ROUNDING * sum((abs(b) * u for b, u in zip(pushed[0], limits, strict=True)), Fraction(0))
+            left -= ACTION_ROUNDING * weighted_size(pushed[0], limits)
             yield scalar_condition(
                 f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", left - root_above(quadratic([image], L))
             )
@@ -92,12 +101,8 @@ def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fractio
     """
     points = len(grid) - 1
     h, error, bend, square = dt / points, Fraction(0), Fraction(0), multiply(G, G)
-    norm = max(sum((abs(g) * w for g, w in zip(line, sizes, strict=True)), Fraction(0)) / sizes[i]
-               for i, line in enumerate(G))  # fmt: skip
-    drift = max(
-        sum((abs(g) * w for g, w in zip(line, sizes, strict=True)), Fraction(0)) / sizes[i] + line[i] - abs(line[i])
-        for i, line in enumerate(G)
-    )
+    norm = max(weighted_size(line, sizes) / sizes[i] for i, line in enumerate(G))
+    drift = max(weighted_size(line, sizes) / sizes[i] + line[i] - abs(line[i]) for i, line in enumerate(G))
     growth = _moved([Fraction(1)], [[max(drift, Fraction(0))]], [Fraction(1)], h, max(drift, Fraction(0)))
     if growth is None:
         return None
@@ -106,9 +111,9 @@ def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fractio
         if moved is None:
             return None
         exact, tail = moved
-        error = max(error, _size([a - b for a, b in zip(exact, given, strict=True)], sizes) + tail)
+        error = max(error, weighted_size([a - b for a, b in zip(exact, given, strict=True)], sizes) + tail)
         if i < points:
-            bend = max(bend, _size(multiply([exact], square)[0], sizes) + tail * norm**2)
+            bend = max(bend, weighted_size(multiply([exact], square)[0], sizes) + tail * norm**2)
     return error + h * h / 8 * (growth[0][0] + growth[1]) * bend
 
 
@@ -117,17 +122,10 @@ def _moved(
 ) -> tuple[list[Fraction], Fraction] | None:
     """Returns row exp(G t) by its series, and a bound of what is left of that; None if it is too long.
 
-    After the term of power p that is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)).
-
-    Args:
-        row: Shape (n + m,).
-        G: The generator.
-        sizes: W of the norm |q| = sum |q_j| W_j.
-        time: t.
-        norm: |G|.
+    After the term of power p that is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)), with norm = |G|.
     """
     term, total, step = row, row, scale(time, G)
-    left = size = _size(row, sizes)
+    left = size = weighted_size(row, sizes)
     for power in range(1, _MOST_TERMS):
         left *= time * norm / power
         term = [entry / power for entry in multiply([term], step)[0]]
@@ -136,8 +134,3 @@ def _moved(
         if 2 * ratio <= 1 and left <= _SMALLEST_TAIL * size:
             return total, left * 2 * time * norm / (power + 1)
     return None
-
-
-def _size(row: list[Fraction], sizes: list[Fraction]) -> Fraction:
-    """Returns |q| = sum |q_j| W_j."""
-    return sum((abs(entry) * size for entry, size in zip(row, sizes, strict=True)), Fraction(0))

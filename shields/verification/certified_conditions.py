@@ -12,7 +12,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
 from shields.verification.between_samples import between_conditions
-from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
+from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
 from shields.verification.polytope_conditions import polytope_conditions
 from shields.verification.rational_matrix import (
     Matrix,
@@ -25,16 +25,17 @@ from shields.verification.rational_matrix import (
     subtract,
 )
 
-# Rounding an action in [-1, 1] to float32 changes it by at most this.
-ACTION_ROUNDING = Fraction(1, 2**24)
-
 
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
-    """Returns all conditions for a certificate whose shapes fit the plant.
-
-    Unless the multipliers are in their ranges, only their conditions are returned: the others prove nothing then.
-    """
-    conditions = list(_multiplier_conditions(certificate))
+    """Returns all conditions; only those of shapes or multipliers where these are wrong: others prove nothing then."""
+    updates = certificate.updates
+    fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
+    fits = fits and all(len(proof.inputs) == plant.m for proof in certificate.proofs)
+    fits = fits and (updates is None or updates.gains.shape[1:] == (plant.n, plant.p))
+    conditions = [flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits)]
+    if not fits:
+        return conditions
+    conditions += _multiplier_conditions(certificate)
     if all(condition.holds for condition in conditions):
         conditions += _bound_conditions(certificate, plant)
         conditions += _error_conditions(certificate, plant)
@@ -46,15 +47,7 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
     return conditions
 
 
-def multipliers_fit(certificate: Certificate, plant: LinearPlant) -> bool:
-    """Returns whether every proof has a multiplier per input, and under a contract gains of the plant's shape."""
-    updates = certificate.updates
-    gains_fit = updates is None or updates.gains.shape[1:] == (plant.n, plant.p)
-    return gains_fit and all(len(proof.inputs) == plant.m for proof in certificate.proofs)
-
-
 def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
-    """Checks the ranges of all multipliers."""
     proofs, (_, rounding) = certificate.proofs, certificate.disturbances()
     fractions = [each for proof in proofs for each in (proof.rate, *proof.inputs)]
     if certificate.updates is not None:
@@ -191,11 +184,7 @@ def _sum_bound(first: Matrix, second: Matrix, weight: Matrix) -> Matrix:
 
 def _smallest_trace_multiplier(first: Matrix, second: Matrix, weight: Matrix) -> Fraction:
     """Returns a rational nu near the minimizer of tr(W P); every nu in (0, 1) proves containment."""
-    a, b = (math.sqrt(_trace(multiply(weight, matrix))) for matrix in (first, second))
+    traces = (sum(row[i] for i, row in enumerate(multiply(weight, matrix))) for matrix in (first, second))
+    a, b = map(math.sqrt, traces)
     nu = Fraction(a) / (Fraction(a) + Fraction(b)) if a + b > 0.0 else Fraction(1, 2)
     return min(max(nu, Fraction(SMALLEST_MULTIPLIER)), 1 - Fraction(SMALLEST_MULTIPLIER))
-
-
-def _trace(matrix: Matrix) -> Fraction:
-    """Returns the trace."""
-    return sum((matrix[i][i] for i in range(len(matrix))), Fraction(0))

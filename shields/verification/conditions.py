@@ -9,6 +9,8 @@ import numpy as np
 
 from shields.verification.rational_matrix import Matrix, is_positive_semidefinite, to_float
 
+# Rounding an action in [-1, 1] to float32 changes it by at most this.
+ACTION_ROUNDING = Fraction(1, 2**24)
 # The margin of a violated condition is at most this, the largest negative float.
 _LARGEST_NEGATIVE = -5e-324
 

@@ -11,11 +11,18 @@ import numpy as np
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
-from shields.verification.conditions import Condition, flag, scalar_condition
-from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational, transpose
+from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
+from shields.verification.rational_matrix import (
+    Matrix,
+    add,
+    congruence,
+    multiply,
+    quadratic,
+    rational,
+    transpose,
+    weighted_size,
+)
 
-# Rounding an action in [-1, 1] to float32 changes it by at most this.
-ACTION_ROUNDING = Fraction(1, 2**24)
 # Binary digits behind the point of an upper bound of a root.
 _ROOT_DIGITS = 128
 
@@ -47,7 +54,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     for i, image in enumerate(next_rows):
         s = root_above(max(quadratic([pushed[i]], error) for error in errors))
         d = root_above(quadratic([G[i]], D))
-        d += ACTION_ROUNDING * sum((abs(b) * limit for b, limit in zip(pushed[i], limits, strict=True)), Fraction(0))
+        d += ACTION_ROUNDING * weighted_size(pushed[i], limits)
         left = 1 - reach(image, multipliers[i], G, widths) - s - d
         yield scalar_condition(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
     for i, (gain, limit) in enumerate(zip(K, limits, strict=True)):
@@ -64,7 +71,7 @@ def reach(image: list[Fraction], multipliers: np.ndarray, G: Matrix, widths: lis
         multiplier = Fraction(float(multipliers[index]))
         total += abs(multiplier)
         rest = [left - multiplier * entry for left, entry in zip(rest, G[index], strict=True)]
-    return total + sum((abs(left) * width for left, width in zip(rest, widths, strict=True)), Fraction(0))
+    return total + weighted_size(rest, widths)
 
 
 def half_widths(box: Matrix) -> list[Fraction] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from fractions import Fraction
 
 import numpy as np
@@ -48,6 +49,11 @@ def congruence(factor: Matrix, matrix: Matrix) -> Matrix:
 def quadratic(row: Matrix, matrix: Matrix) -> Fraction:
     """Returns the number row @ matrix @ row' for a row of shape (1, n)."""
     return congruence(row, matrix)[0][0]
+
+
+def weighted_size(row: Iterable[Fraction], weights: Iterable[Fraction]) -> Fraction:
+    """Returns sum |q_j| w_j, the largest |q x| for |x_j| <= w_j."""
+    return sum((abs(entry) * weight for entry, weight in zip(row, weights, strict=True)), Fraction(0))
 
 
 def is_positive_semidefinite(matrix: Matrix, *, strict: bool = False) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +11,7 @@ from ncs_gym.validation import shown
 from shields.certificate import Certificate
 from shields.errors import CertificateError
 from shields.paper.conditions import paper_conditions
-from shields.verification.certified_conditions import certified_conditions, multipliers_fit
+from shields.verification.certified_conditions import certified_conditions
 from shields.verification.conditions import Condition, flag
 from shields.verification.flint import flint_conditions
 
@@ -42,20 +41,14 @@ class Report:
         holding, total = sum(c.holds for c in self.conditions), len(self.conditions)
         valid = f"valid: {holding} of {total} conditions hold in exact arithmetic"
         verdict = valid if self.valid else f"not valid: {total - holding} of {total} conditions broken"
-        return "\n".join([verdict, *map(_line, _alike(self.conditions))])
-
-
-def _alike(conditions: Iterable[Condition]) -> list[list[Condition]]:
-    """Returns the conditions in groups: those that hold and differ in age or row alone, each other by itself."""
-    groups: dict[str, list[Condition]] = {}
-    for condition in conditions:
-        name = _AGE.sub("", condition.name) if condition.holds else condition.name
-        groups.setdefault(name, []).append(condition)
-    return list(groups.values())
+        alike: dict[str, list[Condition]] = {}
+        for condition in self.conditions:
+            name = _AGE.sub("", condition.name) if condition.holds else condition.name
+            alike.setdefault(name, []).append(condition)
+        return "\n".join([verdict, *map(_line, alike.values())])
 
 
 def _line(alike: list[Condition]) -> str:
-    """Returns a group of conditions as a line of text."""
     least = min(alike, key=lambda condition: condition.margin)
     count = "" if len(alike) == 1 else f" (the least of {len(alike)})"
     return f"{'holds ' if least.holds else 'BROKEN'}  {least.margin:+.3e}  {least.name}{count}"
@@ -89,17 +82,9 @@ def verify(
 
 
 def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
-    """Returns the conditions as the first engine judges them."""
-    conditions = [flag("plant: the certificate belongs to it", plant.has_fingerprint(certificate.fingerprint))]
-    fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
-    if certificate.method == "paper":
-        conditions.append(flag("shapes: L (n, n), K (m, n)", fits))
-        conditions += paper_conditions(certificate, plant) if fits else []
-    else:
-        fits = fits and multipliers_fit(certificate, plant)
-        conditions.append(flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits))
-        conditions += certified_conditions(certificate, plant) if fits else []
-    return conditions
+    conditions = paper_conditions if certificate.method == "paper" else certified_conditions
+    belongs = flag("plant: the certificate belongs to it", plant.has_fingerprint(certificate.fingerprint))
+    return [belongs, *conditions(certificate, plant)]
 
 
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:

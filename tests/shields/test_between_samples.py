@@ -14,10 +14,10 @@ from ncs_gym import Channel, LinearPlant, Packet
 from ncs_gym.network import downlink_protocol
 from shields import Certificate, CertificateError, Infeasible, SafeLoop, SafetyFilter, SafetyShield, synthesize, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
-from shields.runtime.between_samples import grid_test
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.runtime.one_step import OneStepTest
+from shields.runtime.polytope_step import grid_test
 from shields.runtime.starts import starts_known
 from shields.synthesis.certification import with_polytope
 from tests.certificates import certificate_of

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.validation import as_numbers
 from shields.runtime.backup_plans.planner import Planner, Plans
-from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, REASONS, SAFE, STORED, Decision
+from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
 from shields.runtime.polytope_step import PolytopeTest
 
@@ -21,6 +21,10 @@ class Lookahead:
     "project" is changed (`complete`): among the projected input and the plans that are found, the input closest to the
     proposed one is applied and what follows it in its plan is stored. Without any, the next stored input is applied;
     where nothing is stored, K x_hat.
+
+    Its methods change decisions about N proposals in place, given the numbers of `some` of them, estimates x_hat (n,
+    N), what is known of the Sigma_k of each, proposals (m, N) [physical units], and plans still stored (horizon, m, N),
+    NaN beyond their ends.
 
     Args:
         test: The one-step test.
@@ -36,33 +40,12 @@ class Lookahead:
         self._test, self._margin = test, margin
         self.planner = Planner(test, gain, horizon, margin)
 
-    def keep_alone(
-        self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, margin: float
-    ) -> Decision | None:
-        """Returns the decision of `keep` about one proposal if its first candidates are enough, None if they are not.
-
-        Args:
-            estimate: x_hat, shape (n,).
-            errors: What is known of Sigma_k.
-            proposed: Shape (m,); failed the one-step test.
-            margin: Of the proposal.
-        """
-        plan = self.planner.beginning_alone(estimate, errors.shape, proposed)
-        if plan is None:
-            return None
-        return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
-
     def keep(
         self, decided: Decision, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
     ) -> None:
-        """Lets proposed inputs pass where a certified plan begins with them; changes these decisions in place.
+        """Lets inputs that failed the one-step test pass where a certified plan begins with them.
 
-        Args:
-            decided: Decisions whose `input` is the proposed one and whose `plan` is all NaN.
-            some: Numbers of those whose input failed the one-step test.
-            estimates: x_hat, shape (n, N).
-            errors: What is known of the Sigma_k of each.
-            stored: Plans still stored, shape (horizon, m, N), NaN beyond their ends.
+        Of these decisions `input` is the proposed one, and `plan` is all NaN.
         """
         if some.size:
             known = self._rows(some, estimates, errors, decided.input, stored)
@@ -78,16 +61,7 @@ class Lookahead:
         proposed: np.ndarray,
         stored: np.ndarray,
     ) -> None:
-        """Changes decisions of mode "project" about proposals that were not let pass, in place; for more see `keep`.
-
-        Args:
-            decided: Decisions about N proposals.
-            sets: Where next states lie.
-            estimates: x_hat, shape (n, N).
-            errors: What is known of the Sigma_k of each.
-            proposed: Shape (m, N) [physical units].
-            stored: Plans still stored.
-        """
+        """Changes decisions of mode "project" about proposals that were not let pass."""
         some = np.flatnonzero((decided.reason != SAFE) & (decided.reason != PLANNED))
         if not some.size:
             return
@@ -114,11 +88,7 @@ class Lookahead:
         proposed: np.ndarray,
         stored: np.ndarray,
     ) -> np.ndarray:
-        """Begins new plans in some environments where one is found that is closer than the projected input.
-
-        Returns:
-            Where it did, shape (len(some),).
-        """
+        """Begins new plans where one is found that is closer than the projected input; returns where, (len(some),)."""
         projected = decided.reason[some] == PROJECTED
         closest = np.where(projected, decided.input[:, some], np.nan)
         x_hat, shapes, wanted, plans = self._rows(some, estimates, errors, proposed, stored)
@@ -130,7 +100,7 @@ class Lookahead:
     def _rows(
         self, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, inputs: np.ndarray, stored: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns estimates, error shapes, inputs and stored plans of some environments, which are the first axis."""
+        """Returns what the planner takes of some environments."""
         x_hat, shapes = np.ascontiguousarray(estimates[:, some].T), errors.shape[..., some].transpose(2, 0, 1)
         return x_hat, shapes, inputs[:, some].T, stored[..., some].transpose(2, 0, 1)
 

@@ -6,15 +6,14 @@ which depends on Sigma_k alone, and `PlanTest` decides. Arrays count environment
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
-from shields.runtime.between_samples import GridTest, grid_test
-from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes, predicted_errors
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
+from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -30,6 +29,9 @@ class PlanTest:
     1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j + E(Sigma_pred,j) lies in
     S by the one-step test's condition; of a certificate with a polytope P, |g c_j| + rho_j(g) <= 1 for the rows g of P,
     which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the one-step test.
+
+    Its methods take estimates x_hat of E environments, shape (E, n), the tightening of the error shape of each, and P
+    plans for each, shape (E, P, N, m) [physical units].
 
     Args:
         prediction: Of the plant.
@@ -61,11 +63,11 @@ class PlanTest:
             new = {key: e for e, key in enumerate(keys)}
         if new:
             found = tightenings(self.prediction, shapes[list(new.values())])
-            known = [part[: len(self._remembered)] for part in self._table]
+            known = self._table.some(slice(len(self._remembered)))
             self._table = Tightening(*(np.concatenate(pair) for pair in zip(known, found, strict=True)))
             self._remembered |= {key: len(self._remembered) + e for e, key in enumerate(new)}
         numbers = [self._remembered[key] for key in keys]
-        return Tightening(*(part[numbers] for part in self._table))
+        return self._table.some(numbers)
 
     @np.errstate(all="ignore")  # what is not finite is not certified
     def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
@@ -77,13 +79,7 @@ class PlanTest:
         return box, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
     def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns row c_j, shape (N, r, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
-
-        Args:
-            estimates: x_hat, shape (E, n).
-            tightening: Of the error shapes of each.
-            plans: Inputs, shape (E, P, N, m) [physical units].
-        """
+        """Returns row c_j, shape (N, r, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast."""
         centers = self.prediction.centers(estimates, plans)
         steps, n, count, number = centers.shape
         values = self.prediction.rows @ centers.reshape(steps, n, -1)
@@ -95,18 +91,11 @@ class PlanTest:
 
     @np.errstate(all="ignore")
     def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
-        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N).
-
-        Args:
-            estimates: x_hat, shape (E, n).
-            tightening: Of the error shapes of each.
-            plans: Inputs, shape (E, P, N, m) [physical units].
-        """
+        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N)."""
         block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
         if len(plans) > block:
             parts = [slice(start, start + block) for start in range(0, len(plans), block)]
-            each = [self.certified(estimates[e], Tightening(*(t[e] for t in tightening)), plans[e]) for e in parts]
-            return np.concatenate(each)
+            return np.concatenate([self.certified(estimates[e], tightening.some(e), plans[e]) for e in parts])
         room, radius = self.room(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
         within = np.abs(values) <= room.transpose(1, 2, 0)[..., None]
@@ -117,12 +106,8 @@ class PlanTest:
         kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
         if self.prediction.grid is not None:
             kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
-        return kept.transpose(1, 2, 0) & self._within_limits(plans)
-
-    def _within_limits(self, plans: np.ndarray) -> np.ndarray:
-        """Returns whether the first j inputs of plans, shape (..., N, m), are within the limits, shape (..., N)."""
         allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
-        return np.logical_and.accumulate(allowed, axis=-1)
+        return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
 
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
@@ -179,19 +164,13 @@ class Prediction:
         pushes = np.array([size @ np.abs(plant.B) @ plant.u_max for size in sizes[:-1]])
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
-        ends = [] if isinstance(first, PolytopeTest) else [EndTest(first, self, j) for j in range(steps)]
-        self.ends = tuple(ends)
+        self.ends = () if isinstance(first, PolytopeTest) else tuple(EndTest(first, self, j) for j in range(steps))
         self.grid = None if plant.grid_rows is None else PlanGrid(self, test)
         self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
         self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
 
     def centers(self, estimates: np.ndarray, plans: np.ndarray) -> np.ndarray:
-        """Returns c_1..c_N, shape (N, n, E, P).
-
-        Args:
-            estimates: x_hat, shape (E, n).
-            plans: Inputs of P plans for each, shape (E, P, N, m) [physical units]; zero beyond a plan's end.
-        """
+        """Returns c_1..c_N, shape (N, n, E, P), of P plans for each of E estimates; for shapes see `PlanTest`."""
         count, number = plans.shape[:2]
         pushed = (self._forced @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         moved = (self._free @ estimates.T)[..., None] + pushed
@@ -227,29 +206,20 @@ class PlanGrid:
         self._arriving = test.disturbed
 
     def room(self, shapes: np.ndarray) -> np.ndarray:
-        """Returns 1 - rho_i less the rounding that does not depend on the estimate, shape (E, N, g).
-
-        Args:
-            shapes: Symmetric Sigma_k, shape (E, n, n).
-        """
+        """Returns 1 - rho_i less the rounding that does not depend on the estimate, (E, N, g), of shapes (E, n, n)."""
         rounding = self._rounding[:, None]
         reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
         return 1.0 - reach * (1.0 + rounding) - rounding * self._pushed
 
     def keeps(self, estimates: np.ndarray, room: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
-        """Returns whether the box is kept between the samples of the first i+1 steps of plans, shape (N, E, P).
+        """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P).
 
-        Args:
-            estimates: x_hat, shape (E, n).
-            room: What `room` returns for the error shape of each.
-            plans: Inputs, shape (E, P, N, m) [physical units].
-            margin: By which it must be kept.
+        For shapes see `PlanTest`; `room` is what the method of that name returns for the error shape of each.
         """
         steps, g, n = self.free.shape
         count, number = plans.shape[:2]
-        left = room - (np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T).reshape(
-            count, steps, g
-        )
+        rounding = np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T
+        left = room - rounding.reshape(count, steps, g)
         values = (self.forced.reshape(steps * g, -1) @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         values += (self.free.reshape(-1, n) @ estimates.T)[..., None]
         inside = np.abs(values.reshape(steps, g, count, number)) <= left.transpose(1, 2, 0)[..., None] - margin
@@ -260,7 +230,7 @@ class EndTest(OneStepTest):
     """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
 
     E(Q_0) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to sqrt(tr Q_i)
-    makes the trace smallest, also together with the estimation error that `predicted_errors` adds.
+    makes the trace smallest, also together with the estimation error that `predicted` adds.
 
     Args:
         first: The one-step test.
@@ -311,17 +281,17 @@ class Tightening(NamedTuple):
     radius: np.ndarray
     between: np.ndarray
 
+    def some(self, chosen: Any) -> Tightening:
+        """Returns those of some error shapes, given by their numbers."""
+        return Tightening(*(part[chosen] for part in self))
+
 
 @np.errstate(all="ignore")  # what overflows leaves no room
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 
     rho_j(a) = sqrt(a' A^j Sigma_k A^j' a) + sum_{i<j} sqrt(a' A^i D A^i' a), rounded outward: with |S_pq| <= s_p s_q a
-    computed b'Sb is off by at most a relative rounding of (|b|'s)^2, the powers in b included.
-
-    Args:
-        prediction: Of the plant.
-        shapes: Sigma_k, shape (E, n, n).
+    computed b'Sb is off by at most a relative rounding of (|b|'s)^2, the powers in b included. Shapes are (E, n, n).
     """
     plant, rounding = prediction.plant, prediction.rounding[:, None]
     rows, sizes = prediction.rows @ prediction.free, np.abs(prediction.rows) @ prediction.size_free
@@ -339,11 +309,10 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         ones = np.where(usable, 1.0, np.nan)[:, None] * np.ones(prediction.steps)
         none = np.empty((len(shapes), prediction.steps, 0, plant.n))
         return Tightening(ones[..., None] - reach - pushed, none, ones, between)
-    errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
+    errors = [end.predicted(shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)
     unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
     weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
-    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
     return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius, between)
 
 

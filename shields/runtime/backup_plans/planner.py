@@ -52,6 +52,9 @@ class Plans(NamedTuple):
 class Planner:
     """Finds certified plans: candidates first, then the convex program (docs/lookahead.md).
 
+    Its methods take, of E environments, estimates x_hat (E, n), error shapes Sigma_k (E, n, n), proposed inputs within
+    the limits (E, m), and plans still stored (E, N, m), NaN beyond their ends.
+
     Args:
         first: The one-step test.
         gain: K, shape (m, n).
@@ -73,13 +76,7 @@ class Planner:
         self._program = PlanProgram(self.test.prediction)
 
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
-        """Returns what `beginning_with` does if its first candidates are enough, shape (j, m); None if they are not.
-
-        Args:
-            estimate: x_hat, shape (n,).
-            shape: Sigma_k, shape (n, n).
-            proposed: Shape (m,).
-        """
+        """Returns a plan, (j, m), of a single environment, if the first candidates of `beginning_with` are enough."""
         plans = self._continued(estimate, proposed)
         certified = self.test.certified(estimate[None], self.test.tightenings_of(shape[None]), plans[None])[0]
         which = int(certified.any(axis=1).argmax())
@@ -89,7 +86,7 @@ class Planner:
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
     ) -> Plans:
-        """Returns certified plans of E environments whose first inputs are the proposed ones; for arguments see `find`.
+        """Returns certified plans whose first inputs are the proposed ones.
 
         After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
         then K, or the saturated regulator. The first candidate that is certified counts; the solver is not asked.
@@ -120,18 +117,12 @@ class Planner:
         projected: np.ndarray,
         stored: np.ndarray,
     ) -> Plans:
-        """Returns certified plans of E environments whose first inputs are close to the proposed ones.
+        """Returns certified plans whose first inputs are close to the proposed ones.
 
         Candidates are the projected input and then the regulator, what is stored, and either gain from the start. The
         solver is asked where none of them is certified; where plans end in S also if nothing is stored. Plans that end
         in P would begin closer by it in a single step, but not in a loop (docs/lookahead.md), for three times the time.
-
-        Args:
-            estimates: x_hat, shape (E, n).
-            shapes: Sigma_k, shape (E, n, n).
-            proposed: Inputs within the limits, shape (E, m).
-            projected: The closest inputs that pass the one-step test, shape (E, m); NaN where there are none.
-            stored: Plans still stored, shape (E, N, m), NaN beyond their ends.
+        `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
         """
         tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
@@ -144,8 +135,7 @@ class Planner:
                 needed |= np.isnan(stored[:, 0, 0])
             left = np.flatnonzero(needed & (plans.distances > 0.0))
             if left.size:
-                known = Tightening(*(part[left] for part in tightening))
-                plans.improve(left, self._solved(estimates[left], known, proposed[left]))
+                plans.improve(left, self._solved(estimates[left], tightening.some(left), proposed[left]))
         return plans
 
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
@@ -163,11 +153,6 @@ class Planner:
 
         The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
         as every shorter length besides. Of its plan the shortest part that is certified counts.
-
-        Args:
-            estimates: x_hat, shape (E, n).
-            tightening: Of the error shapes of each.
-            proposed: Shape (E, m).
         """
         limits, (box, radius) = self._plant.u_max, self.test.room(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)

@@ -16,7 +16,7 @@ from shields.verification import ACTION_ROUNDING
 _clarabel: Any = clarabel
 # What the program keeps away from the limits of the plan test, in units of the box and of S or P: the solver's
 # precision.
-SOLVER_RESERVE = 1e-7
+SOLVER_MARGIN = 1e-7
 MOST_ITERATIONS = 60
 
 
@@ -45,12 +45,11 @@ class PlanProgram:
         if grid is not None:
             rows = np.concatenate([rows, (grid.forced * scale).reshape(-1, len(scale))])
         self._rows = read_only(np.concatenate([rows, -rows]))
-        self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
+        self._margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
         root = prediction.ends[-1].root if prediction.ends else np.empty((0, plant.n))
         self._cone = len(root) + 1 if len(root) else 0
-        self._end_reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * float(
-            np.linalg.norm(root @ self._end, axis=0).sum()
-        )
+        pushed = float(np.linalg.norm(root @ self._end, axis=0).sum())
+        self._end_margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * pushed
         self._arrange(root)
         self._solver: Any = None
 
@@ -100,9 +99,9 @@ class PlanProgram:
         centers = self._free @ estimate
         moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
         left = [room[:-1, : len(self._C)].ravel(), room[-1, : len(self._G)], between.ravel()]
-        drift, allowed = np.concatenate(moved), np.concatenate(left) - self._reserve
+        drift, allowed = np.concatenate(moved), np.concatenate(left) - self._margin
         ones = np.ones(2 * self._length * self._m)
-        cone = np.concatenate([[radius - self._end_reserve], weighting @ centers[-1]])[: self._cone]
+        cone = np.concatenate([[radius - self._end_margin], weighting @ centers[-1]])[: self._cone]
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
         q = np.zeros(self._length * self._m)
         q[: self._m] = -2.0 * self._weights * proposed / self._limits

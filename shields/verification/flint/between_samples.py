@@ -11,10 +11,18 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
-from shields.verification.flint.exact import form, is_so, mapped, matrix, number
-from shields.verification.flint.polytope import PRECISION, at_least_zero_ball, box_extents
-
-_FLOAT32 = fmpq(1, 2**24)
+from shields.verification.flint.exact import (
+    FLOAT32,
+    PRECISION,
+    ball_at_least_zero,
+    form,
+    is_so,
+    mapped,
+    matrix,
+    number,
+    reach_of,
+)
+from shields.verification.flint.polytope import box_extents
 
 
 def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -36,25 +44,16 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     yield is_so("between samples: the box bounds every state", widths is not None)
     if not kept or widths is None:
         return
-    before = ctx.prec
-    ctx.prec = PRECISION
-    try:
+    with ctx.workprec(PRECISION):
         for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.u_max])):
             name = f"(G) what is between grid points is at most eta of row {j + 1}"
-            yield at_least_zero_ball(name, arb(number(grid.remainder[j])) - least)
+            yield ball_at_least_zero(name, arb(number(grid.remainder[j])) - least)
         if polytope is None or len(polytope.multipliers) == len(polytope.rows) + m + k * points:
             yield from _gain_conditions(certificate, plant, widths)
-    finally:
-        ctx.prec = before
 
 
 def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
-    """Returns balls around the least eta that is proved for each row of the box.
-
-    Args:
-        plant: With a model in continuous time and a grid.
-        sizes: Largest |x_i| in the box and |u_i|.
-    """
+    """Returns balls around the least eta that is proved for each row of the box, given the largest |x_i| and |u_i|."""
     grid, model, points = plant.grid_rows, plant.continuous_model, plant.between_samples
     assert grid is not None
     assert model is not None
@@ -92,25 +91,20 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[
     L, K, D = matrix(certificate.L), matrix(certificate.K), matrix(certificate.disturbances()[0])
     errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
     limits = [number(limit) for limit in plant.u_max]
-    G = None if polytope is None else matrix(polytope.rows)
+    G = None if polytope is None else matrix(polytope.rows).tolist()
     for i, (state, pushed) in enumerate(zip(grid.state, grid.input, strict=True)):
         for j in range(k):
             push = matrix(pushed[j])
             image = matrix(state[j]) + push * K
             rest = 1 - number(grid.remainder[j])
-            rest -= _FLOAT32 * sum((abs(push[0, a]) * limits[a] for a in range(plant.m)), fmpq(0))
+            rest -= FLOAT32 * reach_of(push, limits)
             left = arb(rest) - arb(form(matrix(plant.box_rows[j]), D)).sqrt()
             left -= arb(max(form(push, error) for error in errors)).sqrt()
             where = f"tau_{i} of row {j + 1}"
-            yield at_least_zero_ball(f"(B) |c x| + rho <= 1 - eta on S at {where}", left - arb(form(image, L)).sqrt())
+            yield ball_at_least_zero(f"(B) |c x| + rho <= 1 - eta on S at {where}", left - arb(form(image, L)).sqrt())
             if polytope is not None and G is not None:
                 given = polytope.multipliers[len(polytope.rows) + plant.m + i * k + j]
                 used = [(int(index), number(given[index])) for index in np.flatnonzero(given)]
-                over = image - sum((value * _row(G, index) for index, value in used), fmpq_mat(1, n))
-                reach = sum((abs(value) for _, value in used), fmpq(0))
-                reach += sum((abs(over[0, a]) * widths[a] for a in range(n)), fmpq(0))
-                yield at_least_zero_ball(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left - arb(reach))
-
-
-def _row(rows: Any, index: int) -> Any:
-    return fmpq_mat([[rows[index, a] for a in range(rows.ncols())]])
+                over = image - sum((value * fmpq_mat([G[index]]) for index, value in used), fmpq_mat(1, n))
+                reach = sum((abs(value) for _, value in used), reach_of(over, widths))
+                yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left - arb(reach))

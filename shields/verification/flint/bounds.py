@@ -13,10 +13,8 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
 from shields.certificate import Updates
 from shields.verification.conditions import Condition
-from shields.verification.flint.exact import at_least_zero, definite, identity, is_so, matrix, number
+from shields.verification.flint.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number
 
-# Bits of ball arithmetic.
-PRECISION = 256
 # No term of a sum of ellipsoids gets a smaller weight.
 _SMALLEST_WEIGHT = 1e-9
 
@@ -59,7 +57,13 @@ def bound_conditions(D: Any, updates: Updates | None, plant: LinearPlant) -> Ite
     radius = _part(number(plant.initial_radius_squared) * identity(plant.n), weight).size
     first = [_noise(plant.initial_noise, weight)._replace(size=radius), _declared(plant.initial_bound, weight)]
     yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape_matrix), first)
-    yield from _truncations(plant)
+    for what, noise in (
+        ("process noise", plant.process_noise),
+        ("sensor noise", plant.sensor_noise),
+        ("first error", plant.initial_noise),
+    ):
+        if np.any(noise.covariance):
+            yield keeps_enough(f"chi-square: no more than delta of the {what} is truncated", noise, plant)
 
 
 def keeps_enough(name: str, noise: TruncatedGaussian, plant: LinearPlant) -> Condition:
@@ -73,19 +77,7 @@ def keeps_enough(name: str, noise: TruncatedGaussian, plant: LinearPlant) -> Con
         return at_least_zero(name, slack.fmpq())
 
 
-def _truncations(plant: LinearPlant) -> Iterator[Condition]:
-    """Checks the chi-square quantiles of all noise that there is."""
-    for what, noise in (
-        ("process noise", plant.process_noise),
-        ("sensor noise", plant.sensor_noise),
-        ("first error", plant.initial_noise),
-    ):
-        if np.any(noise.covariance):
-            yield keeps_enough(f"chi-square: no more than delta of the {what} is truncated", noise, plant)
-
-
 def _noise(noise: TruncatedGaussian, weight: np.ndarray) -> Part:
-    """Returns the ellipsoid of truncated noise."""
     return _part(number(noise.energy) * matrix(noise.covariance), weight)
 
 
@@ -111,9 +103,7 @@ def _holds_sum(name: str, outer: Any, parts: list[Part]) -> Condition:
     """
     parts = [part for part in parts if any(part.shape.entries())]
     weights = _weights([part.size for part in parts])
-    product = fmpq(1)
-    for weight in weights:
-        product *= weight
+    product = math.prod(weights, start=fmpq(1))
     difference = product * outer
     for part, weight in zip(parts, weights, strict=True):
         difference -= (product / weight) * part.shape

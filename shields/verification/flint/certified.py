@@ -14,11 +14,18 @@ from shields.certificate import Certificate
 from shields.verification.conditions import Condition
 from shields.verification.flint.between_samples import between_conditions
 from shields.verification.flint.bounds import bound_conditions
-from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number
+from shields.verification.flint.exact import (
+    FLOAT32,
+    at_least_zero,
+    definite,
+    form,
+    identity,
+    is_so,
+    mapped,
+    matrix,
+    number,
+)
 from shields.verification.flint.polytope import polytope_conditions
-
-# An action in [-1, 1] that becomes a float32 moves by at most half a unit in the last of 24 binary digits.
-_FLOAT32 = fmpq(1, 2**24)
 
 
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -111,7 +118,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
     rounding = 0 * D
     for i, limit in enumerate(plant.u_max):
         column = matrix(plant.B[:, i])
-        rounding += plant.m * (_FLOAT32 * number(limit)) ** 2 * (column.transpose() * column)
+        rounding += plant.m * (FLOAT32 * number(limit)) ** 2 * (column.transpose() * column)
     D_u = (1 + s) * (s * D + rounding)
     for age, proof in enumerate(certificate.proofs):
         label = "" if certificate.updates is None else f" at age {age}"
@@ -121,7 +128,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
         yield definite(f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{label}", kept, unit)
         for i, (limit, row, value) in enumerate(zip(plant.u_max, K_rows, proof.inputs, strict=True)):
             mu = number(value)
-            allowed = number(limit) ** 2 * (1 - _FLOAT32) ** 2
+            allowed = number(limit) ** 2 * (1 - FLOAT32) ** 2
             slack = mu * (1 - mu) * allowed - (1 - mu) * form(row, L) - mu * form(row, Sigma)
             name = f"(U) input {i + 1} stays within u_max (1 - 2^-24){label}"
             yield at_least_zero(name, slack, mu * (1 - mu))

@@ -9,6 +9,10 @@ from flint import fmpq, fmpq_mat
 
 from shields.verification.conditions import Condition
 
+# An action in [-1, 1] that becomes a float32 moves by at most half a unit in the last of 24 binary digits.
+FLOAT32 = fmpq(1, 2**24)
+# Bits of ball arithmetic: far more than what conditions keep from their limits.
+PRECISION = 256
 # Margins are for people, their sign is not: that of a condition that does not hold is below zero.
 _JUST_NEGATIVE = -float(np.nextafter(0.0, 1.0))
 
@@ -36,6 +40,11 @@ def mapped(factor: Any, shape: Any) -> Any:
 def form(row: Any, shape: Any) -> Any:
     """Returns the number row @ shape @ row'."""
     return mapped(row, shape)[0, 0]
+
+
+def reach_of(row: Any, sizes: list[Any]) -> Any:
+    """Returns the largest |row @ x| for |x_j| <= sizes_j, of a matrix with one row."""
+    return sum((abs(row[0, j]) * size for j, size in enumerate(sizes)), fmpq(0))
 
 
 def is_semidefinite(symmetric: Any, *, strictly: bool = False) -> bool:
@@ -78,6 +87,12 @@ def at_least_zero(name: str, difference: Any, unit: Any = 1) -> Condition:
     except OverflowError:
         margin = np.inf
     return Condition(name, _signed(margin, holds), holds)
+
+
+def ball_at_least_zero(name: str, ball: Any) -> Condition:
+    """Returns the condition that every number in a ball is not negative; a ball around zero does not hold."""
+    holds = bool(ball >= 0)
+    return Condition(name, _signed(float(ball.mid()), holds), holds)
 
 
 def is_so(name: str, holds: bool) -> Condition:

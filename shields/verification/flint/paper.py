@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from flint import arb, ctx, fmpq, fmpq_mat
@@ -11,21 +11,23 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
-from shields.verification.flint.bounds import PRECISION, keeps_enough
-from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number
+from shields.verification.flint.bounds import keeps_enough
+from shields.verification.flint.exact import (
+    PRECISION,
+    at_least_zero,
+    definite,
+    form,
+    identity,
+    is_so,
+    mapped,
+    matrix,
+    number,
+)
 
 # Where 1 - kappa rho is smaller, Theorem 2 bounds nothing.
 _SMALLEST_GAP = 1e-9
 # The constants that a certificate states are floats: they may differ from the true ones by this, relative to them.
 _STATED = fmpq(1, 10**9)
-
-
-class _Constants(NamedTuple):
-    """Enclosures of the constants of OP at one (kappa, rho)."""
-
-    epsilon_up: Any
-    epsilon: Any
-    alpha: Any
 
 
 def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -45,17 +47,17 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     if not inside:
         return
     with ctx.workprec(PRECISION):
-        constants = _constants(kappa, rho, plant)
-        agree = _is_near(stated.epsilon_up, constants.epsilon_up) and _is_near(stated.epsilon, constants.epsilon)
+        epsilon_up, epsilon, alpha = _constants(kappa, rho, plant)
+        agree = _is_near(stated.epsilon_up, epsilon_up) and _is_near(stated.epsilon, epsilon)
         yield is_so("eps_up and eps are those of Theorems 2 and 3", agree)
     yield keeps_enough("chi-square: no more than delta is truncated", plant.process_noise, plant)
-    yield from _set_conditions(certificate, kappa, rho, constants, plant)
+    yield from _set_conditions(certificate, kappa, rho, epsilon_up, alpha, plant)
 
 
 def _set_conditions(
-    certificate: Certificate, kappa: Any, rho: Any, constants: _Constants, plant: LinearPlant
+    certificate: Certificate, kappa: Any, rho: Any, epsilon_up: Any, alpha: Any, plant: LinearPlant
 ) -> Iterator[Condition]:
-    """Checks the constraints on L and K."""
+    """Checks the constraints on L and K, given enclosures of the constants."""
     L, K, n = matrix(certificate.L), matrix(certificate.K), plant.n
     positive = definite("L > 0", L, strictly=True)
     yield positive
@@ -63,23 +65,23 @@ def _set_conditions(
         closed_loop, M = matrix(plant.A) + matrix(plant.B) * K, L.inv()
         yield definite("(C1) kappa M - (A+BK)' M (A+BK) >= 0", kappa * M - mapped(closed_loop.transpose(), M))
     with ctx.workprec(PRECISION):
-        alpha = constants.alpha.upper().fmpq()
-    yield definite("(C2) L >= alpha I", L - alpha * identity(n))
+        least = alpha.upper().fmpq()
+    yield definite("(C2) L >= alpha I", L - least * identity(n))
     for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
     for i, limit in enumerate(plant.u_max):
         row = matrix(certificate.K[i])
         slack = number(limit) ** 2 / 2 - form(row, L)
-        if constants.alpha > 0:
+        if alpha > 0:
             with ctx.workprec(PRECISION):
-                error = arb(form(row * L, identity(n))) * constants.epsilon_up / constants.alpha**2
+                error = arb(form(row * L, identity(n))) * epsilon_up / alpha**2
                 slack = (arb(slack) - error).lower().fmpq()
         yield at_least_zero(f"(C4)-(C6) input {i + 1}", slack)
     yield definite("(C7) rho lambda_min(L) >= lambda_max(L)", _ratios(rho, L))
 
 
-def _constants(kappa: Any, rho: Any, plant: LinearPlant) -> _Constants:
-    """Returns the constants of Theorems 2 and 3 and of Definition 4 with g_bar^2 = kappa rho."""
+def _constants(kappa: Any, rho: Any, plant: LinearPlant) -> tuple[Any, Any, Any]:
+    """Returns enclosures of eps_up, eps and alpha (Theorems 2 and 3, Definition 4) with g_bar^2 = kappa rho."""
     g2, gamma = arb(kappa * rho), arb(number(plant.gamma))
     q_bar = _largest_eigenvalue(matrix(plant.process_noise_cov)) + gamma
     p0, A = _largest_eigenvalue(matrix(plant.initial_cov)), matrix(plant.A)
@@ -87,8 +89,7 @@ def _constants(kappa: Any, rho: Any, plant: LinearPlant) -> _Constants:
     epsilon_up = (p0 * g2 + q_bar / arb(1 - kappa * rho)) * quantile
     norm = _largest_eigenvalue(A.transpose() * A).sqrt()
     epsilon = (g2.sqrt() + norm) ** 2 * epsilon_up
-    alpha = ((gamma.sqrt() + epsilon.sqrt()) / (1 - arb(kappa).sqrt())) ** 2
-    return _Constants(epsilon_up, epsilon, alpha)
+    return epsilon_up, epsilon, ((gamma.sqrt() + epsilon.sqrt()) / (1 - arb(kappa).sqrt())) ** 2
 
 
 def _largest_eigenvalue(symmetric: Any) -> Any:

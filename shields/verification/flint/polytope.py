@@ -12,11 +12,17 @@ from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
 from shields.verification.conditions import Condition
-from shields.verification.flint.exact import form, is_so, mapped, matrix, number
-
-_FLOAT32 = fmpq(1, 2**24)
-# Binary digits of roots, far beyond what rows and multipliers keep from their limits.
-PRECISION = 192
+from shields.verification.flint.exact import (
+    FLOAT32,
+    PRECISION,
+    ball_at_least_zero,
+    form,
+    is_so,
+    mapped,
+    matrix,
+    number,
+    reach_of,
+)
 
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -29,8 +35,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
         return
     leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box_rows.ravel(), strict=True))
     yield is_so("polytope: its first rows are those of the safe box", leads)
-    box = matrix(plant.box_rows)
-    widths = box_extents(box)
+    widths = box_extents(matrix(plant.box_rows))
     yield is_so("polytope: the box bounds every state", widths is not None)
     if not leads or widths is None:
         return
@@ -47,21 +52,17 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     u_max = [number(limit) for limit in plant.u_max]
     errors = [matrix(proof.Sigma) for proof in certificate.proofs]
     images, gains = [mapped(B * K, Sigma) for Sigma in errors], [mapped(K, Sigma) for Sigma in errors]
-    before = ctx.prec
-    ctx.prec = PRECISION
-    try:
+    with ctx.workprec(PRECISION):
         for i in range(r):
             row = fmpq_mat([G.tolist()[i]])
             largest = max(form(row, image) for image in images)
-            rounding = sum((abs((row * B)[0, j]) * u_max[j] for j in range(plant.m)), fmpq(0)) * _FLOAT32
+            rounding = reach_of(row * B, u_max) * FLOAT32
             left = arb(1 - bounds[i] - rounding) - arb(largest).sqrt() - arb(form(row, D)).sqrt()
-            yield at_least_zero_ball(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
+            yield ball_at_least_zero(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
         for i in range(plant.m):
             largest = max(gain[i, i] for gain in gains)
-            left = arb(u_max[i] * (1 - _FLOAT32) - bounds[r + i]) - arb(largest).sqrt()
-            yield at_least_zero_ball(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
-    finally:
-        ctx.prec = before
+            left = arb(u_max[i] * (1 - FLOAT32) - bounds[r + i]) - arb(largest).sqrt()
+            yield ball_at_least_zero(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
 
 
 def box_extents(box: Any) -> list[Any] | None:
@@ -71,10 +72,3 @@ def box_extents(box: Any) -> list[Any] | None:
     # x = (C'C)^-1 C' (C x), and |C x| <= 1 entry by entry.
     inverse = (box.transpose() * box).inv() * box.transpose()
     return [sum((abs(inverse[i, j]) for j in range(box.nrows())), fmpq(0)) for i in range(box.ncols())]
-
-
-def at_least_zero_ball(name: str, ball: Any) -> Condition:
-    """Returns the condition that every number in a ball is not negative; a ball around zero does not hold."""
-    holds = bool(ball >= 0)
-    margin = float(ball.mid())
-    return Condition(name, max(margin, 0.0) if holds else min(margin, -5e-324), holds)

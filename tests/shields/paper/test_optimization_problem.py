@@ -140,7 +140,7 @@ def test_set_without_the_margin_exists_where_op_has_none():
     plant = truck_trailer()
     bounds, problem = PaperModel(plant).at(0.9, 1.05), OptimizationProblem(plant)
     assert problem.solution(bounds) is None
-    found = problem.solution(bounds, with_margin=False, with_error=False)
+    found = problem.solution(bounds, with_error=False)
     L, K = found.L, found.K
     assert np.linalg.eigvalsh(L)[0] < bounds.alpha
     closed = plant.A + plant.B @ K

@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import SafetyFilter
-from shields.runtime.one_step import OneStepTest, predicted_errors
+from shields.runtime.one_step import OneStepTest
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -33,7 +33,7 @@ def predicted(certificate, plant, shape):
 
 def errors_of(test, shape):
     """What is known of one error shape, as a batch of one."""
-    return predicted_errors(test, shape[None], np.empty((0, *shape.shape)))
+    return test.predicted(shape[None], np.empty((0, *shape.shape)))
 
 
 def reachable(test, estimate, shape):
@@ -150,7 +150,7 @@ def test_a_batch_says_of_each_what_a_batch_of_one_does(case):
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(4)
     estimates, shapes, inputs = (np.array(each) for each in zip(*cases(certificate, plant, rng, 300), strict=True))
     estimates[7], shapes[8], shapes[9] = np.nan, np.nan, -shapes[9]
-    errors = predicted_errors(test, shapes, certificate.error_shapes)
+    errors = test.predicted(shapes, certificate.error_shapes)
     chosen = rng.permutation(300)
     with np.errstate(all="ignore"):
         sets = test.reachable(estimates[chosen].T, errors.of(chosen))
@@ -237,12 +237,12 @@ def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
     test, good = OneStepTest(certificate.L, plant), 0.5 * certificate.Sigma
     swap = good + np.eye(3)[[1, 0, 2]]
     bad = [np.full((3, 3), np.nan), np.full((3, 3), np.inf), -good, 1e308 * np.eye(3), swap]
-    errors = predicted_errors(test, np.array([good, *bad, good]), certificate.error_shapes)
+    errors = test.predicted(np.array([good, *bad, good]), certificate.error_shapes)
     np.testing.assert_array_equal(np.isfinite(errors.radius), [True, *[False] * 5, True])
     np.testing.assert_array_equal(errors.certified, [True, *[False] * 5, True])
-    assert np.isnan(errors.largest[1:-1]).all()
+    assert np.isnan(errors.own[0, 1:-1]).all()
     assert np.isnan(errors.half_widths[:, 1:-1]).all()
-    alone = predicted_errors(test, good[None], certificate.error_shapes)
+    alone = test.predicted(good[None], certificate.error_shapes)
     for array, one in zip(errors, alone, strict=True):
         np.testing.assert_allclose(array[..., 0], one[..., 0], rtol=1e-12)
         np.testing.assert_array_equal(array[..., 0], array[..., -1])

@@ -10,7 +10,7 @@ import pytest
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
-from shields.runtime.one_step import OneStepTest, certified_root, predicted_errors
+from shields.runtime.one_step import OneStepTest, certified_root
 from shields.runtime.safety_filter import require_computable
 from shields.verification.rational_matrix import (
     congruence,
@@ -136,7 +136,7 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
     # The root of this L is exact; only products with it round, by terms of size `tilt` that cancel.
     factor = np.array([[1.0, 0.0], [tilt, 1.0]])
     test, rng = OneStepTest(factor @ factor.T, slanted(10.0)), np.random.default_rng(0)
-    errors = predicted_errors(test, np.zeros((1, 2, 2)), np.zeros((0, 2, 2))).single()
+    errors = test.predicted(np.zeros((1, 2, 2)), np.zeros((0, 2, 2))).single()
     for _ in range(60):
         x = factor @ rng.standard_normal(2)
         low, high = 0.0, 1e3
@@ -160,7 +160,7 @@ def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_marg
         low, high = 0.0, 1e3
         for _ in range(60):  # to the edge of what is known to be inside
             middle = 0.5 * (low + high)
-            known = test.knows_inside(np.zeros(2), predicted_errors(test, middle * shape[None], nothing).single(), 0.0)
+            known = test.knows_inside(np.zeros(2), test.predicted(middle * shape[None], nothing).single(), 0.0)
             low, high = (middle, high) if known else (low, middle)
         assert low > 0.0
         assert is_positive_semidefinite(subtract(rational(L), rational(low * shape)))

@@ -17,7 +17,7 @@ from shields.runtime.guarantee import (
     LoopObservation,
 )
 from shields.runtime.safety_filter import MODES
-from shields.runtime.starts import first_store, start_known
+from shields.runtime.starts import first_store, starts_known
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests import arrays
 from tests.certificates import certificate_of
@@ -77,7 +77,7 @@ def drive(env, steps, policy):
     safety_filter = SafetyFilter(shield.certificate, inner.plant, shield.filter.mode)
     watched = [Watched(safety_filter) for _ in range(env.num_envs)]
     _, info = env.reset(seed=0)
-    inside = start_known(safety_filter, inner.single.initial_set)
+    (inside,) = starts_known(safety_filter, inner.single.initial_set, 0)
     counts = np.zeros(env.num_envs, int)
     for e, one in enumerate(watched):
         one.start(inside, {key: value[e] for key, value in info.items()})
