@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from dataclasses import fields
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -120,10 +120,12 @@ def test_controller_that_is_killed_is_restarted_beside_the_running_plant(tmp_pat
     [{"speed": 2.0}, {"room": 3}, {"uplink": Channel(loss=0.1)}, {"downlink": Channel(loss=0.1)}, {"env": "a"}],
 )
 def test_machines_that_were_told_other_things_have_other_keys(changes):
-    told = {field.name: None for field in fields(NetworkLoop)} | {"secret": bytes(16), "speed": 1.0, "room": 1}
-    one, other = NetworkLoop(**told), NetworkLoop(**told | changes)
-    assert one.key == NetworkLoop(**told | {"seed": 7, "out": "elsewhere"}).key
-    assert one.key != other.key
+    told = {"settings": LoopSettings(), "uplink": Channel(), "downlink": Channel(), "secret": bytes(16), "max_age": 0}
+    of_settings = {name: value for name, value in changes.items() if name not in told}
+    other = told | changes if not of_settings else told | {"settings": LoopSettings(**of_settings)}
+    untold = told | {"settings": LoopSettings(seed=7, out=Path("elsewhere"))}
+    assert NetworkLoop(**told).key == NetworkLoop(**untold).key
+    assert NetworkLoop(**told).key != NetworkLoop(**other).key
     assert "--speed, --room" in waiting_text({"tag": 3})
 
 
