@@ -7,7 +7,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from experiments.baselines.regulators import RegulatorWeights
+from experiments.baselines.controllers import RegulatorWeights
 
 
 def tuned_weights(env_id: str, arm: str) -> RegulatorWeights:

@@ -11,7 +11,7 @@ import tyro
 
 from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
-from experiments.baselines.margins import MARGINS
+from experiments.baselines import MARGINS
 from experiments.settings.arguments import Assignments, OptionalStepCount, StepCount, require_horizon, require_least
 from ncs_gym.validation import shown
 
