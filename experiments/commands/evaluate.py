@@ -105,5 +105,5 @@ def _mode(settings: EvaluateSettings, agent: Agent) -> str | None:
     """Returns the mode of the shield, None for no shield; by default that of the agent's training."""
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
-    require_horizon(settings.horizon, mode)
+    require_horizon(settings, mode)
     return mode

@@ -12,7 +12,7 @@ import tyro
 from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
 from experiments.baselines import MARGINS
-from experiments.settings.arguments import Assignments, OptionalStepCount, StepCount, require_horizon, require_least
+from experiments.settings.arguments import Assignments, OptionalStepCount, StepCount, require_horizon, require_limits
 from ncs_gym.validation import shown
 
 # Address that starts a Ray cluster of its own on this machine.
@@ -42,8 +42,7 @@ class BackendSettings:
     gpus_per_run: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range or belongs to another engine."""
-        require_least(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
+        require_limits(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
         if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         whole = self.gpus_per_run <= 1.0 or self.gpus_per_run.is_integer()
@@ -169,11 +168,10 @@ class LearningSettings(BackendSettings):
         return with_changes(of_file, self.hyperparams)
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
         BackendSettings.__post_init__(self)
-        require_least(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
+        require_limits(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
-        require_horizon(self.horizon, self.mode, *arms)
+        require_horizon(self, self.mode, *arms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,10 +269,9 @@ class EvaluateSettings:
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
-        require_least(self, episodes=1, seed=0)
+        require_limits(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
-            require_horizon(self.horizon, self.shield)
+            require_horizon(self, self.shield)
 
 
 # Environments in which the network decides.
@@ -387,9 +384,8 @@ class StudySettings(BackendSettings):
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
         BackendSettings.__post_init__(self)
-        require_least(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
+        require_limits(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
         if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):

@@ -163,9 +163,9 @@ def test_networks_of_both_ways_are_chosen_by_name(env, more):
     ("arguments", "words"),
     [
         (["--speed", 0], "--speed must be positive"),
-        (["--mischief", 2], "--mischief must be a probability"),
-        (["--port", 70000], "--port must be between 1 and 65533"),
-        (["--room", -1], "--room must be between 0 and 100 steps"),
+        (["--mischief", 2], "--mischief must be at least 0 and at most 1"),
+        (["--port", 70000], "--port must be at least 1 and at most 65533"),
+        (["--room", -1], "--room must be at least 0 and at most 100"),
         (["--role", "plant"], "give both the same --key-file"),
         (["--channel", "lag=3"], "--channel lag: a channel has no such setting"),
         (["--downlink", "delay=0"], "--downlink: what is sent at each step arrives at the next at best"),
