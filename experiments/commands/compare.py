@@ -33,7 +33,7 @@ from experiments.runs.experiment import (
     run_of_arm,
 )
 from experiments.runs.loops import loop_config
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import CompareSettings
 from experiments.terminal import wrapped
@@ -53,7 +53,6 @@ def compare(settings: CompareSettings) -> None:
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):
-        prepare_output(settings.out)
         plant = ncs_env(loop.single()).plant
         verification = verify(certificate, plant)
         print(wrapped(certificate_line(certificate, verification)), wrapped(settings.agent_line), sep="\n", flush=True)

@@ -19,7 +19,7 @@ from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.heatmaps import requirements_map
 from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
 from experiments.terminal import text_table, wrapped
@@ -70,7 +70,6 @@ def requirements(settings: RequirementsSettings) -> None:
     plant, today = _plant_and_network(settings)
     asked = _values(settings, plant, today)
     with claim_folder("requirements", settings):
-        prepare_output(settings.out)
         store = _Store(settings.out)
         found = shields.requirements(
             plant,

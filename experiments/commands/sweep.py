@@ -18,7 +18,7 @@ from experiments.report.html import sweep_report
 from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
 from experiments.runs.loops import loop_config
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
@@ -53,7 +53,6 @@ def sweep(settings: SweepSettings) -> None:
     require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
-        prepare_output(settings.out)
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         runs = [

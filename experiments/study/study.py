@@ -16,7 +16,7 @@ from experiments.commands import short_version
 from experiments.commands.compare import compare
 from experiments.report.html import render_page
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.learning import short_name
@@ -50,7 +50,6 @@ def study(settings: StudySettings) -> None:
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
     with claim_folder("study", settings):
-        prepare_output(settings.out)
         parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
         comparisons, channels = {}, {}
         for name, part in parts.items():

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.results import Episode, TrainingPoint, Trajectory
-from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
-from experiments.runs.arms import Arm
+from experiments.analysis.episodes import arm_summaries, episodes_table, paired_differences
 from experiments.runs.training_run import RunResult
 
 ALL_ARMS = [
@@ -57,16 +56,10 @@ def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **cha
 
 def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str, Any]:
     """The summary of a comparison without reference policies."""
-
-    def arm(name: str) -> dict[str, Any]:
-        mode = Arm.of(name, "project").mode
-        summary = arm_summary(episodes_table(results[name]), mode, fixed_policy=False)
-        return summary | {"shielded": mode not in (None, "monitor")}
-
     baseline = next(iter(results))
     episodes = episodes_table(run for runs in results.values() for run in runs)
     return {
-        "arms": {name: arm(name) for name in results},
+        "arms": arm_summaries(episodes, "project"),
         "references": {},
         "paired_differences": {"baseline": baseline, "arms": paired_differences(episodes, baseline)},
     } | provenance(arms=list(results), **settings)

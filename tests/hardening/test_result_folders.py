@@ -16,7 +16,7 @@ from experiments.analysis.tables import summary_text
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
-from experiments.runs.output_folder import claim_folder, prepare_output
+from experiments.runs.output_folder import claim_folder
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun, _agent_of
 from experiments.settings import AttackSettings, CompareSettings
@@ -166,7 +166,8 @@ def test_only_files_that_commands_write_are_removed_before_they_are_written_agai
     for name in ("data.parquet", "figures/photo.png", "notes.html"):
         (tmp_path / name).write_text("mine")
     before = everything_in(tmp_path)
-    prepare_output(tmp_path)
+    with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
+        (tmp_path / "settings.json").unlink()
     assert everything_in(tmp_path) == before
 
 
