@@ -123,7 +123,7 @@ def _summary(
         "arms": {name: arms[name] for name in settings.arms},
         "references": {name: arms[name] for name in settings.baselines},
         "paired_differences": {"baseline": baseline, "arms": paired_differences(compared, baseline)},
-    } | (gaussian | experiment_provenance("compare", settings, loop, certificate, runs))
+    } | (gaussian | experiment_provenance(settings, loop, certificate, runs))
 
 
 def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:

@@ -73,7 +73,7 @@ def sweep(settings: SweepSettings) -> None:
         arms = [arm_summaries(part, settings.mode) for part in parts]
         summary = {
             "cells": [point | {"arms": each} for point, each in zip(points, arms, strict=True)]
-        } | experiment_provenance("sweep", settings, loops[0], certificates[0], runs)
+        } | experiment_provenance(settings, loops[0], certificates[0], runs)
         figures = sweep_figures(summary, settings.arms)
         certificates[0].save(settings.out / "certificate.json")
         verification = verify(certificates[0], ncs_env(loops[0].single()).plant)

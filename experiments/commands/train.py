@@ -39,7 +39,7 @@ def train(settings: TrainSettings) -> None:
         arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
         certificate.save(settings.out / "certificate.json")
         summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0}
-        summary |= experiment_provenance("train", settings, loop, certificate, [run])
+        summary |= experiment_provenance(settings, loop, certificate, [run])
         write_results(settings.out, summary)
         print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
         print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")

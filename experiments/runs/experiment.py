@@ -111,18 +111,24 @@ def certificate_line(certificate: Certificate, verification: Report) -> str:
     return f"{conditions} ({size})" if size else conditions
 
 
+def lasting_settings(settings: Any) -> dict[str, Any]:
+    """Returns the settings of a command that results depend on, JSON values."""
+    kept = settings_json("", settings)["settings"]
+    return {name: value for name, value in kept.items() if name not in INCIDENTAL_SETTINGS}
+
+
 def experiment_provenance(
-    command: str, settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
+    settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
 ) -> dict[str, Any]:
     """Returns what a reader needs to know where the results of a command come from, JSON values."""
-    content, env = settings_json(command, settings)["settings"], ncs_env(loop.single())
+    env = ncs_env(loop.single())
     channel = env.channel.description
     if env.downlink is not None:
         channel += f" Commands: {env.downlink.description}"
     return {
         "runs": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-        "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
+        "settings": lasting_settings(settings),
         "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},
         "described": {"plant": str(env.plant), "channel": channel},
         "certificate": certificate.checksum,
