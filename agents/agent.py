@@ -229,7 +229,6 @@ def pretrained(env_id: str) -> Agent:
 
 
 def _plant_of(env_id: str) -> LinearPlant | None:
-    """Returns an environment's plant, None for an environment without one."""
     return getattr(gym.make(env_id).unwrapped, "plant", None)
 
 
@@ -357,13 +356,7 @@ loop = LoopConfig(env=agent.env, kwargs={{"channel": agent.channel}}{shield})
 
 
 def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | None) -> str:
-    """Returns the card of an agent, in Markdown.
-
-    Args:
-        agent: The agent.
-        shield: The shield that it is meant to act behind; None for none.
-        evaluation: Episodes of the agent in that loop; None leaves the figures out.
-    """
+    """Returns the card of an agent, in Markdown, as `Agent.save` explains."""
     env = gym.make(agent.env).unwrapped
     plant, channel = getattr(env, "plant", None), agent.channel or getattr(env, "channel", None)
     rows = {

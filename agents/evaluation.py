@@ -122,7 +122,6 @@ def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
 
 
 def _first_trajectory(infos: list[dict[str, np.ndarray]]) -> Trajectory:
-    """Returns the trajectory of the first environment from the infos of its reset and of its steps."""
     steps = infos[1:]
     not_shielded = np.zeros(1, np.bool_)
     return Trajectory(

@@ -61,7 +61,6 @@ class SafetyCounts:
     overdue: int = 0
 
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
-        """Returns the counts of both."""
         sums: dict[str, Any] = {
             each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)
         }

@@ -146,12 +146,7 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
     Targets are moved as little as possible so that the regulator's own loop, from the estimate taken for the state and
     without disturbance, with a constant target keeps the limits of box and inputs less a margin for the next
     `GOVERNED_STEPS` steps. Where no target does, the middle of what the limits ask for is used (Garone et al. 2017,
-    docs/bibliography.md).
-
-    Args:
-        env: The environment; tasks other than `SetpointTracking` are not governed.
-        weights: Weights of the regulator.
-        margin: Fraction of the box that is kept free.
+    docs/bibliography.md). Tasks other than `SetpointTracking` are not governed. The margin is a fraction of the box.
     """
     plant, task = env.plant, env.task
     if not isinstance(task, SetpointTracking):
@@ -196,13 +191,8 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     """Returns model predictive control from the estimate, taken for the state, as it is usually built.
 
     It minimizes the regulator's cost over `PREDICTED_STEPS` steps, with the regulator's cost-to-go at their end, within
-    the limits of the inputs and those of the box less a margin, which may be left at a high price. (Rawlings, Mayne and
-    Diehl: "Model Predictive Control: Theory, Computation, and Design", 2017.)
-
-    Args:
-        env: The environment.
-        weights: Weights of the cost.
-        margin: Fraction of the box that is kept free.
+    the limits of the inputs and those of the box less a margin, a fraction of it, which may be left at a high price.
+    (Rawlings, Mayne and Diehl: "Model Predictive Control: Theory, Computation, and Design", 2017.)
     """
     plant, problem, steps = env.plant, regulator_problem(env, weights), PREDICTED_STEPS
     A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
@@ -249,11 +239,7 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
 def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns state (n,) and input (m,) with x = A x + B u and c x = 1, the smallest in units of box and limits.
 
-    Where there is none, the least-squares solution.
-
-    Args:
-        plant: The plant.
-        output: c, shape (n,).
+    Where there is none, the least-squares solution. The output is c, shape (n,).
     """
     n, scale = plant.n, np.concatenate([plant.half_widths, plant.u_max])
     rest = np.hstack([np.eye(n) - plant.A, -plant.B]) / plant.half_widths[:, None]

@@ -65,13 +65,7 @@ class CertaintyEquivalentFilter:
         self._plans = np.empty((0, plant.m, 0))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
-        """Returns the inputs to apply, shape (N, m).
-
-        Args:
-            estimates: x_hat, shape (N, n).
-            proposed: Shape (N, m) [physical units].
-            begun: Where an episode has just begun, shape (N,): earlier plans do not count.
-        """
+        """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
         errors, plans = self._assumed.of(np.zeros(len(estimates), np.intp)), None
         if self._plans.shape[-1] == len(estimates):
             plans = np.where(begun, np.nan, self._plans)
@@ -141,13 +135,7 @@ class PredictiveFilter:
         self._between = np.ones((horizon, 0 if grid is None else grid.free.shape[1]))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
-        """Returns the inputs to apply, shape (N, m).
-
-        Args:
-            estimates: x_hat, shape (N, n).
-            proposed: Shape (N, m) [physical units].
-            begun: Where an episode has just begun, shape (N,): earlier plans do not count.
-        """
+        """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
         if len(self._plans) != len(estimates):
             self._plans = np.full((len(estimates), self._horizon - 1, self._plant.m), np.nan)
         self._plans[begun] = np.nan
@@ -206,13 +194,9 @@ class PredictiveFilter:
 def _tube(
     certificate: Certificate, plant: LinearPlant, end_sizes: Callable[[np.ndarray], np.ndarray], horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how far true states are off a plan in the rows of the box, shape (N - 1, k), and at its end.
+    """Returns how far true states are off a plan in the rows of the box, shape (horizon - 1, k), and at its end.
 
-    Args:
-        certificate: Gives the error sets and K.
-        plant: The plant.
-        end_sizes: Returns how far the states of an ellipsoid of a given shape reach at the end.
-        horizon: N.
+    `end_sizes` returns how far the states of an ellipsoid of a given shape reach at the end.
     """
     K, rows = certificate.K, plant.box_rows
     first = list(certificate.error_shapes)

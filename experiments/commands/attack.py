@@ -105,12 +105,9 @@ def _certificates(cases: dict[str, AttackCase], folder: Path, safe_set: str | No
 
 
 def _numbers_of_batches(cases: int, count: int, least: int) -> list[int]:
-    """Returns the number of batches of each case, as even as possible, more for earlier cases.
+    """Returns the number of batches of each case, as even as possible, more for earlier cases, `count` in all.
 
-    Args:
-        cases: Number of cases.
-        count: Number of batches in all that the budget allows; one at least is run.
-        least: Number of kinds of batches, which take turns: they come in for the same cases where not all can.
+    One at least is run. The `least` kinds of batches take turns: where not all cases can have each kind, some have all.
     """
     count = max(count, 1)
     attacked = min(cases, -(-count // least))

@@ -145,7 +145,6 @@ def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[st
 
 
 def _findings(summary: dict[str, Any]) -> list[str]:
-    """Returns what to read from the table, in sentences computed from it."""
     findings = [
         f"{name} is not enough: {arm['train_violation_steps']:,} violating steps in training, "
         f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes in evaluation."

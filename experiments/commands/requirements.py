@@ -57,16 +57,7 @@ _MOST_PANELS = 9
 
 
 def requirements(settings: RequirementsSettings) -> None:
-    """Runs `ncs requirements`.
-
-    Raises:
-        ValueError: If the environment is unknown, the plant's file cannot be read, or a setting is out of range.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If the output folder cannot be written.
-        RunError: If a search fails.
-        ClusterError: If a cluster cannot execute the searches.
-    """
+    """Runs `ncs requirements`."""
     plant, today = _plant_and_network(settings)
     asked = _values(settings, plant, today)
     with claim_folder("requirements", settings):

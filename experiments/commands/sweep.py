@@ -88,7 +88,6 @@ def sweep(settings: SweepSettings) -> None:
 
 
 def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
-    """Returns the points of the grid."""
     own_unless_given = ("quantization_steps", "mass_factors", "downlink_losses")
     sides = {name: getattr(settings, name) or ((None,) if name in own_unless_given else ()) for name in _SIDES}
     for name, side in (sides | {"arms": settings.arms}).items():
@@ -103,7 +102,6 @@ def _name(point: _GridPoint) -> str:
 
 
 def _loop(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
-    """Returns the control loop with the channels and the mass of a point."""
     changes = {name: point[name] for name in ("loss", "delay", "quantization_step") if point[name] is not None}
     if point["burst_length"] and point["loss"]:
         changes["burst_length"] = point["burst_length"]

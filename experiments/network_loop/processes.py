@@ -126,12 +126,7 @@ def network_channels(
 ) -> tuple[Channel, Channel]:
     """Returns uplink and downlink of an environment as a real network has them: what is sent now arrives a step later.
 
-    Without a downlink of its own it has one like its uplink.
-
-    Args:
-        env: The environment.
-        up_changes: Changes of the uplink by name; see `changed_channel`.
-        down_changes: Those of the downlink.
+    Without a downlink of its own it has one like its uplink; for changes see `changed_channel`.
 
     Raises:
         ValueError: If a change is wrong, or is none that a real network can have.
@@ -171,13 +166,7 @@ def run_controller_node(
 ) -> bool:
     """Runs the controller in real time, until it has made its steps, the process is ended or is left alone.
 
-    Args:
-        loop: The loop.
-        show: Called with each row of the log.
-        is_alone: Whether processes that it needs have ended.
-
-    Returns:
-        Whether the process was told to end.
+    Returns whether the process was told to end; `show` is called with each row of the log.
     """
     told = _told_to_stop()
     asyncio.run(_controller(loop, show, lambda: told() or is_alone()))
@@ -321,12 +310,7 @@ def waiting_text(refused: Mapping[str, int]) -> str:
 
 
 def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries.
-
-    Raises:
-        AgentError: If there is no agent for this environment.
-        ValueError: If the folder of a run holds several agents.
-    """
+    """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries."""
     plant = env.plant
     if name == "push":
         count = 0

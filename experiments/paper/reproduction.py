@@ -141,7 +141,6 @@ def reproduction_figures(simulations: Sequence[Simulation]) -> dict[str, tuple[s
 
 
 def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation], None]) -> CaptionedFigure:
-    """Returns one panel per design, with one legend below."""
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((12, 4.8))
         axes = figure.subplots(1, len(simulations), sharey=True)

@@ -27,13 +27,7 @@ INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)
 
 
 def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
-    """Returns if agents can be trained with the hyperparameters given; those that are not given can.
-
-    Raises:
-        ValueError: If there is no such hyperparameter, or the learning library does not take its value.
-        ModuleNotFoundError: If the algorithm's package is not installed.
-        OSError: If the file of hyperparameters cannot be read.
-    """
+    """Raises what training would raise later if agents cannot be trained with the hyperparameters given."""
     if settings.hyperparams or settings.conf_file is not None:
         from agents import training  # imports torch
 

@@ -119,20 +119,12 @@ def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--cha
     return None if changed == own else changed
 
 
-def _bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
-    """Returns losses of a given probability that come in bursts of a given mean length.
+def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:
+    """Returns losses of a given probability that come in bursts of a given mean number of packets.
 
     In the bad state everything is lost. From one packet to the next, M = send_period steps later, it is to be left with
     probability b = 1/length and entered with a = loss b / (1 - loss); the chain moves every step, so its own
-    probabilities have the same ratio and the M-th root of the eigenvalue 1 - a - b.
-
-    Args:
-        loss: Probability that a packet is lost.
-        length: Mean number of packets lost in a row, >= 1; 1 / (1 - loss) if losses were independent.
-        send_period: M [steps].
-
-    Raises:
-        ValueError: If no such chain exists.
+    probabilities have the same ratio and the M-th root of the eigenvalue 1 - a - b. Raises ValueError if there is none.
     """
     usable = 0.0 <= loss < 1.0 and 1.0 <= length < float("inf")
     left = 1.0 / length if usable else 0.0

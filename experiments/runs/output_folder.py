@@ -107,12 +107,7 @@ def write_results(
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Has a folder for this process alone; where the file system knows no locks, a warning says that it has not.
-
-    Raises:
-        FolderInUseError: If another process has it.
-        OSError: If the folder cannot be written.
-    """
+    """Has a folder for this process alone; where the file system knows no locks, a warning says that it has not."""
     lock = FileLock(folder / _LOCK, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)

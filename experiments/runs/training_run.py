@@ -304,14 +304,7 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 
 
 def _agent_of(run: TrainingRun) -> Agent | None:
-    """Returns the agent that a run does not train: the one whose files it has, or one with its initial weights.
-
-    Returns:
-        None for a run with a policy that is no agent.
-
-    Raises:
-        AgentError: If the files are no agent of an environment that is registered here.
-    """
+    """Returns the agent that a run does not train: that of its files, or one with initial weights; None for none."""
     if run.agent_files:
         return _loaded(run.agent_files)
     if run.policy_kind != "untrained":

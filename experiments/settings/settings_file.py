@@ -66,7 +66,6 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
 
 
 def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
-    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:

@@ -75,7 +75,6 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
-    """Writes every file: those of the study, and those that the documentation asks for."""
     figures = study_figures(summary)
     if (page := settings.page) is not None:
         (page.parent / "images").mkdir(parents=True, exist_ok=True)

@@ -101,7 +101,6 @@ def _environment(comparison: dict[str, Any], episodes: pd.DataFrame) -> dict[str
 
 
 def _arm(arm: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
-    """Returns what pages show of an arm: its training, and its evaluation in every scenario."""
     kept = ("mode", "train_steps", "train_violation_steps", "train_violation_steps_by_run")
     scenarios = {
         scenario: _evaluated(numbers, episodes[episodes["condition"] == scenario])
