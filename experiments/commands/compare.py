@@ -69,7 +69,7 @@ def compare(settings: CompareSettings) -> None:
         files = {
             "episodes.parquet": parquet(episodes, summary),
             "training.parquet": parquet(training_table(results), summary),
-            "report.html": comparison_report(summary, verification, dict(figures.values()), findings),
+            "report.html": comparison_report(summary, verification, figures, findings),
         }
         write_results(settings.out, summary, files, figures)
         count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"

@@ -79,7 +79,7 @@ def sweep(settings: SweepSettings) -> None:
         verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
         files = {
             "episodes.parquet": parquet(pd.concat(parts), summary),
-            "report.html": sweep_report(summary, verification, dict(figures.values())),
+            "report.html": sweep_report(summary, verification, figures),
         }
         write_results(settings.out, summary, files, figures)
         count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
