@@ -11,13 +11,13 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
 from experiments.runs.experiment import certificate_of
-from experiments.runs.loops import module_and_id, registered_env, with_channel
+from experiments.runs.loops import registered_env, with_channel
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import agent_named, certificate_file
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
 from experiments.settings import EvaluateSettings
-from experiments.settings.arguments import require_horizon
+from experiments.settings.arguments import id_alone, require_horizon
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
 
@@ -32,7 +32,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     env_id = None
     if settings.env is not None:
         registered_env(settings.env)
-        env_id = module_and_id(settings.env)[1]
+        env_id = id_alone(settings.env)
     agent, folder = agent_named(str(settings.model), env_id)
     if env_id is None:
         registered_env(agent.env)

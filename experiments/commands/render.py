@@ -11,10 +11,11 @@ from tqdm import tqdm
 from experiments.commands import require_extra, short_version
 from experiments.network_loop.log_figure import loop_log_figure
 from experiments.plots.animation import FORMATS, save_animation
-from experiments.runs.loops import module_and_id, registered_env
+from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
+from experiments.settings.arguments import id_alone
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyShield
 
@@ -66,7 +67,7 @@ class _EpisodeRenderer:
     def __init__(self, settings: RenderSettings, mode: str) -> None:
         self._mode = mode
         certificate = None if settings.certificate is None else Certificate.load(settings.certificate)
-        _, env_id = module_and_id(settings.env)  # whose module is imported
+        env_id = id_alone(settings.env)  # whose module is imported
         self._env: gym.Env = gym.make(env_id, render_mode="rgb_array")
         inner = ncs_env(self._env)
         assert inner.renderer is not None

@@ -11,7 +11,7 @@ from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
 from experiments.baselines import tuned_training
 from experiments.runs.arms import Arm
-from experiments.runs.loops import module_and_id, other_scenarios
+from experiments.runs.loops import other_scenarios
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, LearningSettings, settings_json
@@ -84,7 +84,7 @@ def run_of_arm(
         policy_kind=arm.policy,
         training_loop=training_loop,
         loop=loop,
-        module=module_and_id(settings.env)[0],
+        module=settings.env.rpartition(":")[0],
         seed=settings.seed,
         index=index,
         steps=settings.training_steps,

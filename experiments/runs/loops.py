@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 
 from agents.loop import LoopConfig
+from experiments.settings.arguments import id_alone
 from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
@@ -29,7 +30,7 @@ def registered_env(env_id: str) -> NCSEnv:
     Raises:
         ValueError: If the id is not registered or has no plant of its own, or there is no such module.
     """
-    module, name = module_and_id(env_id)
+    module, _, name = env_id.rpartition(":")
     if module:
         import_module(module)
         if name not in gym.registry:
@@ -40,12 +41,6 @@ def registered_env(env_id: str) -> NCSEnv:
             "module that registers one of your own"
         )
     return ncs_env(gym.make(name))
-
-
-def module_and_id(env_id: str) -> tuple[str, str]:
-    """Returns the module of "module:id", empty for an id alone, and the id by which the environment is registered."""
-    module, _, name = env_id.rpartition(":")
-    return module, name
 
 
 def import_module(module: str) -> None:
@@ -85,7 +80,7 @@ def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs:
         ValueError: If the environment is unknown or has no plant of its own, or cannot have the channel.
     """
     registered_env(env_id)
-    return with_channel(LoopConfig(env=module_and_id(env_id)[1], kwargs=kwargs), channel or {})
+    return with_channel(LoopConfig(env=id_alone(env_id), kwargs=kwargs), channel or {})
 
 
 def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:

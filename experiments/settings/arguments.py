@@ -39,6 +39,11 @@ Assignments = Annotated[
 ]
 
 
+def id_alone(env_id: str) -> str:
+    """Returns the id of "module:id", by which the environment is registered."""
+    return env_id.rpartition(":")[2]
+
+
 def beside_those_of_file(settings: Any, of_file: Any) -> Any:
     """Returns a command's settings in which the assignments of a settings file hold where none are given.
 

@@ -12,7 +12,14 @@ import tyro
 from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
 from experiments.baselines import MARGINS
-from experiments.settings.arguments import Assignments, OptionalStepCount, StepCount, require_horizon, require_limits
+from experiments.settings.arguments import (
+    Assignments,
+    OptionalStepCount,
+    StepCount,
+    id_alone,
+    require_horizon,
+    require_limits,
+)
 from ncs_gym.validation import shown
 
 # Address that starts a Ray cluster of its own on this machine.
@@ -120,7 +127,7 @@ class LearningSettings(BackendSettings):
             ValueError: If the file is damaged, or has none for the environment.
             OSError: If the file cannot be read.
         """
-        given, env_id = self._given_hyperparams, self._env_id
+        given, env_id = self._given_hyperparams, id_alone(self.env)
         tuned = None if given.keys() >= DEFAULTS[self.algo].keys() else tuned_hyperparams(env_id, self.algo)
         found = with_changes(with_changes(DEFAULTS[self.algo], tuned or {}), given)
         return {name: value for name, value in found.items() if name != "n_timesteps"}
@@ -134,7 +141,7 @@ class LearningSettings(BackendSettings):
         """
         if self.steps is not None:
             return self.steps
-        steps = self._given_hyperparams.get("n_timesteps", tuned_steps(self._env_id, self.algo) or _DEFAULT_STEPS)
+        steps = self._given_hyperparams.get("n_timesteps", tuned_steps(id_alone(self.env), self.algo) or _DEFAULT_STEPS)
         if type(steps) not in (int, float) or not 1 <= steps < 1e15 or steps != int(steps):
             raise ValueError(f"n_timesteps must be a whole number >= 1, got {shown(steps)}")
         return int(steps)
@@ -143,8 +150,8 @@ class LearningSettings(BackendSettings):
     def agent_line(self) -> str:
         """One line with all hyperparameters of the algorithm and where they come from."""
         found, given = self.all_hyperparams, self._given_hyperparams.keys() - {"n_timesteps"}
-        is_tuned = tuned_hyperparams(self._env_id, self.algo) is not None
-        source = f"hyperparameters tuned for {self._env_id}" if is_tuned else "default hyperparameters"
+        is_tuned = tuned_hyperparams(id_alone(self.env), self.algo) is not None
+        source = f"hyperparameters tuned for {id_alone(self.env)}" if is_tuned else "default hyperparameters"
         if given == found.keys():
             source = "hyperparameters as given"
         elif given:
@@ -157,14 +164,9 @@ class LearningSettings(BackendSettings):
         return replace(self, steps=self.training_steps, hyperparams=self.all_hyperparams, conf_file=None)
 
     @property
-    def _env_id(self) -> str:
-        """The id of "module:id", by which the environment is registered."""
-        return self.env.rpartition(":")[2]
-
-    @property
     def _given_hyperparams(self) -> dict[str, Any]:
         """Hyperparameters of the command line, and those of the file."""
-        of_file = {} if self.conf_file is None else read_hyperparams(self.conf_file, self._env_id)
+        of_file = {} if self.conf_file is None else read_hyperparams(self.conf_file, id_alone(self.env))
         return with_changes(of_file, self.hyperparams)
 
     def __post_init__(self) -> None:
@@ -394,4 +396,4 @@ class StudySettings(BackendSettings):
 
 def short_name(env_id: str) -> str:
     """Returns an environment's id without its namespace and module, as in names of folders."""
-    return env_id.rpartition(":")[2].rpartition("/")[2]
+    return id_alone(env_id).rpartition("/")[2]
