@@ -5,9 +5,12 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import platform
 import zipfile
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.agent_file import (
     AGENT_FILES,
     AgentError,
-    card_text,
     document_of,
     pretrained_folder,
     read_files,
@@ -185,8 +187,7 @@ class Agent:
         folder = Path(folder)
         if shield is not None and not _is_for_plant_of(self.env, shield.certificate.fingerprint):
             raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
-        of_agent = {name: getattr(self, name) for name in ("algorithm", "hyperparams", "env", "channel", "checksum")}
-        files = self.files() | {"README.md": card_text(**of_agent, shield=shield, evaluation=evaluation).encode()}
+        files = self.files() | {"README.md": _card(self, shield, evaluation).encode()}
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             write_atomically(folder / name, content)
@@ -228,7 +229,6 @@ def pretrained(env_id: str) -> Agent:
 
 
 def _plant_of(env_id: str) -> LinearPlant | None:
-    """Returns an environment's plant, None for an environment without one."""
     return getattr(gym.make(env_id).unwrapped, "plant", None)
 
 
@@ -338,3 +338,75 @@ def load_sb3_zip(path: Path, env_id: str) -> Agent:
         model=model,
         normalization=Normalization(np.zeros(size), np.ones(size), 0.0, float("inf")),
     )
+
+
+_PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
+_USE = """## Use
+
+The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpickled. Checksums find damage, not
+forgery.
+
+```python
+from agents import Agent, LoopConfig{imports}
+
+agent = Agent.load(".")
+loop = LoopConfig(env=agent.env, kwargs={{"channel": agent.channel}}{shield})
+```
+"""
+
+
+def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | None) -> str:
+    """Returns the card of an agent, in Markdown, as `Agent.save` explains."""
+    env = gym.make(agent.env).unwrapped
+    plant, channel = getattr(env, "plant", None), agent.channel or getattr(env, "channel", None)
+    rows = {
+        "environment": f"`{agent.env}`",
+        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
+        "channel": f"`{channel}`" + ("" if agent.channel else ", that of the id"),
+        "shield": _shield_text(shield),
+        "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),
+        "SHA-256 of the weights": f"`{agent.checksum}`",
+        "saved with": _versions(),
+    }
+    table = [f"| {name} | {value} |" for name, value in rows.items()]
+    parts = [f"# {agent.algorithm} in {agent.env}\n", "| | |", "|---|---|", *table, ""]
+    if shield is not None:
+        parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
+        parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `ncs verify certificate.json`", ""]
+    if evaluation is not None:
+        parts += ["## Evaluation", "", *_figures(evaluation), ""]
+    known = "" if shield is None else f', shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"'
+    if shield is not None:
+        known += ")" if shield.horizon is None else f", horizon={shield.horizon})"
+    imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
+    return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
+
+
+def _versions() -> str:
+    found = [f"Python {platform.python_version()}"]
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    return ", ".join(found)
+
+
+def _figures(evaluation: Evaluation) -> list[str]:
+    episodes = evaluation.episodes
+    steps = sum(episode.steps for episode in episodes)
+    violating = sum(episode.violation_steps > 0 for episode in episodes)
+    returns = [episode.episode_return for episode in episodes]
+    interventions = sum(episode.interventions for episode in episodes)
+    return [
+        f"- mean return: {np.mean(returns):.4g}, of {len(episodes)} episodes and {steps} steps",
+        f"- episodes in which the true state violated the safe box: {violating} of {len(episodes)}",
+        f"- violating steps: {sum(episode.violation_steps for episode in episodes)} of {steps}",
+        f"- interventions of the shield: {interventions} of {steps} steps",
+        f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
+    ]
+
+
+def _shield_text(shield: ShieldSettings | None) -> str:
+    if shield is None:
+        return "none"
+    horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"
+    return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

@@ -1,4 +1,4 @@
-"""The files of an agent, checked, and its card: where it was trained, behind which shield, and what it did.
+"""The files of an agent, checked.
 
 `agent.json` has numbers and names and the checksum of `model.zip`, the weights.
 """
@@ -7,20 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import platform
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from importlib import resources
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-
-from agents.loop import ShieldSettings
-from agents.results import Evaluation
-from ncs_gym import Channel
 from ncs_gym.validation import shown
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
@@ -53,16 +44,7 @@ def require_names(names: Iterable[str]) -> None:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes the files of an agent in a folder that exists.
-
-    Args:
-        folder: The folder.
-        files: Contents by name.
-
-    Raises:
-        AgentError: If a name is none of `AGENT_FILES`; nothing is written then.
-        OSError: If a file cannot be written.
-    """
+    """Writes the files of an agent in a folder that exists; nothing if a name is none of `AGENT_FILES` (AgentError)."""
     require_names(files)
     for name, content in files.items():
         write_atomically(folder / name, content)
@@ -122,100 +104,3 @@ def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | 
     if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
         raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
     return mode, horizon
-
-
-_PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
-_USE = """## Use
-
-The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpickled. Checksums find damage, not
-forgery.
-
-```python
-from agents import Agent, LoopConfig{imports}
-
-agent = Agent.load(".")
-loop = LoopConfig(env=agent.env, kwargs={{"channel": agent.channel}}{shield})
-```
-"""
-
-
-def card_text(
-    *,
-    algorithm: str,
-    hyperparams: Mapping[str, Any],
-    env: str,
-    channel: Channel | None,
-    checksum: str,
-    shield: ShieldSettings | None,
-    evaluation: Evaluation | None,
-) -> str:
-    """Returns the card of an agent, in Markdown.
-
-    Args:
-        algorithm: Name of the algorithm.
-        hyperparams: Hyperparameters the agent was trained with.
-        env: Id of the environment the agent was trained in.
-        channel: Channel the agent was trained with; None for that of the id.
-        checksum: SHA-256 of the weights.
-        shield: The shield that the agent is meant to act behind; None for none.
-        evaluation: Episodes of the agent in that loop; None leaves the figures out.
-    """
-    plant = getattr(gym.make(env).unwrapped, "plant", None)
-    rows = {
-        "environment": f"`{env}`",
-        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
-        "channel": _channel(env, channel),
-        "shield": _shield_text(shield),
-        "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in hyperparams.items()),
-        "SHA-256 of the weights": f"`{checksum}`",
-        "saved with": _versions(),
-    }
-    table = [f"| {name} | {value} |" for name, value in rows.items()]
-    parts = [f"# {algorithm} in {env}\n", "| | |", "|---|---|", *table, ""]
-    if shield is not None:
-        parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
-        parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `ncs verify certificate.json`", ""]
-    if evaluation is not None:
-        parts += ["## Evaluation", "", *_figures(evaluation), ""]
-    known = "" if shield is None else f', shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"'
-    if shield is not None:
-        known += ")" if shield.horizon is None else f", horizon={shield.horizon})"
-    imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
-    return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
-
-
-def _channel(env: str, channel: Channel | None) -> str:
-    """Returns the channel in words of Python; that of the id where the agent has none of its own."""
-    own: Any = channel or getattr(gym.make(env).unwrapped, "channel", None)
-    return f"`{own}`" + ("" if channel else ", that of the id")
-
-
-def _versions() -> str:
-    """Returns the versions of Python and of the packages that an agent is made of."""
-    found = [f"Python {platform.python_version()}"]
-    for name in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            found.append(f"{name} {version(name)}")
-    return ", ".join(found)
-
-
-def _figures(evaluation: Evaluation) -> list[str]:
-    episodes = evaluation.episodes
-    steps = sum(episode.steps for episode in episodes)
-    violating = sum(episode.violation_steps > 0 for episode in episodes)
-    returns = [episode.episode_return for episode in episodes]
-    interventions = sum(episode.interventions for episode in episodes)
-    return [
-        f"- mean return: {np.mean(returns):.4g}, of {len(episodes)} episodes and {steps} steps",
-        f"- episodes in which the true state violated the safe box: {violating} of {len(episodes)}",
-        f"- violating steps: {sum(episode.violation_steps for episode in episodes)} of {steps}",
-        f"- interventions of the shield: {interventions} of {steps} steps",
-        f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
-    ]
-
-
-def _shield_text(shield: ShieldSettings | None) -> str:
-    if shield is None:
-        return "none"
-    horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"
-    return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

@@ -49,94 +49,71 @@ def evaluate(
     finished: list[Episode] = []
     trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
-        count = min(_MAX_PARALLEL_EPISODES, episodes - first)
-        rollout = _Rollout(loop.without_penalties, count, level_matrix)
-        infos = rollout.run(policy, [seed, first, _SEED_STREAM], trajectory is None, on_progress)
+        indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
+        played, infos = _played(loop.without_penalties, policy, indices, seed, level_matrix, on_progress)
         trajectory = trajectory or _first_trajectory(infos)
-        finished += rollout.episodes(first)
+        finished += played
     return Evaluation(finished, trajectory)  # type: ignore[arg-type]
 
 
-class _Rollout:
-    """Episodes played side by side, each from its start to its end, with running totals in arrays.
-
-    Args:
-        loop: The control loop, without penalties.
-        count: Number of episodes.
-        level_matrix: M, shape (n, n), a polytope, or None.
-    """
-
-    def __init__(self, loop: LoopConfig, count: int, level_matrix: np.ndarray | Polytope | None) -> None:
+def _played(
+    loop: LoopConfig,
+    policy: Policy,
+    indices: range,
+    seed: int,
+    level_matrix: np.ndarray | Polytope | None,
+    on_progress: Callable[[int], None] | None,
+) -> tuple[list[Episode], list[dict[str, Any]]]:
+    """Returns episodes played side by side, and the infos of episode 0, of its reset and its steps."""
+    count, prototype = len(indices), ncs_env(loop.single())
+    terminates, rows, envs = prototype.terminate_on_violation, prototype.plant.box_rows, loop.vector(count)
+    if terminates and isinstance(envs.unwrapped, NCSVectorEnv):
         # Episodes that end early are stepped on without being counted: the others' random numbers stay the same.
-        prototype = ncs_env(loop.single())
-        self._terminates = prototype.terminate_on_violation
-        self._envs, self._C, self._level_matrix = loop.vector(count), prototype.plant.box_rows, level_matrix
-        if self._terminates and isinstance(self._envs.unwrapped, NCSVectorEnv):
-            self._envs = loop.vector(count, terminate_on_violation=False)
-        self._running = np.ones(count, np.bool_)
-        names = ("return", "steps", "violations", "estimate_violations", "interventions", "planned")
-        self._totals = {name: np.zeros(count) for name in names}
-        self._guaranteed, self._level = np.ones(count, np.bool_), np.zeros(count)
-
-    def run(
-        self, policy: Policy, seed: list[int], keep_infos: bool, on_progress: Callable[[int], None] | None
-    ) -> list[dict[str, Any]]:
-        """Plays all episodes; returns the infos of the reset and, if kept, of the first episode's steps."""
-        env_seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 1)
-        observations, info = self._envs.reset(seed=env_seed)
-        self._update_guarantees(info)
-        infos = [info]
-        while self._running.any():
-            observations, rewards, terminated, truncated, info = self._envs.step(policy(observations, info))
-            if keep_infos and self._running[0]:
-                infos.append(info)
-            self._add(rewards, info)
-            self._running &= ~(terminated | truncated)
-            if self._terminates:
-                self._running &= ~(info["cost"] > 0.0)
-            if on_progress is not None:
-                on_progress(len(self._running))
-        self._envs.close()
-        return infos
-
-    def episodes(self, first: int) -> list[Episode]:
-        """Returns the finished episodes; the first has the given index."""
-        totals = self._totals
-        return [
-            Episode(
-                index=first + e,
-                steps=int(totals["steps"][e]),
-                episode_return=float(totals["return"][e]),
-                violation_steps=int(totals["violations"][e]),
-                estimate_violation_steps=int(totals["estimate_violations"][e]),
-                interventions=int(totals["interventions"][e]),
-                planned=int(totals["planned"][e]),
-                guaranteed=bool(self._guaranteed[e]),
-                largest_level=float(self._level[e]) if self._level_matrix is not None else float("nan"),
-            )
-            for e in range(len(self._running))
-        ]
-
-    def _add(self, rewards: np.ndarray, info: dict[str, Any]) -> None:
-        values = {
-            "return": rewards,
-            "steps": 1,
-            "violations": info["cost"] > 0.0,
-            "estimate_violations": np.abs(info["estimate"] @ self._C.T).max(axis=1) > 1.0,
-            "interventions": info.get("shield_intervened", np.zeros(len(rewards), np.bool_)),
-            "planned": info.get("shield_plan_length", np.zeros(len(rewards), np.int64)) > 0,
+        envs = loop.vector(count, terminate_on_violation=False)
+    env_seed = int(np.random.SeedSequence([seed, indices[0], _SEED_STREAM]).generate_state(1)[0] >> 1)
+    observations, info = envs.reset(seed=env_seed)
+    infos, nothing = [info], np.zeros(count, np.bool_)
+    running, ended, guaranteed = ~nothing, nothing, ~nothing
+    returns, largest = np.zeros(count), np.full(count, np.nan if level_matrix is None else 0.0)
+    names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned")
+    totals = {name: np.zeros(count, np.int64) for name in names}
+    while True:
+        guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
+        if level_matrix is not None:
+            largest = np.maximum(largest, np.where(running, _levels(info["state"], level_matrix), 0.0))
+        running &= ~ended
+        if not running.any():
+            break
+        observations, rewards, terminated, truncated, info = envs.step(policy(observations, info))
+        if running[0] and indices[0] == 0:
+            infos.append(info)
+        returns += np.where(running, rewards, 0.0)
+        happened = {
+            "steps": ~nothing,
+            "violation_steps": info["cost"] > 0.0,
+            "estimate_violation_steps": np.abs(info["estimate"] @ rows.T).max(axis=1) > 1.0,
+            "interventions": info.get("shield_intervened", nothing).astype(np.bool_),
+            "planned": info.get("shield_plan_length", nothing) > 0,
         }
-        for name, value in values.items():
-            self._totals[name] += np.where(self._running, value, 0)
-        self._update_guarantees(info)
-
-    def _update_guarantees(self, info: dict[str, Any]) -> None:
-        """Updates whether the guarantee held, and the largest levels, of the running episodes."""
-        guaranteed = info.get("shield_guaranteed", np.zeros(len(self._running), np.bool_)).astype(np.bool_)
-        self._guaranteed &= guaranteed | ~self._running
-        if self._level_matrix is not None:
-            levels = _levels(info["state"], self._level_matrix)
-            self._level = np.maximum(self._level, np.where(self._running, levels, 0.0))
+        for name, where in happened.items():
+            totals[name] += running & where
+        ended = terminated | truncated
+        if terminates:
+            ended |= info["cost"] > 0.0
+        if on_progress is not None:
+            on_progress(count)
+    envs.close()
+    episodes = [
+        Episode(
+            index=index,
+            episode_return=float(returns[e]),
+            guaranteed=bool(guaranteed[e]),
+            largest_level=float(largest[e]),
+            **{name: int(total[e]) for name, total in totals.items()},
+        )
+        for e, index in enumerate(indices)
+    ]
+    return episodes, infos
 
 
 def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
@@ -145,7 +122,6 @@ def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
 
 
 def _first_trajectory(infos: list[dict[str, np.ndarray]]) -> Trajectory:
-    """Returns the trajectory of the first environment from the infos of its reset and of its steps."""
     steps = infos[1:]
     not_shielded = np.zeros(1, np.bool_)
     return Trajectory(

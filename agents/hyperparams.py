@@ -137,7 +137,6 @@ def tuned_steps(env_id: str, algorithm: str = "PPO") -> int | None:
 
 @cache
 def _tuned() -> dict[str, dict[str, Any]]:
-    """Returns the file of PPO: hyperparameters by environment id."""
     return json.loads(resources.files("agents").joinpath("tuned", "ppo.json").read_text("utf-8"))
 
 

@@ -29,6 +29,9 @@ class ShieldSettings:
         penalty: Subtracted from the reward for every intervention.
         horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
         on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
+
+    Raises:
+        ValueError: If the mode is unknown, or what is to be done where nothing is proved.
     """
 
     certificate: Certificate
@@ -38,21 +41,11 @@ class ShieldSettings:
     on_unproved: str = "warn"
 
     def __post_init__(self) -> None:
-        """Checks the mode, and gives a horizon that is not given its default, so that whoever keeps it keeps a number.
-
-        Raises:
-            ValueError: If the mode is unknown, or what is to be done where nothing is proved.
-        """
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
         LostGuarantee(self.on_unproved)
         if self.mode == "lookahead" and self.horizon is None:
             object.__setattr__(self, "horizon", DEFAULT_HORIZON)
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
-        return dict(vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +63,6 @@ class LagrangianSettings:
     multiplier: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
         for entry in fields(self):
             if not 0.0 <= (value := getattr(self, entry.name)) < math.inf:
                 raise ValueError(f"{entry.name} must be >= 0, got {value!r}")
@@ -105,7 +97,6 @@ class LoopConfig:
     residual_gain: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Refuses what is not the settings of a shield, a bare certificate say, before anything is trained with it."""
         if self.shield is not None and not isinstance(self.shield, ShieldSettings):
             raise ValueError(f"shield must be ShieldSettings(certificate), got {type(self.shield).__name__}")
         if self.shield is not None and self.filter is not None:
@@ -138,7 +129,7 @@ class LoopConfig:
     def single(self, **settings: Any) -> gym.Env:
         """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
         env = gym.make(self.env, **{**self.kwargs, **settings})
-        return env if self.shield is None else SafetyShield(env, **self.shield.arguments)
+        return env if self.shield is None else SafetyShield(env, **vars(self.shield))
 
     def vector(self, count: int, **settings: Any) -> VectorEnv:
         """Returns `count` environments: the id's own vector environment, or gymnasium's of single environments."""
@@ -147,7 +138,7 @@ class LoopConfig:
         else:
             envs = gym.make_vec(self.env, num_envs=count, **{**self.kwargs, **settings})
             if self.shield is not None:
-                envs = VectorSafetyShield(envs, **self.shield.arguments)
+                envs = VectorSafetyShield(envs, **vars(self.shield))
         if self.filter is not None:
             envs = self.filter(envs)
         if self.residual_gain is not None:

@@ -117,11 +117,7 @@ class SB3VecEnv(VecEnv):
         return observation
 
     def _require_known_keys(self, info: dict[str, Any]) -> None:
-        """Returns if all of `info_keys` occur; of other environments than ours a reset does not say.
-
-        Raises:
-            ValueError: If one does not.
-        """
+        """Raises ValueError unless all of `info_keys` occur; of other environments than ours a reset does not say."""
         unknown = sorted(set(self._info_keys) - set(_STEP_KEYS) - set(info))
         if unknown and isinstance(self.vector_env.unwrapped, NCSVectorEnv):
             known = ", ".join(sorted(key for key in info if not key.startswith("_")))
@@ -261,5 +257,4 @@ def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
 
 
 def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Returns whether two options are equal, arrays entry by entry."""
     return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)

@@ -157,11 +157,7 @@ def _trainable(
 
 
 def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm, env: VecNormalize) -> None:
-    """Puts weights, optimizers and normalization of an agent into a model and its environment.
-
-    Raises:
-        ValueError: If the agent is of another environment or algorithm, or its networks have other sizes.
-    """
+    """Puts weights, optimizers and normalization of an agent into a model and its environment."""
     if (start.env, start.algorithm) != (loop.env, algorithm):
         raise ValueError(
             f"the agent to go on from is {start.algorithm} of {start.env}, this is {algorithm} of {loop.env}"

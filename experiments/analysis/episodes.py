@@ -56,13 +56,7 @@ def training_table(results: Iterable[RunResult]) -> pd.DataFrame:
 
 
 def parquet(table: pd.DataFrame, summary: Mapping[str, Any]) -> bytes:
-    """Returns a table as the content of a Parquet file, whose metadata say where it comes from.
-
-    Args:
-        table: The table.
-        summary: Content of summary.json, with settings and versions, and where there is one plant, that and its
-            certificate.
-    """
+    """Returns a table as the content of a Parquet file, whose metadata say where it comes from."""
     origin = {name: summary[name] for name in _ORIGIN if name in summary}
     content = pa.Table.from_pandas(table, preserve_index=False)
     buffer = io.BytesIO()

@@ -9,7 +9,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from experiments.runs.loops import module_and_id, registered_env
+from experiments.runs.loops import registered_env
+from experiments.settings.arguments import id_alone
 from ncs_gym import (
     Channel,
     ChannelContract,
@@ -99,7 +100,7 @@ def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> di
     """
     if env_id is not None:
         env = registered_env(env_id)
-        return _env_cases(module_and_id(env_id)[1], env, all_channels=env.contract is None)
+        return _env_cases(id_alone(env_id), env, all_channels=env.contract is None)
     found = {}
     for registered in ENVIRONMENTS:
         if registered not in _LEFT_OUT:

@@ -37,12 +37,7 @@ _NOT_COUNTED = {*BackendSettings.__dataclass_fields__, "steps", "out", "force", 
 
 
 def cases_of(settings: AttackSettings) -> dict[str, AttackCase]:
-    """Returns what is attacked, by name.
-
-    Raises:
-        ValueError: If there is no environment of the id, no such kind of channel, or the plant's file cannot be
-            read.
-    """
+    """Returns what is attacked, by name; raises ValueError if there is no such environment, plant or channel."""
     if settings.plant is None:
         found = attack_cases(settings.seed, settings.random_plants, settings.env)
     else:
@@ -174,10 +169,6 @@ def _claimed_and_kept(info: dict[str, Any], kept: np.ndarray) -> tuple[np.ndarra
 
     The present state is the result of an earlier decision: it does not rest on the age of the newest sample now, but on
     the input that the actuator applied. After a broken contract what the shield says itself is claimed.
-
-    Args:
-        info: What the step returned.
-        kept: In which episodes all contracts were kept before the step, shape (N,).
     """
     kept = kept & ~info["downlink_broken"]
     return kept | info["shield_guaranteed"], kept & ~info["contract_broken"]

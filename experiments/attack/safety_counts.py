@@ -5,7 +5,7 @@ Sums of counts do not depend on how the work was split.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
@@ -61,7 +61,6 @@ class SafetyCounts:
     overdue: int = 0
 
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
-        """Returns the counts of both."""
         sums: dict[str, Any] = {
             each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)
         }
@@ -94,55 +93,45 @@ class SafetyCounts:
         return asdict(self) | {"margin": self.margin, "bound": self.bound}
 
 
-# Text of a column by the two lines of its header.
-_Columns = dict[tuple[str, str], Callable[[SafetyCounts], str]]
-
-
-_EPISODES: _Columns = {("", "episodes"): lambda counts: f"{counts.episodes:,}"}
-_FAILURES: _Columns = {
-    ("", "failed"): lambda counts: f"{counts.broken_episodes:,}",
-    ("", "p <"): lambda counts: f"{counts.bound:.1e}",
-    ("", "margin"): lambda counts: f"{counts.margin:.1e}" if counts.level > 0.0 else "-",
-}
-_OUTSIDE_BOX: _Columns = {("outside", "box"): lambda counts: f"{counts.violations:,}"}
-_OVERRIDDEN: _Columns = {("over-", "ridden"): lambda counts: f"{counts.interventions / counts.steps:.1%}"}
-_LAPSED: _Columns = {
-    ("no", "claim"): lambda counts: f"{counts.lapsed / counts.steps:.1%}",
-    ("outside", "then"): lambda counts: f"{counts.lapsed_violations:,}",
-}
-_REQUESTS: _Columns = {
-    ("packets", "per step"): lambda counts: f"{counts.packets / counts.steps:.2f}",
-    ("", "forced"): lambda counts: f"{counts.forced / counts.steps:.1%}" if counts.forced else "-",
-    ("age", "> h"): lambda counts: f"{counts.overdue:,}",
-}
-_SET_COLUMNS: _Columns = {
-    **_EPISODES,
-    ("outside", "S"): lambda counts: f"{counts.exits:,}",
-    **_OUTSIDE_BOX,
-    **_FAILURES,
-    **_OVERRIDDEN,
-}
-_BOX_COLUMNS: _Columns = {
-    **_EPISODES,
-    ("began", "outside"): lambda counts: f"{counts.outside_starts:,}",
-    ("outside", "S"): lambda counts: f"{counts.exits / counts.steps:.1%}",
-    **_OUTSIDE_BOX,
-    **_FAILURES,
-    ("", "planned"): lambda counts: f"{counts.planned / counts.steps:.1%}",
-    **_OVERRIDDEN,
-}
-_SET_LEGEND = f"""\
+# Two lines of the header of a column, the tables that have it, and its text.
+_Column = tuple[str, str, str, Callable[[SafetyCounts], str]]
+_COLUMNS: tuple[_Column, ...] = (
+    ("", "episodes", "set box", lambda counts: f"{counts.episodes:,}"),
+    ("began", "outside", "box", lambda counts: f"{counts.outside_starts:,}"),
+    ("outside", "S", "set", lambda counts: f"{counts.exits:,}"),
+    ("outside", "S", "box", lambda counts: f"{counts.exits / counts.steps:.1%}"),
+    ("outside", "box", "set box", lambda counts: f"{counts.violations:,}"),
+    ("", "failed", "set box", lambda counts: f"{counts.broken_episodes:,}"),
+    ("", "p <", "set box", lambda counts: f"{counts.bound:.1e}"),
+    ("", "margin", "set box", lambda counts: f"{counts.margin:.1e}" if counts.level > 0.0 else "-"),
+    ("", "planned", "box", lambda counts: f"{counts.planned / counts.steps:.1%}"),
+    ("over-", "ridden", "set box", lambda counts: f"{counts.interventions / counts.steps:.1%}"),
+    ("no", "claim", "lapsed", lambda counts: f"{counts.lapsed / counts.steps:.1%}"),
+    ("outside", "then", "lapsed", lambda counts: f"{counts.lapsed_violations:,}"),
+    ("packets", "per step", "requests", lambda counts: f"{counts.packets / counts.steps:.2f}"),
+    ("", "forced", "requests", lambda counts: f"{counts.forced / counts.steps:.1%}" if counts.forced else "-"),
+    ("age", "> h", "requests", lambda counts: f"{counts.overdue:,}"),
+)
+_LEGENDS = {
+    "set": f"""\
 outside: steps with a true state outside S or the box; failed: episodes that left S or the box;
 p <: upper end of the exact 95 % interval of their probability;
 margin: smallest 1 - level from step {SETTLING_STEPS} on (episodes start on the boundary); the level in S is
 max |g x| over the rows g of a polytope, sqrt(x'Mx) in an ellipsoid;
-overridden: steps that the shield changed or, unshielded, would have changed"""
-_BOX_LEGEND = f"""\
+overridden: steps that the shield changed or, unshielded, would have changed""",
+    "box": f"""\
 began outside: episodes that began outside S with a certified plan;
 outside S: steps there, which lookahead allows; outside box: steps there;
 failed: episodes that left the box; p <: upper end of the exact 95 % interval of their probability;
 margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on;
-planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed"""
+planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed""",
+    "lapsed": """
+no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
+outside then: such steps outside the box""",
+    "requests": """
+forced: steps in which the contract forced a request that nobody made;
+age > h: steps with a sample older than the contract allows, of channels that keep it""",
+}
 
 GAUSSIAN_LEGEND = """failed: episodes that left S or the box; interval: the exact 95 % interval of their probability;
 bound: the union bound on it over all draws of noise, for the shielded loop;
@@ -159,12 +148,6 @@ _CHANNELS = {
     "bursts": "losses in a row",
     "overtaking": "packets overtake one another",
 }
-_LAPSED_LEGEND = """
-no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
-outside then: such steps outside the box"""
-_REQUESTS_LEGEND = """
-forced: steps in which the contract forced a request that nobody made;
-age > h: steps with a sample older than the contract allows, of channels that keep it"""
 
 
 def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> str:
@@ -174,13 +157,10 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
         counts: Counts by the name of their case, "plant, channel"; the rows of a plant stand together.
         looks_ahead: Whether the shield was that of mode "lookahead".
     """
-    columns, legend = (_BOX_COLUMNS, _BOX_LEGEND) if looks_ahead else (_SET_COLUMNS, _SET_LEGEND)
     total = sum(counts.values(), SafetyCounts())
-    if total.lapsed:
-        columns, legend = columns | _LAPSED, legend + _LAPSED_LEGEND
-    if total.forced:
-        columns, legend = columns | _REQUESTS, legend + _REQUESTS_LEGEND
-    rows = [list(line) for line in zip(("", "case"), *columns, strict=True)]
+    is_shown = {"set": not looks_ahead, "box": looks_ahead, "lapsed": total.lapsed, "requests": total.forced}
+    columns = [column for column in _COLUMNS if any(is_shown[table] for table in column[2].split())]
+    rows = [["", *(column[0] for column in columns)], ["case", *(column[1] for column in columns)]]
     plants = {name: name.rpartition(", ")[0] for name in counts}
     for plant in dict.fromkeys(plants.values()):
         rows.append([plant])
@@ -192,11 +172,12 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
     seen = dict.fromkeys(name.rpartition(", ")[2] for name in counts)
     channels = "\n".join(f"{kind}: {_CHANNELS[kind]};" for kind in seen if kind in _CHANNELS)
     table = text_table(rows, rules=(2, len(rows) - 1))
+    legend = "".join(text for name, text in _LEGENDS.items() if is_shown[name])
     return "\n".join(filter(None, (f"{steps}\n", table, channels, legend)))
 
 
-def _row(name: str, counts: SafetyCounts, columns: _Columns) -> list[str]:
-    return [name, *(text_of(counts) for text_of in columns.values())]
+def _row(name: str, counts: SafetyCounts, columns: Sequence[_Column]) -> list[str]:
+    return [name, *(text_of(counts) for *_, text_of in columns)]
 
 
 def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> str:

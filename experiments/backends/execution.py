@@ -149,39 +149,36 @@ _REPORTED_STEPS = 1000
 
 
 @contextmanager
-def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[LocalWorkers]:
-    """Yields worker processes, an `execution.Executor`."""
+def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[_LocalWorkers]:
+    """Yields worker processes, an `Executor`."""
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
     manager.start(initialize_worker)
     with manager, ProcessPoolExecutor(workers, mp_context=context, initializer=initialize_worker) as pool:
         reports, stop = manager.Queue(), manager.Event()
         try:
-            yield LocalWorkers(pool, reports, stop, log_folder)
+            yield _LocalWorkers(pool, reports, stop, log_folder)
         except BaseException:
             stop.set()
             pool.shutdown(cancel_futures=True)
             raise
 
 
-class LocalWorkers:
+class _LocalWorkers:
     """Worker processes, the queue that they report to, and the event that tells them to give up."""
 
     def __init__(self, pool: ProcessPoolExecutor, reports: Any, stop: Any, log_folder: Path | None) -> None:
         self._pool, self._reports, self._stop, self._log_folder = pool, reports, stop, log_folder
 
     def submit(self, run: Run) -> Future[Any]:
-        """Returns the future result of a run."""
         return self._pool.submit(_execute_here, run, self._reports, self._stop, self._log_folder)
 
     def reports(self) -> Iterator[int | str]:
-        """Yields numbers of steps taken, and the texts of warnings."""
         with suppress(Empty):
             while True:
                 yield self._reports.get_nowait()
 
     def failure(self, run: Run, error: BaseException) -> BaseException:
-        """Returns the error of the run, unless it is not its own."""
         return error if isinstance(error, BrokenExecutor | RunStopped) else RunError.of(run.name, error)
 
 

@@ -124,11 +124,7 @@ def _remote(function: Callable[..., Any], settings: BackendSettings) -> Any:
 
 
 def _require_large_node(settings: BackendSettings) -> None:
-    """Returns if a node is large enough for a run, or becomes so while the user lets us wait.
-
-    Raises:
-        ClusterError: If none is: Ray would wait for one forever.
-    """
+    """Raises ClusterError if no node is large enough for a run or becomes so in time: Ray would wait forever."""
     wanted = {"CPU": settings.cpus_per_run, "GPU": settings.gpus_per_run}
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if any(all(node.get(name, 0.0) >= amount for name, amount in wanted.items()) for node in nodes):

@@ -67,15 +67,7 @@ def portable_task() -> Callable[[dict[str, str], bytes], Any]:
 
 
 def _execute_on_node(expected: dict[str, str], content: bytes) -> Any:
-    """Returns the result of a pickled run, which is unpickled only if this node has the driver's classes.
-
-    Args:
-        expected: The driver's `versions()`; results are stored under its key.
-        content: Pickled run.
-
-    Raises:
-        ClusterError: If this node has other versions.
-    """
+    """Returns the result of a pickled run, which is unpickled only if this node has the driver's versions."""
     own = versions()
     # Another version of a package says more than another source.
     for name in sorted(expected.keys() | own.keys(), key=lambda name: name == "source"):

@@ -3,10 +3,8 @@
 None of them comes with a proof under estimation errors, so none reports `shield_guaranteed`.
 """
 
-from experiments.baselines.controllers import CONTROLLERS, REGULATORS, controller
-from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, EstimateFilterSettings
-from experiments.baselines.margins import MARGINS
-from experiments.baselines.regulators import RegulatorWeights
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, RegulatorWeights, controller
+from experiments.baselines.filters import FILTERS, MARGINS, EstimateFilter, EstimateFilterSettings
 from experiments.baselines.tuned import tuned_training, tuned_weights
 
 __all__ = [

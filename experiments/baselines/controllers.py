@@ -1,55 +1,263 @@
-"""Linear controllers and other policies that nobody has to train, for vector environments."""
+"""Controllers that nobody has to train, for vector environments: linear ones, regulators, and no or random inputs.
+
+The regulators are linear-quadratic, with a governor of its references, and model predictive. All three minimize the
+same cost of the task's error, whose weights are tuned for each by itself.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
+import clarabel
 import numpy as np
+from scipy.linalg import block_diag, solve_discrete_are, sqrtm
+from scipy.sparse import bmat, csc_matrix
 
 from agents.evaluation import Policy
-from experiments.baselines.margins import MARGINS
-from experiments.baselines.regulators import (
-    DEFAULT_WEIGHTS,
-    Inputs,
-    RegulatorWeights,
-    equilibrium,
-    governor,
-    model_predictive,
-    regulator,
-)
-from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
+from experiments.baselines.filters import MARGINS
+from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
+from ncs_gym.plants.lqr import lqr_gain
+
+# Its types are not declared.
+_clarabel: Any = clarabel
+# Steps that a reference governor looks ahead, and a model predictive controller.
+GOVERNED_STEPS, PREDICTED_STEPS = 100, 20
+# What keeps the equations of a regulator well-posed where an input itself costs nothing.
+_LEAST_WEIGHT = 1e-6
+# Price of leaving the limits of the box by their half-widths: a program without any solution serves nobody.
+_PRICE_OF_LEAVING = 1e4
+
+# Maps observations (N, entries) and estimates (N, n) to inputs (N, m) [physical units], not yet clipped.
+Inputs = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def controller(name: str, env: NCSEnv, K: np.ndarray, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS) -> Policy:
-    """Returns a policy for vector environments of a kind.
+@dataclass(frozen=True)
+class RegulatorWeights:
+    """What a linear-quadratic regulator weighs against an error of the task of one width.
 
-    Args:
-        name: A name in `CONTROLLERS` or `REGULATORS`.
-        env: A single environment with the plant and the task.
-        K: Certified gain, shape (m, n), of u = K x_hat.
-        seed: Seed of the random policy.
-        weights: Weights of the regulators.
+    Attributes:
+        effort: An input at its limit; where the task prices changes of the input, a change by its limit.
+        state: A state at the edge of the box.
     """
-    make = REGULATORS.get(name)
-    inputs = CONTROLLERS[name](env, K, seed) if make is None else make(env, weights)
-    limits = env.plant.u_max
-    return lambda observations, infos: np.clip(inputs(observations, infos["estimate"]) / limits, -1.0, 1.0)
+
+    effort: float = 0.01
+    state: float = 0.01
+
+
+DEFAULT_WEIGHTS = RegulatorWeights()
+
+
+@dataclass(frozen=True)
+class RegulatorProblem:
+    """The sum of |E z + D u|^2 along z+ = A z + B u, where z is the state and what else of the observation counts.
+
+    Attributes:
+        A: Shape (entries, entries).
+        B: Shape (entries, m).
+        E: Shape (costs, entries).
+        D: Shape (costs, m).
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    E: np.ndarray
+    D: np.ndarray
+
+    def entries(self, observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
+        """Returns z, shape (N, entries), for observations and estimates (N, n)."""
+        beyond = observations[:, estimates.shape[1] : len(self.A)]
+        return np.hstack([estimates, beyond.astype(np.float64)])
+
+    def gain(self) -> np.ndarray:
+        """Returns the gain of the optimal u = gain z, shape (m, entries).
+
+        Raises:
+            ValueError: If there is none.
+        """
+        if (gain := lqr_gain(self.A, self.B, self.E.T @ self.E, self.D.T @ self.D, self.E.T @ self.D)) is None:
+            raise ValueError("there is no linear-quadratic regulator: the inputs cannot stabilize the plant")
+        return gain
+
+
+def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProblem:
+    """Returns what a regulator of an environment's task minimizes.
+
+    Its cost weighs the error in the task's width, states in units of the box and inputs in units of their limits. The
+    speed error of `SpeedTracking`, e+ = e - dt u, is a state of its own.
+    """
+    plant, task = env.plant, env.task
+    if isinstance(task, SetpointTracking):
+        return _tracking_problem(plant, task, weights)
+    states, effort = np.sqrt(weights.state) * plant.box_rows, np.sqrt(weights.effort + _LEAST_WEIGHT)
+    A, B, E = plant.A, plant.B, states
+    if isinstance(task, SpeedTracking):
+        A = np.pad(A, (0, 1))
+        A[-1, -1] = 1.0
+        B = np.vstack([B, -plant.dt * np.eye(plant.m)[task.input_index]])
+        E = np.pad(E, (0, 1))
+        E[-1, -1] = 1.0 / 5.0  # the reward counts errors in units of 5 m/s
+    D = np.vstack([np.zeros((len(E), plant.m)), effort * np.diag(1.0 / plant.u_max)])
+    E = np.vstack([E, np.zeros((plant.m, len(A)))])
+    return RegulatorProblem(A, B, E, D)
+
+
+def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: RegulatorWeights) -> RegulatorProblem:
+    """Returns the problem of x, the targets of now and later, and the last input if it is observed.
+
+    It counts (c x - r)^2 / width^2 + state |x - x_s r|^2 + effort |u - v|^2, where (x_s, u_s) is the equilibrium of
+    target 1, norms are in units of box and limits, and v is the last input where the task prices changes, u_s r
+    elsewhere. Of the targets that are known, the last is taken to stay.
+    """
+    n, m, targets = plant.n, plant.m, 1 + task.preview
+    x_s, u_s = equilibrium(plant, task.output)
+    size = n + targets + (m if task.change_price else 0)
+    A, B = np.zeros((size, size)), np.zeros((size, m))
+    A[:n, :n], B[:n] = plant.A, plant.B
+    A[n : n + targets, n : n + targets] = np.eye(targets, k=1)
+    A[n + targets - 1, n + targets - 1] = 1.0 - _LEAST_WEIGHT
+    B[n + targets :] = np.eye(m) if task.change_price else 0.0
+
+    def rows(of_state: np.ndarray, of_target: np.ndarray) -> np.ndarray:
+        return np.hstack([of_state, -of_target[:, None], np.zeros((len(of_state), size - n - 1))])
+
+    held = rows(np.zeros((m, n)), -u_s) / plant.u_max[:, None]  # u_s r
+    last = np.eye(size)[n + targets :] / plant.u_max[:, None] if task.change_price else held
+    error = rows(task.output[None], np.ones(1)) / task.width
+    box = np.sqrt(weights.state) * rows(plant.box_rows, plant.box_rows @ x_s)
+    wanted = np.vstack([np.sqrt(weights.effort) * last, np.sqrt(_LEAST_WEIGHT) * held])
+    given = np.vstack([np.sqrt(each) * np.diag(1.0 / plant.u_max) for each in (weights.effort, _LEAST_WEIGHT)])
+    free = np.zeros((1 + len(box), m))
+    return RegulatorProblem(A, B, np.vstack([error, box, -wanted]), np.vstack([free, given]))
+
+
+def regulator(env: NCSEnv, weights: RegulatorWeights) -> Inputs:
+    """Returns the linear-quadratic regulator of the task's error, with what is known of its targets."""
+    problem = regulator_problem(env, weights)
+    gain = problem.gain()
+    return lambda observations, estimates: problem.entries(observations, estimates) @ gain.T
+
+
+def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inputs:
+    """Returns the regulator with its targets clipped by a reference governor.
+
+    Targets are moved as little as possible so that the regulator's own loop, from the estimate taken for the state and
+    without disturbance, with a constant target keeps the limits of box and inputs less a margin for the next
+    `GOVERNED_STEPS` steps. Where no target does, the middle of what the limits ask for is used (Garone et al. 2017,
+    docs/bibliography.md). Tasks other than `SetpointTracking` are not governed. The margin is a fraction of the box.
+    """
+    plant, task = env.plant, env.task
+    if not isinstance(task, SetpointTracking):
+        return regulator(env, weights)
+    n, known = plant.n, slice(plant.n, plant.n + 1 + task.preview)
+    problem = regulator_problem(env, weights)
+    gain = problem.gain()
+    own = np.delete(gain, np.arange(gain.shape[1])[known], axis=1)  # of x and the last input
+    of_target = gain[:, known].sum(axis=1, keepdims=True)
+    moved = np.eye(own.shape[1], own.shape[1])
+    moved[n:] = 0.0
+    moved[:n, :n] = plant.A
+    pushed = np.vstack([plant.B, np.eye(plant.m)[: own.shape[1] - n]])
+    loop, drive = moved + pushed @ own, pushed @ of_target
+    limits = np.vstack([np.pad(plant.box_rows, ((0, 0), (0, own.shape[1] - n))), own / plant.u_max[:, None]])
+    direct = np.concatenate([np.zeros((len(plant.box_rows), 1)), of_target / plant.u_max[:, None]])
+    allowed = np.concatenate([np.full(len(plant.box_rows), 1.0 - margin), np.ones(plant.m)])
+    rows, slopes = [limits[len(plant.box_rows) :]], [direct[len(plant.box_rows) :]]
+    power, response = loop, drive
+    for _ in range(GOVERNED_STEPS):
+        rows.append(limits @ power)
+        slopes.append(limits @ response + direct)
+        power, response = loop @ power, loop @ response + drive
+    free, slope = np.vstack(rows), np.vstack(slopes)[:, 0]
+    bound = np.concatenate([np.ones(plant.m), np.tile(allowed, GOVERNED_STEPS)])
+    felt = np.abs(slope) > _LEAST_WEIGHT * np.abs(slope).max()
+    free, slope, bound = free[felt], slope[felt], bound[felt]
+
+    def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
+        entries = problem.entries(observations, estimates)
+        middle = -np.delete(entries, np.arange(entries.shape[1])[known], axis=1) @ free.T / slope
+        low, high = ((middle + side * bound / np.abs(slope)) for side in (-1.0, 1.0))
+        low, high = low.max(axis=1, keepdims=True), high.min(axis=1, keepdims=True)
+        center = 0.5 * (low + high)
+        entries[:, known] = np.clip(entries[:, known], np.minimum(low, center), np.maximum(high, center))
+        return entries @ gain.T
+
+    return inputs
+
+
+def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inputs:
+    """Returns model predictive control from the estimate, taken for the state, as it is usually built.
+
+    It minimizes the regulator's cost over `PREDICTED_STEPS` steps, with the regulator's cost-to-go at their end, within
+    the limits of the inputs and those of the box less a margin, a fraction of it, which may be left at a high price.
+    (Rawlings, Mayne and Diehl: "Model Predictive Control: Theory, Computation, and Design", 2017.)
+    """
+    plant, problem, steps = env.plant, regulator_problem(env, weights), PREDICTED_STEPS
+    A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
+    to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
+    rows = np.pad(plant.box_rows, ((0, 0), (0, len(A) - plant.n)))
+    free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
+    for k in range(steps):  # z_k = free z_0 + forced u
+        now = np.eye(steps * m)[k * m : (k + 1) * m]
+        costs.append((E @ free, E @ forced + D @ now))
+        free, forced = A @ free, A @ forced + B @ now
+        limits.append((rows @ free, rows @ forced))
+    costs.append((to_go @ free, to_go @ forced))
+    drift, effect = (np.concatenate(each) for each in zip(*costs, strict=True))
+    moved, felt = (np.concatenate(each) for each in zip(*limits, strict=True))
+    # Variables are the inputs, and by how much each step leaves the box.
+    leaving, nothing = np.repeat(np.eye(steps), len(rows), axis=0), np.zeros((steps * m, steps))
+    P = csc_matrix(block_diag(2.0 * np.triu(effect.T @ effect), np.zeros((steps, steps))))
+    inequalities = bmat(
+        [
+            [felt, -leaving],
+            [-felt, -leaving],
+            [np.eye(steps * m), nothing],
+            [-np.eye(steps * m), nothing],
+            [nothing.T, -np.eye(steps)],
+        ],
+        format="csc",
+    )
+    settings, bounds = _clarabel.DefaultSettings(), np.tile(plant.u_max, 2 * steps)
+    settings.verbose = settings.presolve_enable = False
+
+    def solved(entries: np.ndarray) -> np.ndarray:
+        slope, place = effect.T @ (drift @ entries), moved @ entries
+        q = np.concatenate([2.0 * slope, np.full(steps, _PRICE_OF_LEAVING)])
+        b = np.concatenate([1.0 - margin - place, 1.0 - margin + place, bounds, np.zeros(steps)])
+        cones = [_clarabel.NonnegativeConeT(len(b))]
+        found = _clarabel.DefaultSolver(P, q, inequalities, b, cones, settings).solve()
+        if found.status not in (_clarabel.SolverStatus.Solved, _clarabel.SolverStatus.AlmostSolved):
+            raise RuntimeError(f"the predictive controller's program was not solved: {found.status}")
+        return np.array(found.x[:m])
+
+    return lambda observations, estimates: np.array([solved(each) for each in problem.entries(observations, estimates)])
+
+
+def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns state (n,) and input (m,) with x = A x + B u and c x = 1, the smallest in units of box and limits.
+
+    Where there is none, the least-squares solution. The output is c, shape (n,).
+    """
+    n, scale = plant.n, np.concatenate([plant.half_widths, plant.u_max])
+    rest = np.hstack([np.eye(n) - plant.A, -plant.B]) / plant.half_widths[:, None]
+    equations = np.vstack([rest, np.concatenate([output, np.zeros(plant.m)])])
+    both = scale * np.linalg.lstsq(equations * scale, np.eye(n + 1)[-1])[0]
+    return both[:n], both[n:]
 
 
 def _zero(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
-    """Returns no input at all."""
     return lambda observations, estimates: np.zeros((len(estimates), env.plant.m))
 
 
 def _random(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
-    """Returns uniformly random inputs within the limits."""
     rng, limits = np.random.default_rng(seed), env.plant.u_max
     return lambda observations, estimates: rng.uniform(-limits, limits, (len(estimates), len(limits)))
 
 
 def _certified_gain(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
-    """Returns u = K x_hat, which ignores the task."""
     return lambda observations, estimates: estimates @ K.T
 
 
@@ -88,19 +296,13 @@ def _proportional(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
     if isinstance(env.task, SpeedTracking):
         direction = np.eye(env.plant.m)[env.task.input_index] / env.plant.dt
         return lambda observations, estimates: observations[:, -1:] * direction
-    return _about_target(env, K)
-
-
-def _about_target(env: NCSEnv, gain: np.ndarray) -> Inputs:
-    """Returns u = u_s + gain (x_hat - x_s) with (x_s, u_s) the smallest equilibrium at the task's target."""
-    task, first = env.task, env.plant.n
-    if not isinstance(task, SetpointTracking):
-        return lambda observations, estimates: estimates @ gain.T
-    x_s, u_s = equilibrium(env.plant, task.output)
+    if not isinstance(env.task, SetpointTracking):
+        return lambda observations, estimates: estimates @ K.T
+    first, (x_s, u_s) = env.plant.n, equilibrium(env.plant, env.task.output)
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         target = observations[:, first : first + 1].astype(np.float64)
-        return target * u_s + (estimates - target * x_s) @ gain.T
+        return target * u_s + (estimates - target * x_s) @ K.T
 
     return inputs
 
@@ -118,3 +320,19 @@ CONTROLLERS: dict[str, Callable[[NCSEnv, np.ndarray, int], Inputs]] = {
     "proportional": _proportional,
 }
 """The policies by name, made from an environment, the certified gain and a seed."""
+
+
+def controller(name: str, env: NCSEnv, K: np.ndarray, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS) -> Policy:
+    """Returns a policy for vector environments of a kind.
+
+    Args:
+        name: A name in `CONTROLLERS` or `REGULATORS`.
+        env: A single environment with the plant and the task.
+        K: Certified gain, shape (m, n), of u = K x_hat.
+        seed: Seed of the random policy.
+        weights: Weights of the regulators.
+    """
+    make = REGULATORS.get(name)
+    inputs = CONTROLLERS[name](env, K, seed) if make is None else make(env, weights)
+    limits = env.plant.u_max
+    return lambda observations, infos: np.clip(inputs(observations, infos["estimate"]) / limits, -1.0, 1.0)

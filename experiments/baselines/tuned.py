@@ -7,16 +7,11 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from experiments.baselines.regulators import RegulatorWeights
+from experiments.baselines.controllers import RegulatorWeights
 
 
 def tuned_weights(env_id: str, arm: str) -> RegulatorWeights:
-    """Returns the weights of a regulator; the defaults where none were tuned.
-
-    Args:
-        env_id: Id by which the environment is registered.
-        arm: Name of the arm: the regulator's, and that of the filter that it acts behind.
-    """
+    """Returns the weights of an arm's regulator in a registered environment; the defaults where none were tuned."""
     return RegulatorWeights(**_tuned().get(env_id, {}).get(arm, {}))
 
 
@@ -24,15 +19,10 @@ def tuned_training(env_id: str, arm: str) -> dict[str, Any]:
     """Returns settings of an arm's training, in the place of those of the command; nothing where none were tuned.
 
     They are `hyperparams` (changes), `violation_penalty` and `lagrangian` (entries of `LagrangianSettings`).
-
-    Args:
-        env_id: Id by which the environment is registered.
-        arm: Name of an arm in which an agent is trained.
     """
     return _tuned().get(env_id, {}).get(arm, {})
 
 
 @cache
 def _tuned() -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns the file: by environment id and arm."""
     return json.loads(resources.files("experiments.baselines").joinpath("tuned.json").read_text("utf-8"))

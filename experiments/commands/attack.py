@@ -19,10 +19,10 @@ from experiments.attack.safety_counts import (
     require_within,
 )
 from experiments.backends.execution import results_of
-from experiments.runs.experiment import INCIDENTAL_SETTINGS
+from experiments.runs.experiment import lasting_settings
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.provenance import versions
-from experiments.settings import AttackSettings, settings_json
+from experiments.settings import AttackSettings
 from experiments.settings.certificates import FEWEST_ENVS
 from experiments.terminal import wrapped
 from ncs_gym.network import downlink_protocol
@@ -67,9 +67,7 @@ def attack(settings: AttackSettings) -> None:
         )
         if limits:
             print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
-        given = settings_json("certify", settings)["settings"]
-        document = {"settings": {name: value for name, value in given.items() if name not in INCIDENTAL_SETTINGS}}
-        document |= {"versions": versions(), "total": total.document()}
+        document = {"settings": lasting_settings(settings), "versions": versions(), "total": total.document()}
         document["cases"] = {case: each.document() for case, each in counts.items()}
         if limits:
             document["bound_violation_probability"] = limits
@@ -107,12 +105,9 @@ def _certificates(cases: dict[str, AttackCase], folder: Path, safe_set: str | No
 
 
 def _numbers_of_batches(cases: int, count: int, least: int) -> list[int]:
-    """Returns the number of batches of each case, as even as possible, more for earlier cases.
+    """Returns the number of batches of each case, as even as possible, more for earlier cases, `count` in all.
 
-    Args:
-        cases: Number of cases.
-        count: Number of batches in all that the budget allows; one at least is run.
-        least: Number of kinds of batches, which take turns: they come in for the same cases where not all can.
+    One at least is run. The `least` kinds of batches take turns: where not all cases can have each kind, some have all.
     """
     count = max(count, 1)
     attacked = min(cases, -(-count // least))

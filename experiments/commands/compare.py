@@ -33,7 +33,7 @@ from experiments.runs.experiment import (
     run_of_arm,
 )
 from experiments.runs.loops import loop_config
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import CompareSettings
 from experiments.terminal import wrapped
@@ -53,7 +53,6 @@ def compare(settings: CompareSettings) -> None:
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):
-        prepare_output(settings.out)
         plant = ncs_env(loop.single()).plant
         verification = verify(certificate, plant)
         print(wrapped(certificate_line(certificate, verification)), wrapped(settings.agent_line), sep="\n", flush=True)
@@ -70,7 +69,7 @@ def compare(settings: CompareSettings) -> None:
         files = {
             "episodes.parquet": parquet(episodes, summary),
             "training.parquet": parquet(training_table(results), summary),
-            "report.html": comparison_report(summary, verification, dict(figures.values()), findings),
+            "report.html": comparison_report(summary, verification, figures, findings),
         }
         write_results(settings.out, summary, files, figures)
         count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
@@ -124,7 +123,7 @@ def _summary(
         "arms": {name: arms[name] for name in settings.arms},
         "references": {name: arms[name] for name in settings.baselines},
         "paired_differences": {"baseline": baseline, "arms": paired_differences(compared, baseline)},
-    } | (gaussian | experiment_provenance("compare", settings, loop, certificate, runs))
+    } | (gaussian | experiment_provenance(settings, loop, certificate, runs))
 
 
 def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
@@ -146,7 +145,6 @@ def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[st
 
 
 def _findings(summary: dict[str, Any]) -> list[str]:
-    """Returns what to read from the table, in sentences computed from it."""
     findings = [
         f"{name} is not enough: {arm['train_violation_steps']:,} violating steps in training, "
         f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes in evaluation."

@@ -24,7 +24,7 @@ from experiments.network_loop.processes import (
     run_network,
     run_plant,
 )
-from experiments.runs.loops import import_module, module_and_id, registered_env
+from experiments.runs.loops import registered_env
 from experiments.settings import LoopSettings
 from experiments.terminal import synthesis_status
 from ncs_gym import NCSEnv
@@ -41,15 +41,7 @@ _PATIENCE, _PERIOD = 10.0, 1.0
 
 
 def loop(settings: LoopSettings) -> None:
-    """Runs `ncs loop`.
-
-    Raises:
-        ValueError: If a setting is wrong or the key too short, or there is no certificate for the plant behind this
-            network.
-        CertificateError: If a given certificate is damaged or does not verify.
-        OSError: If a file cannot be read or written, or an address is in use.
-        ChildProcessError: If a process ended by itself.
-    """
+    """Runs `ncs loop`; raises ChildProcessError if a process of it ends by itself."""
     settings = short_version(settings, **_SMOKE)
     env = registered_env(settings.env)
     settings.out.mkdir(parents=True, exist_ok=True)
@@ -58,7 +50,7 @@ def loop(settings: LoopSettings) -> None:
     network_loop = _network_loop(settings, env)
     others = {"all": (run_plant, run_network), "plant": (run_plant, run_network), "controller": ()}[settings.role]
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=_in_process, args=(run, network_loop, settings.env)) for run in others]
+    processes = [context.Process(target=_in_process, args=(run, network_loop)) for run in others]
     for process in processes:
         process.start()
     try:
@@ -70,9 +62,8 @@ def loop(settings: LoopSettings) -> None:
                 raise ChildProcessError("a process of the loop ended by itself; its message is above")
         else:
             with _view(settings, env) as show:
-                known = not settings.restarted
                 alone = lambda: not all(each.is_alive() for each in processes)  # noqa: E731
-                was_told = run_controller_node(network_loop, known, show, alone)
+                was_told = run_controller_node(network_loop, show, alone)
             if not was_told and alone():
                 raise ChildProcessError("a process of the loop ended by itself; its message is above")
     finally:
@@ -88,10 +79,8 @@ def loop(settings: LoopSettings) -> None:
     print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
 
 
-def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop, env: str) -> None:
+def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop) -> None:
     """Runs a process of the loop; the module that registers the environment is imported in each."""
-    if module_and_id(env)[0]:
-        import_module(module_and_id(env)[0])
     try:
         run(network_loop)
     except OSError as error:
@@ -130,30 +119,8 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     key = os.urandom(32) if settings.key_file is None else settings.key_file.read_bytes()
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
-    here, port = "127.0.0.1", settings.port
-    return NetworkLoop(
-        env=settings.env,
-        certificate=settings.out / "certificate.json",
-        uplink=uplink,
-        downlink=downlink,
-        room=settings.room,
-        secret=key,
-        seed=settings.seed,
-        speed=settings.speed,
-        policy=settings.policy,
-        mode=settings.shield,
-        horizon=settings.horizon,
-        mischief=settings.mischief,
-        until_worst=settings.worst,
-        controller=(settings.host, port),
-        sensor=(here, port + 1),
-        actuator=(here, port + 2),
-        listen=(here if settings.role == "all" else "0.0.0.0", port),
-        out=settings.out,
-        steps=settings.steps,
-        ask_age=settings.ask_age,
-        max_age=0 if env.contract is None else env.contract.max_age,
-    )
+    max_age = 0 if env.contract is None else env.contract.max_age
+    return NetworkLoop(settings=settings, uplink=uplink, downlink=downlink, secret=key, max_age=max_age)
 
 
 class _view:

@@ -11,18 +11,16 @@ from tqdm import tqdm
 from experiments.commands import require_extra, short_version
 from experiments.network_loop.log_figure import loop_log_figure
 from experiments.plots.animation import FORMATS, save_animation
-from experiments.runs.loops import module_and_id, registered_env
+from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
+from experiments.settings.arguments import id_alone
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyShield
 
 # Budget of `--smoke`.
 _SMOKE = {"steps": 5}
-_MAX_FPS = 50
-_MAX_SCALE = 4
-_MIN_WIDTH = 160
 # Width and gray value of the space between two frames side by side [pixels].
 _GAP = 8
 _GRAY = 120
@@ -31,9 +29,14 @@ _GRAY = 120
 def render(settings: RenderSettings) -> None:
     """Runs `ncs render`."""
     settings = short_version(settings, **_SMOKE)
-    _check(settings)
+    plant = registered_env(settings.env).plant
+    if settings.out.suffix not in FORMATS:
+        raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
+    if settings.log is not None and settings.out.suffix != ".png":
+        raise ValueError(f"--log draws a figure: --out must end in .png, got {settings.out}")
+    require_place(settings.out)
     if settings.log is not None:
-        figure = loop_log_figure(settings.log, registered_env(settings.env).plant, settings.steps)
+        figure = loop_log_figure(settings.log, plant, settings.steps)
         settings.out.write_bytes(figure.png)
         print(f"saved to {settings.out}")
         return
@@ -64,7 +67,7 @@ class _EpisodeRenderer:
     def __init__(self, settings: RenderSettings, mode: str) -> None:
         self._mode = mode
         certificate = None if settings.certificate is None else Certificate.load(settings.certificate)
-        _, env_id = module_and_id(settings.env)  # `_check` has imported the module
+        env_id = id_alone(settings.env)  # whose module is imported
         self._env: gym.Env = gym.make(env_id, render_mode="rgb_array")
         inner = ncs_env(self._env)
         assert inner.renderer is not None
@@ -119,21 +122,3 @@ def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
     gap[:, _GAP // 2 - 1 : _GAP // 2 + 1] = _GRAY
     parts = [part for frame in frames for part in (gap, frame)][1:]
     return np.concatenate(parts, axis=1)
-
-
-def _check(settings: RenderSettings) -> None:
-    """Checks the settings."""
-    registered_env(settings.env)
-    if settings.out.suffix not in FORMATS:
-        raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
-    if settings.log is not None and settings.out.suffix != ".png":
-        raise ValueError(f"--log draws a figure: --out must end in .png, got {settings.out}")
-    limits_of = {"seed": (0, None), "steps": (1, None), "fps": (1, _MAX_FPS), "scale": (1, _MAX_SCALE)}
-    for name, (low, high) in (limits_of | {"width": (_MIN_WIDTH, None)}).items():
-        value = getattr(settings, name)
-        if value is not None and (value < low or (high is not None and value > high)):
-            limits = f"at least {low}" + (f" and at most {high}" if high is not None else "")
-            raise ValueError(f"--{name} must be {limits}, got {value}")
-    if settings.side_by_side and settings.shield == "none":
-        raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
-    require_place(settings.out)

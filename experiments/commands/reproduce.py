@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import json
-
 from tqdm import tqdm
 
 from experiments.paper.reproduction import designs, reproduction_figures, simulate
-from experiments.runs.output_folder import claim_folder, prepare_output
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.settings import ReproduceSettings
 from experiments.terminal import text_table
-from shields.atomic_write import write_atomically
 
 
 def reproduce(settings: ReproduceSettings) -> None:
     """Runs `ncs reproduce`."""
     with claim_folder("reproduce", settings):
-        prepare_output(settings.out)
         with tqdm(total=3 * settings.starts, unit="start", mininterval=1.0) as bar:
             simulations = [simulate(design, settings, bar) for design in designs()]
-        for name, png in reproduction_figures(simulations).items():
-            write_atomically(settings.out / "figures" / f"{name}.png", png)
         outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
-        write_atomically(settings.out / "summary.json", json.dumps(outcomes, indent=1) + "\n")
+        write_results(settings.out, outcomes, figures=reproduction_figures(simulations))
         print(_table(outcomes))
         print(f"files: {settings.out}")
 

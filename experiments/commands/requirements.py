@@ -19,7 +19,7 @@ from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.heatmaps import requirements_map
 from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
 from experiments.terminal import text_table, wrapped
@@ -57,20 +57,10 @@ _MOST_PANELS = 9
 
 
 def requirements(settings: RequirementsSettings) -> None:
-    """Runs `ncs requirements`.
-
-    Raises:
-        ValueError: If the environment is unknown, the plant's file cannot be read, or a setting is out of range.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If the output folder cannot be written.
-        RunError: If a search fails.
-        ClusterError: If a cluster cannot execute the searches.
-    """
+    """Runs `ncs requirements`."""
     plant, today = _plant_and_network(settings)
     asked = _values(settings, plant, today)
     with claim_folder("requirements", settings):
-        prepare_output(settings.out)
         store = _Store(settings.out)
         found = shields.requirements(
             plant,

@@ -18,7 +18,7 @@ from experiments.report.html import sweep_report
 from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
 from experiments.runs.loops import loop_config
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
@@ -53,7 +53,6 @@ def sweep(settings: SweepSettings) -> None:
     require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
-        prepare_output(settings.out)
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         runs = [
@@ -74,13 +73,13 @@ def sweep(settings: SweepSettings) -> None:
         arms = [arm_summaries(part, settings.mode) for part in parts]
         summary = {
             "cells": [point | {"arms": each} for point, each in zip(points, arms, strict=True)]
-        } | experiment_provenance("sweep", settings, loops[0], certificates[0], runs)
+        } | experiment_provenance(settings, loops[0], certificates[0], runs)
         figures = sweep_figures(summary, settings.arms)
         certificates[0].save(settings.out / "certificate.json")
         verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
         files = {
             "episodes.parquet": parquet(pd.concat(parts), summary),
-            "report.html": sweep_report(summary, verification, dict(figures.values())),
+            "report.html": sweep_report(summary, verification, figures),
         }
         write_results(settings.out, summary, files, figures)
         count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
@@ -89,7 +88,6 @@ def sweep(settings: SweepSettings) -> None:
 
 
 def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
-    """Returns the points of the grid."""
     own_unless_given = ("quantization_steps", "mass_factors", "downlink_losses")
     sides = {name: getattr(settings, name) or ((None,) if name in own_unless_given else ()) for name in _SIDES}
     for name, side in (sides | {"arms": settings.arms}).items():
@@ -104,7 +102,6 @@ def _name(point: _GridPoint) -> str:
 
 
 def _loop(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
-    """Returns the control loop with the channels and the mass of a point."""
     changes = {name: point[name] for name in ("loss", "delay", "quantization_step") if point[name] is not None}
     if point["burst_length"] and point["loss"]:
         changes["burst_length"] = point["burst_length"]

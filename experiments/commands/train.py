@@ -10,7 +10,7 @@ from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
 from experiments.runs.going_on import forget_checkpoint, going_on
 from experiments.runs.loops import loop_config
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.training_run import RunResult
 from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
@@ -27,7 +27,6 @@ def train(settings: TrainSettings) -> None:
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("train", settings.completed):
-        prepare_output(settings.out)
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         run = run_of_arm(settings, loop, certificate, settings.arm, 0)
@@ -40,7 +39,7 @@ def train(settings: TrainSettings) -> None:
         arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
         certificate.save(settings.out / "certificate.json")
         summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0}
-        summary |= experiment_provenance("train", settings, loop, certificate, [run])
+        summary |= experiment_provenance(settings, loop, certificate, [run])
         write_results(settings.out, summary)
         print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
         print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")

@@ -45,7 +45,6 @@ def verify(settings: VerifySettings) -> None:
 
 
 def _matching_env(certificate: Certificate) -> str:
-    """Returns the id of the registered environment whose plant the certificate was made for."""
     for env_id in registered_ids():
         if registered_env(env_id).plant.has_fingerprint(certificate.fingerprint):
             return env_id

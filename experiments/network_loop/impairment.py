@@ -101,7 +101,6 @@ class Impairment:
 
 
 def _corrupted(data: bytes, rng: np.random.Generator) -> bytes:
-    """Returns the bytes with one bit turned over."""
     changed = bytearray(data)
     changed[rng.integers(len(changed))] ^= 1 << int(rng.integers(8))
     return bytes(changed)

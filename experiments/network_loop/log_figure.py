@@ -15,11 +15,6 @@ from ncs_gym import LinearPlant
 def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFigure:
     """Returns the last steps of the newest episode in the logs of `ncs loop`: its plant's, its controller's, or both.
 
-    Args:
-        folder: Folder of the logs.
-        plant: The plant they are of.
-        steps: How many of them.
-
     Raises:
         ValueError: If there are no rows, or they are of another plant.
     """

@@ -19,8 +19,9 @@ from experiments.network_loop.impairment import Impairment, open_line
 from experiments.network_loop.log import StepLog
 from experiments.runs.loops import changed_channel, registered_env
 from experiments.runs.policies import policy_by_name
+from experiments.settings import LoopSettings
 from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
-from ncs_gym.network import downlink_protocol
+from ncs_gym.network import DownlinkProtocol, downlink_protocol
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.wire import Wire
 from ncs_gym.processes.plant_simulation import PlantSimulation
@@ -36,13 +37,14 @@ from shields.nodes import (
 )
 
 # Steps by which an echo may be older than the oldest sample; what is allowed where nothing is promised.
-ECHO_ROOM, ECHO_AGE = 5, 50
+ECHO_MARGIN, ECHO_AGE = 5, 50
 # Steps in a row that are not proved after which the controller begins another episode.
 RENEWED = 250
 # Seconds after which a controller that waits says so.
 SILENCE = 5.0
 # Steps between two changes of direction of the controller "push".
 PUSH = 100
+HERE = "127.0.0.1"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,93 +52,73 @@ class NetworkLoop:
     """A control loop over a network, in a form that every process of it understands.
 
     Attributes:
-        env: Id of the environment whose plant is simulated.
-        certificate: File of the certificate.
+        settings: Those of the command.
         uplink: What the network does to samples and echoes.
         downlink: What it does to commands.
-        room: Steps by which both may be later than that, because the processes are: what is promised counts them.
         secret: What both machines share.
-        seed: Of network, disturbance and controller.
-        speed: Steps of the plant per duration of a step.
-        policy: Name of the controller.
-        mode, horizon: Of the shield.
-        mischief: Of `Impairment`.
-        until_worst: Of `Impairment`.
-        controller, sensor, actuator: Addresses at which the controller hears, and the network hears for it.
-        listen: Address at which the controller binds.
-        out: Folder of the logs.
-        steps: After how many steps the controller ends; None for never.
-        ask_age: Age from which the controller asks for samples, where they are on request; None to leave it to the
-            contract.
         max_age: Largest age of a sample in use when an input takes effect, where samples are on request.
     """
 
-    env: str
-    certificate: Path
+    settings: LoopSettings
     uplink: Channel
     downlink: Channel
-    room: int
     secret: bytes
-    seed: int
-    speed: float
-    policy: str
-    mode: str
-    horizon: int | None
-    mischief: float
-    until_worst: bool
-    controller: tuple[str, int]
-    sensor: tuple[str, int]
-    actuator: tuple[str, int]
-    listen: tuple[str, int]
-    out: Path
-    steps: int | None
-    ask_age: int | None
     max_age: int
 
     @property
-    def promised(self) -> tuple[Channel, Channel]:
-        """Uplink and downlink with the room for late processes."""
-        return tuple(replace(each, jitter=each.jitter + self.room) for each in (self.uplink, self.downlink))  # pyright: ignore
+    def certificate(self) -> Path:
+        """File of the certificate."""
+        return self.settings.out / "certificate.json"
 
     @property
-    def input_delay(self) -> int:
-        """c, the number of steps from a decision to its effect."""
+    def controller(self) -> tuple[str, int]:
+        """Address at which the controller hears."""
+        return self.settings.host, self.settings.port
+
+    @property
+    def sensor(self) -> tuple[str, int]:
+        """Address at which the network hears the sensor."""
+        return HERE, self.settings.port + 1
+
+    @property
+    def actuator(self) -> tuple[str, int]:
+        """Address at which the network hears the actuator."""
+        return HERE, self.settings.port + 2
+
+    @property
+    def promised(self) -> tuple[Channel, Channel]:
+        """Uplink and downlink, both later by what the processes may be late: what is promised counts that."""
+        late = self.settings.room
+        up, down = (replace(each, jitter=each.jitter + late) for each in (self.uplink, self.downlink))
+        return up, down
+
+    @property
+    def protocol(self) -> DownlinkProtocol:
+        """How commands are sent, and how many steps after the decision they take effect."""
         protocol = downlink_protocol(self.promised[1], None)
         assert protocol is not None
-        return protocol.input_delay
+        return protocol
 
     @property
     def contract(self) -> ChannelContract | None:
         """What is promised of samples and commands together; None if nothing is.
 
-        Samples on request may be left out for as long as `max_age` has room beyond what the network needs.
+        Samples on request may be left out as long as none in use is older than `max_age`.
         """
-        uplink, downlink = self.promised
-        protocol = downlink_protocol(downlink, None)
-        assert protocol is not None
-        needed = protocol.behind(contract_of(uplink))
-        if needed is None or not uplink.on_request:
+        needed = self.protocol.behind(contract_of(self.promised[0]))
+        if needed is None or not self.uplink.on_request:
             return needed
         return replace(needed, max_age=max(needed.max_age, self.max_age))
 
     @property
     def key(self) -> bytes:
         """Key of the messages: machines that were told other things refuse each other's."""
-        told = self.env, self.speed, self.room, self.uplink, self.downlink
+        told = self.settings.env, self.settings.speed, self.settings.room, self.uplink, self.downlink
         return hmac.digest(self.secret, repr(told).encode(), "sha256")
 
     def dt(self, env: NCSEnv) -> float:
         """Returns the duration of a step in real time [s]."""
-        return env.plant.dt / self.speed
-
-    def safe_loop(self, env: NCSEnv) -> SafeLoop:
-        """Returns the loop."""
-        uplink, downlink = self.promised
-        contract = contract_of(uplink)  # echoes are sent at every step, whatever samples are
-        age = ECHO_AGE if contract is None else contract.max_age + ECHO_ROOM
-        settings = {"downlink": downlink, "echo_age": age, "on_unproved": "ignore"}
-        certificate = Certificate.load(self.certificate)
-        return SafeLoop(certificate, env.plant, uplink, self.mode, self.horizon, **settings)
+        return env.plant.dt / self.settings.speed
 
 
 def network_channels(
@@ -144,12 +126,7 @@ def network_channels(
 ) -> tuple[Channel, Channel]:
     """Returns uplink and downlink of an environment as a real network has them: what is sent now arrives a step later.
 
-    Without a downlink of its own it has one like its uplink.
-
-    Args:
-        env: The environment.
-        up_changes: Changes of the uplink by name; see `changed_channel`.
-        down_changes: Those of the downlink.
+    Without a downlink of its own it has one like its uplink; for changes see `changed_channel`.
 
     Raises:
         ValueError: If a change is wrong, or is none that a real network can have.
@@ -185,24 +162,14 @@ def run_network(loop: NetworkLoop) -> None:
 
 
 def run_controller_node(
-    loop: NetworkLoop,
-    known: bool = True,
-    show: Callable[[dict[str, Any]], None] | None = None,
-    is_alone: Callable[[], bool] = lambda: False,
+    loop: NetworkLoop, show: Callable[[dict[str, Any]], None] | None, is_alone: Callable[[], bool]
 ) -> bool:
     """Runs the controller in real time, until it has made its steps, the process is ended or is left alone.
 
-    Args:
-        loop: The loop.
-        known: Whether the plant starts where the first estimate says.
-        show: Called with each row of the log.
-        is_alone: Whether processes that it needs have ended.
-
-    Returns:
-        Whether it was told to stop.
+    Returns whether the process was told to end; `show` is called with each row of the log.
     """
     told = _told_to_stop()
-    asyncio.run(_controller(loop, known, show, lambda: told() or is_alone()))
+    asyncio.run(_controller(loop, show, lambda: told() or is_alone()))
     return told()
 
 
@@ -217,18 +184,20 @@ def _told_to_stop() -> Callable[[], bool]:
 
 
 async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
-    env = registered_env(loop.env)
-    plant, rng = env.plant, np.random.default_rng([loop.seed, 1])
+    env = registered_env(loop.settings.env)
+    plant, rng = env.plant, np.random.default_rng([loop.settings.seed, 1])
     certificate = Certificate.load(loop.certificate)
     linear = plant.remainder is None
     disturbance = AdversarialDisturbance(certificate.M) if linear else env.disturbance
     simulation = PlantSimulation(plant, disturbance, False, process=env.process)
-    wire, clock = Wire(plant, loop.input_delay, loop.key), StepClock(loop.dt(env))
+    wire, clock = Wire(plant, loop.protocol.input_delay, loop.key), StepClock(loop.dt(env))
     sensor = SensorNode(wire, await UdpTransport.open(peer=loop.sensor), clock)
-    actuator = Actuator(loop.input_delay, plant.m, plant.u_max)
+    actuator = Actuator(loop.protocol.input_delay, plant.m, plant.u_max)
     node = ActuatorNode(wire, await UdpTransport.open(peer=loop.actuator), clock, actuator)
     names = [*(f"x_{name}" for name in plant.state_names), *(f"u_{name}" for name in plant.input_names)]
-    log = StepLog(loop.out, "plant", ["time", "episode", "step", *names, "missing", "outside", "sent", "drift"])
+    log = StepLog(
+        loop.settings.out, "plant", ["time", "episode", "step", *names, "missing", "outside", "sent", "drift"]
+    )
     start, episode, last, released = np.zeros(plant.n), 0, 0, False
     state, memory = start, simulation.begin(rng)
 
@@ -257,11 +226,11 @@ async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
 
 
 async def _network(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
-    env = registered_env(loop.env)
+    env = registered_env(loop.settings.env)
 
     def one_way(channel: Channel, number: int) -> Impairment:
-        rng = np.random.default_rng([loop.seed, 2, number])
-        return Impairment(channel, loop.dt(env), rng, loop.mischief, loop.until_worst)
+        rng = np.random.default_rng([loop.settings.seed, 2, number])
+        return Impairment(channel, loop.dt(env), rng, loop.settings.mischief, loop.settings.worst)
 
     ways = [one_way(channel, i) for i, channel in enumerate((loop.uplink, loop.downlink, loop.uplink, loop.downlink))]
     await open_line(loop.sensor, loop.controller, *ways[:2])
@@ -271,19 +240,26 @@ async def _network(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
 
 
 async def _controller(
-    loop: NetworkLoop, known: bool, show: Callable[[dict[str, Any]], None] | None, is_over: Callable[[], bool]
+    loop: NetworkLoop, show: Callable[[dict[str, Any]], None] | None, is_over: Callable[[], bool]
 ) -> None:
-    env = registered_env(loop.env)
-    plant, wire = env.plant, Wire(env.plant, loop.input_delay, loop.key)
-    transport = await UdpTransport.open(local=loop.listen)
-    node = ControllerNode(loop.safe_loop(env), wire, transport, StepClock(loop.dt(env)), np.zeros(plant.n), known=known)
+    settings, env = loop.settings, registered_env(loop.settings.env)
+    plant, wire = env.plant, Wire(env.plant, loop.protocol.input_delay, loop.key)
+    uplink, downlink = loop.promised
+    contract = contract_of(uplink)  # echoes are sent at every step, whatever samples are
+    age = ECHO_AGE if contract is None else contract.max_age + ECHO_MARGIN
+    given = {"downlink": downlink, "echo_age": age, "on_unproved": "ignore"}
+    certificate = Certificate.load(loop.certificate)
+    safe_loop = SafeLoop(certificate, plant, uplink, settings.shield, settings.horizon, **given)
+    transport = await UdpTransport.open(local=(HERE if settings.role == "all" else "0.0.0.0", settings.port))
+    start, known = np.zeros(plant.n), not settings.restarted
+    node = ControllerNode(safe_loop, wire, transport, StepClock(loop.dt(env)), start, known=known)
     inputs = plant.input_names
     columns = ["time", "episode", "step", "guaranteed", "reason", *(f"x_hat_{name}" for name in plant.state_names)]
     columns += [*(f"proposed_{name}" for name in inputs), *(f"u_{name}" for name in inputs)]
     columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "microseconds"]
-    log = StepLog(loop.out, "controller", columns)
-    packets = StepLog(loop.out, "packets", ["episode", "sent", "received"])
-    propose = controller_named(loop.policy, loop.env, env, loop.seed)
+    log = StepLog(settings.out, "controller", columns)
+    packets = StepLog(settings.out, "packets", ["episode", "sent", "received"])
+    propose = controller_named(settings.policy, settings.env, env, settings.seed)
     steps = unproved = 0
 
     def on_step(node: ControllerNode, proposed: Any) -> None:
@@ -312,10 +288,10 @@ async def _controller(
         if node.episode == 0 and not is_told and time.monotonic() - began > SILENCE:
             is_told = True
             print(waiting_text(node.refused), file=sys.stderr, flush=True)
-        return is_over() or (loop.steps is not None and steps >= loop.steps)
+        return is_over() or steps >= settings.steps
 
     def asks(safe: SafeLoop) -> bool:
-        return loop.ask_age is not None and safe.measurement_age >= loop.ask_age
+        return settings.ask_age is not None and safe.measurement_age >= settings.ask_age
 
     await run_controller(node, propose, on_step, has_ended, asks=asks)
     log.close()
@@ -334,12 +310,7 @@ def waiting_text(refused: Mapping[str, int]) -> str:
 
 
 def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries.
-
-    Raises:
-        AgentError: If there is no agent for this environment.
-        ValueError: If the folder of a run holds several agents.
-    """
+    """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries."""
     plant = env.plant
     if name == "push":
         count = 0

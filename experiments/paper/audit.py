@@ -94,7 +94,6 @@ class Claim:
     defect: str = ""
 
     def __post_init__(self) -> None:
-        """Keeps a defect only of a claim that does not hold."""
         if self.verdict != Verdict.FAILS:
             object.__setattr__(self, "defect", "")
 

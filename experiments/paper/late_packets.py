@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -73,14 +74,8 @@ class Definition1Filter:
 MakeFilter = Callable[[PaperExample, LinearPlant, np.ndarray], Definition1Filter | VectorEstimator]
 
 
-def taken_as_current(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> Definition1Filter:
-    """Returns Definition 1's filter that takes a late sample for y_k."""
-    return Definition1Filter(example, plant, mean, takes_late=True)
-
-
-def discarded(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> Definition1Filter:
-    """Returns Definition 1's filter that discards late samples."""
-    return Definition1Filter(example, plant, mean, takes_late=False)
+taken_as_current: MakeFilter = partial(Definition1Filter, takes_late=True)
+discarded: MakeFilter = partial(Definition1Filter, takes_late=False)
 
 
 def replayed(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> VectorEstimator:

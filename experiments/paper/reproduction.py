@@ -134,16 +134,13 @@ _COLOR = "#1f6f8b"
 _SHOWN_STEPS = 40
 
 
-def reproduction_figures(simulations: Sequence[Simulation]) -> dict[str, bytes]:
-    """Returns the PNG files of the states and of the inputs, by name."""
-    return {
-        "states": _panels(simulations, _draw_states).png,
-        "inputs": _panels(simulations, _draw_inputs).png,
-    }
+def reproduction_figures(simulations: Sequence[Simulation]) -> dict[str, tuple[str, bytes]]:
+    """Returns caption (none) and PNG file of the states and of the inputs, by name."""
+    figures = {"states": _panels(simulations, _draw_states), "inputs": _panels(simulations, _draw_inputs)}
+    return {name: (figure.caption, figure.png) for name, figure in figures.items()}
 
 
 def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation], None]) -> CaptionedFigure:
-    """Returns one panel per design, with one legend below."""
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((12, 4.8))
         axes = figure.subplots(1, len(simulations), sharey=True)

@@ -257,7 +257,6 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
 
 
 def _draw_events(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -> None:
-    """Draws a row of ticks per arm and kind of event."""
     names = []
     for name, path in paths.items():
         mode, color = Arm.of(name).mode, ArmStyle.of(name).color
@@ -327,7 +326,6 @@ def _plane(certificate: Certificate, states: np.ndarray) -> tuple[int, int]:
 def _draw_path(
     axis: Axes, plant: LinearPlant, states: np.ndarray, plane: tuple[int, int], arm: str, count: int
 ) -> dict[str, Artist]:
-    """Draws one of several trajectories of an arm, its start and its violating states."""
     x, y = states[:, plane].T
     axis.plot(x, y, color=ArmStyle.of(arm).color, lw=0.9, alpha=max(0.8 - 0.05 * count, 0.3))
     (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=_INK, mew=1.0)

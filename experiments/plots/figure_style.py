@@ -186,7 +186,6 @@ class ArmStyle:
 
 
 def _look_of(arm: Arm) -> str:
-    """Returns the key of an arm's color and marker."""
     if not arm.is_trained and arm.mode is None:
         return "controller"
     if arm.penalizes_violations:

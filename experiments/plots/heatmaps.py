@@ -31,17 +31,9 @@ _BOUNDARY, _TODAY = "#c1272d", "#ff9800"
 
 
 class _Quantity(NamedTuple):
-    """Quantity that a heatmap shows.
+    """What a heatmap shows: the entry `key` of an arm's summary times a factor, on a color scale from low to high.
 
-    Attributes:
-        key: Key of the quantity in an arm's summary.
-        title: Label of the color scale, with the unit.
-        colors: Name of a color map of matplotlib.
-        low: Start of the color scale; None for the smallest value.
-        high: End of the color scale, unless a value is larger; None for the largest value.
-        caption: First sentence of the caption.
-        factor: Factor from the unit in the summary to the unit in the figure.
-        of_shields: Whether only arms with a shield have the quantity.
+    Without an end given, and beyond the highest one, the scale reaches to the values.
     """
 
     key: str

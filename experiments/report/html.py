@@ -21,27 +21,29 @@ _PIXEL_RATIO = 2.1
 _PNG_WIDTH = slice(16, 20)
 
 
-def comparison_report(
-    summary: dict[str, Any], verification: Report, figures: dict[str, bytes], findings: list[str]
-) -> str:
+# Caption and PNG file of each figure, by its name.
+Figures = Mapping[str, tuple[str, bytes]]
+
+
+def comparison_report(summary: dict[str, Any], verification: Report, figures: Figures, findings: list[str]) -> str:
     """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline."""
     runs, title = max(arm["runs"] for arm in summary["arms"].values()), f"Safe learning on {summary['settings']['env']}"
     context = _origin("compare", summary, verification)
-    return render_page("comparison.html.j2", _named(figures), title=title, runs=runs, findings=findings, **context)
+    return render_page("comparison.html.j2", figures, title=title, runs=runs, findings=findings, **context)
 
 
-def sweep_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes]) -> str:
+def sweep_report(summary: dict[str, Any], verification: Report, figures: Figures) -> str:
     """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings."""
     title, context = f"Channels of {summary['settings']['env']}", _origin("sweep", summary, verification)
-    return render_page("sweep.html.j2", _named(figures), title=title, **context)
+    return render_page("sweep.html.j2", figures, title=title, **context)
 
 
-def render_page(template: str, figures: Mapping[str, tuple[str, bytes]], **context: Any) -> str:
+def render_page(template: str, figures: Figures, **context: Any) -> str:
     """Returns a page: HTML that contains its figures and opens offline, or Markdown.
 
     Args:
         template: Name of the template; only that of an HTML page escapes what it inserts.
-        figures: Caption and PNG file by name.
+        figures: The figures.
         **context: Further variables of the template.
     """
     images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
@@ -54,10 +56,6 @@ def _origin(command: str, summary: dict[str, Any], verification: Report) -> dict
     settings = summary["settings"]
     shown = {name: _text(value) for name, value in flat(settings).items()}
     return dict(command=command, summary=summary, settings=settings, shown_settings=shown, verification=verification)
-
-
-def _named(figures: dict[str, bytes]) -> dict[str, tuple[str, bytes]]:
-    return {str(number): figure for number, figure in enumerate(figures.items())}
 
 
 @cache

@@ -11,7 +11,7 @@ from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
 from experiments.baselines import tuned_training
 from experiments.runs.arms import Arm
-from experiments.runs.loops import module_and_id, other_scenarios
+from experiments.runs.loops import other_scenarios
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, LearningSettings, settings_json
@@ -27,13 +27,7 @@ INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)
 
 
 def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
-    """Returns if agents can be trained with the hyperparameters given; those that are not given can.
-
-    Raises:
-        ValueError: If there is no such hyperparameter, or the learning library does not take its value.
-        ModuleNotFoundError: If the algorithm's package is not installed.
-        OSError: If the file of hyperparameters cannot be read.
-    """
+    """Raises what training would raise later if agents cannot be trained with the hyperparameters given."""
     if settings.hyperparams or settings.conf_file is not None:
         from agents import training  # imports torch
 
@@ -90,7 +84,7 @@ def run_of_arm(
         policy_kind=arm.policy,
         training_loop=training_loop,
         loop=loop,
-        module=module_and_id(settings.env)[0],
+        module=settings.env.rpartition(":")[0],
         seed=settings.seed,
         index=index,
         steps=settings.training_steps,
@@ -111,18 +105,24 @@ def certificate_line(certificate: Certificate, verification: Report) -> str:
     return f"{conditions} ({size})" if size else conditions
 
 
+def lasting_settings(settings: Any) -> dict[str, Any]:
+    """Returns the settings of a command that results depend on, JSON values."""
+    kept = settings_json("", settings)["settings"]
+    return {name: value for name, value in kept.items() if name not in INCIDENTAL_SETTINGS}
+
+
 def experiment_provenance(
-    command: str, settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
+    settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
 ) -> dict[str, Any]:
     """Returns what a reader needs to know where the results of a command come from, JSON values."""
-    content, env = settings_json(command, settings)["settings"], ncs_env(loop.single())
+    env = ncs_env(loop.single())
     channel = env.channel.description
     if env.downlink is not None:
         channel += f" Commands: {env.downlink.description}"
     return {
         "runs": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-        "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
+        "settings": lasting_settings(settings),
         "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},
         "described": {"plant": str(env.plant), "channel": channel},
         "certificate": certificate.checksum,

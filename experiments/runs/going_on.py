@@ -43,7 +43,8 @@ def going_on(folder: Path, run: TrainingRun, *, anew: bool) -> TrainingRun:
     run, store = replace(run, start=known), RunStore(folder)
     if store.load(run) is not None:
         return run
-    found = [_finished(store, run), _read(checkpoint)]
+    finished = store.load(replace(run, steps=1), of_other_settings=True)  # of any number of steps
+    found = [finished and Start(finished.files, finished.history), _read(checkpoint)]
     longer = [each for each in found if each and (known.steps if known else 0) < each.steps < run.steps]
     if not longer:
         return run
@@ -58,12 +59,6 @@ def going_on(folder: Path, run: TrainingRun, *, anew: bool) -> TrainingRun:
 def forget_checkpoint(folder: Path, run: TrainingRun) -> None:
     """Removes the checkpoint of a training that is finished."""
     shutil.rmtree(folder / "tensorboard" / run.name / CHECKPOINT, ignore_errors=True)
-
-
-def _finished(store: RunStore, run: TrainingRun) -> Start | None:
-    """Returns the agent of a finished training of any number of steps; None if there is none."""
-    result = store.load(replace(run, steps=1), of_other_settings=True)
-    return result and Start(result.files, result.history)
 
 
 def _read(folder: Path) -> Start | None:

@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 
 from agents.loop import LoopConfig
+from experiments.settings.arguments import id_alone
 from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
@@ -29,7 +30,7 @@ def registered_env(env_id: str) -> NCSEnv:
     Raises:
         ValueError: If the id is not registered or has no plant of its own, or there is no such module.
     """
-    module, name = module_and_id(env_id)
+    module, _, name = env_id.rpartition(":")
     if module:
         import_module(module)
         if name not in gym.registry:
@@ -40,12 +41,6 @@ def registered_env(env_id: str) -> NCSEnv:
             "module that registers one of your own"
         )
     return ncs_env(gym.make(name))
-
-
-def module_and_id(env_id: str) -> tuple[str, str]:
-    """Returns the module of "module:id", empty for an id alone, and the id by which the environment is registered."""
-    module, _, name = env_id.rpartition(":")
-    return module, name
 
 
 def import_module(module: str) -> None:
@@ -85,7 +80,7 @@ def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs:
         ValueError: If the environment is unknown or has no plant of its own, or cannot have the channel.
     """
     registered_env(env_id)
-    return with_channel(LoopConfig(env=module_and_id(env_id)[1], kwargs=kwargs), channel or {})
+    return with_channel(LoopConfig(env=id_alone(env_id), kwargs=kwargs), channel or {})
 
 
 def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:
@@ -119,20 +114,12 @@ def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--cha
     return None if changed == own else changed
 
 
-def _bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
-    """Returns losses of a given probability that come in bursts of a given mean length.
+def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:
+    """Returns losses of a given probability that come in bursts of a given mean number of packets.
 
     In the bad state everything is lost. From one packet to the next, M = send_period steps later, it is to be left with
     probability b = 1/length and entered with a = loss b / (1 - loss); the chain moves every step, so its own
-    probabilities have the same ratio and the M-th root of the eigenvalue 1 - a - b.
-
-    Args:
-        loss: Probability that a packet is lost.
-        length: Mean number of packets lost in a row, >= 1; 1 / (1 - loss) if losses were independent.
-        send_period: M [steps].
-
-    Raises:
-        ValueError: If no such chain exists.
+    probabilities have the same ratio and the M-th root of the eigenvalue 1 - a - b. Raises ValueError if there is none.
     """
     usable = 0.0 <= loss < 1.0 and 1.0 <= length < float("inf")
     left = 1.0 / length if usable else 0.0

@@ -41,15 +41,10 @@ _GROWING = {
 _LOCK = ".lock"
 # What the operating system says where there are no locks.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
-# What stands for a finished experiment, and what is drawn and listed of it: patterns where names depend on settings.
-_TABLES = ("episodes.parquet", "training.parquet")
+# What stands for a finished experiment, and what is drawn and listed of it.
 _FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
-_MADE_OF_RESULTS = (
-    "summary.json",
-    "report.html",
-    *_TABLES,
-    *(f"figures/{name}.png" for name in (*_FIGURES, "trusting-*")),
-)
+_MADE_OF_RESULTS = ("summary.json", "report.html", "episodes.parquet", "training.parquet")
+_MADE_OF_RESULTS += tuple(f"figures/{name}.png" for name in _FIGURES)
 # Differences that a message lists, and characters of each value.
 _MOST_LISTED, _MOST_CHARACTERS = 3, 40
 
@@ -57,6 +52,8 @@ _MOST_LISTED, _MOST_CHARACTERS = 3, 40
 @contextmanager
 def claim_folder(command: str, settings: Any) -> Iterator[None]:
     """Creates the output folder of a command and writes `settings.json` in it; no other command has it meanwhile.
+
+    An earlier summary, tables, figures and report, which belong together, are removed; files of other names stay.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
     or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs attack` or
@@ -84,22 +81,9 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
         if not settings.force:
             _require_own_settings(folder / "settings.json")
         save_settings(folder / "settings.json", command, settings)
+        for name in _MADE_OF_RESULTS:
+            (folder / name).unlink(missing_ok=True)
         yield
-
-
-def prepare_output(folder: Path) -> None:
-    """Creates an output folder and removes an earlier summary, tables, figures and report, which belong together.
-
-    Files of other names are left where they are.
-
-    Raises:
-        OSError: If the folder cannot be written.
-    """
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / ".writable", "")
-    (folder / ".writable").unlink()
-    for file in [file for pattern in _MADE_OF_RESULTS for file in folder.glob(pattern)]:
-        file.unlink(missing_ok=True)
 
 
 def write_results(
@@ -113,6 +97,7 @@ def write_results(
     Raises:
         OSError: If a file cannot be written.
     """
+    (folder / "figures").mkdir(exist_ok=True)
     for name, (_, png) in figures.items():
         write_atomically(folder / "figures" / f"{name}.png", png)
     for name, content in files.items():
@@ -122,12 +107,7 @@ def write_results(
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Has a folder for this process alone; where the file system knows no locks, a warning says that it has not.
-
-    Raises:
-        FolderInUseError: If another process has it.
-        OSError: If the folder cannot be written.
-    """
+    """Has a folder for this process alone; where the file system knows no locks, a warning says that it has not."""
     lock = FileLock(folder / _LOCK, fallback_to_soft=False)
     try:
         lock.acquire(blocking=False)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from agents.agent_file import AgentError, pretrained_folder
 from experiments.baselines import REGULATORS, controller, tuned_weights
 from ncs_gym import NCSEnv
+
+if TYPE_CHECKING:
+    from agents.agent import Agent
 
 # Controllers that need neither training nor a certificate, and the short name of one.
 UNTRAINED_POLICIES = ("greedy", "zero", "random", *REGULATORS)
@@ -41,25 +45,38 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         no_gain = np.zeros((env.plant.m, env.plant.n))
         act = controller(_SHORT.get(name, name), env, no_gain, seed, tuned_weights(env_id, name))
         return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
-    from agents.agent import (
-        Agent,  # imports torch
-        is_sb3_zip,
-        load_sb3_zip,
-    )
-
-    path = pretrained_folder(env_id) if name == PRETRAINED else Path(name)
-    agent = load_sb3_zip(path, env_id) if is_sb3_zip(path) else Agent.load(agent_folder(path))
-    if agent.env != env_id:
-        raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")
+    agent, _ = agent_named(name, env_id)
     return lambda observation, info: agent.act(observation[None])[0]
 
 
-def agent_folder(folder: Path) -> Path:
-    """Returns the folder of the only agent in a run's output; any other folder is returned as it is.
+def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
+    """Returns a trained agent, and the folder or zip that it is in.
+
+    Args:
+        name: As for `policy_by_name`.
+        env_id: Id of the environment that it has to be of; None for any.
 
     Raises:
-        ValueError: If the run left several agents.
+        AgentError: If there is no agent, or it is of another environment.
+        ValueError: If the folder of a run holds several agents, or nothing says of which environment the agent is.
     """
+    from agents.agent import Agent, is_sb3_zip, load_sb3_zip  # imports torch
+
+    path = _only_agent(Path(name))
+    if env_id is None and (name == PRETRAINED or is_sb3_zip(path)):
+        raise ValueError(f"{name} does not say of which environment the agent is: give --env")
+    if env_id is not None and name == PRETRAINED:
+        path = pretrained_folder(env_id)
+    if env_id is not None and is_sb3_zip(path):
+        return load_sb3_zip(path, env_id), path
+    agent = Agent.load(path)
+    if env_id not in (None, agent.env):
+        raise AgentError(f"the agent in {path} was trained in {agent.env}, not in {env_id}")
+    return agent, path
+
+
+def _only_agent(folder: Path) -> Path:
+    """Returns the folder of the only agent in a run's output; any other folder is returned as it is."""
     models = sorted(file.parent for file in folder.glob("models/*/agent.json"))
     if (folder / "agent.json").exists() or not models:
         return folder

@@ -55,6 +55,43 @@ class Start:
         return self.history[-1].steps
 
 
+@dataclass(frozen=True)
+class RunResult:
+    """Result of a training run.
+
+    Attributes:
+        arm: Name of the run's arm.
+        index: Number of the run within its arm.
+        train_steps: Number of training steps; 0 if nothing was trained.
+        train_violation_steps: Number of training steps whose true state violated the safe box.
+        train_interventions: Number of training steps in which the shield intervened.
+        history: Running totals during the training.
+        episodes: Evaluation episodes.
+        trajectory: Trajectory of the first evaluation episode.
+        files: Contents of the trained agent's files by name; empty if nothing was trained.
+        scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
+    """
+
+    arm: str
+    index: int
+    train_steps: int
+    train_violation_steps: int
+    train_interventions: int
+    history: list[TrainingPoint]
+    episodes: list[Episode]
+    trajectory: Trajectory
+    files: dict[str, bytes] = field(default_factory=dict)
+    scenarios: dict[str, list[Episode]] = field(default_factory=dict)
+
+    @property
+    def outcome(self) -> str:
+        """What came out, in one line."""
+        violating = sum(episode.violation_steps > 0 for episode in self.episodes)
+        mean = sum(episode.episode_return for episode in self.episodes) / len(self.episodes)
+        training = f"{self.train_violation_steps:,} violating training steps, " if self.train_steps else ""
+        return f"{training}{violating} of {len(self.episodes)} episodes violating, return {mean:z.2f}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainingRun:
     """Settings of one training run.
@@ -99,15 +136,12 @@ class TrainingRun:
     agent_files: dict[str, bytes] = field(default_factory=dict)
     start: Start | None = None
 
+    result_type = RunResult
+
     @property
     def parts(self) -> tuple[str, ...]:
         """What the steps belong to."""
         return ("training", "evaluation") if self.trains else ("evaluation",)
-
-    @property
-    def result_type(self) -> type[RunResult]:
-        """Type of the result."""
-        return RunResult
 
     @property
     def leaves(self) -> tuple[str, ...]:
@@ -227,43 +261,6 @@ class TrainingRun:
         return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index, *more]).generate_state(2)]
 
 
-@dataclass(frozen=True)
-class RunResult:
-    """Result of a training run.
-
-    Attributes:
-        arm: Name of the run's arm.
-        index: Number of the run within its arm.
-        train_steps: Number of training steps; 0 if nothing was trained.
-        train_violation_steps: Number of training steps whose true state violated the safe box.
-        train_interventions: Number of training steps in which the shield intervened.
-        history: Running totals during the training.
-        episodes: Evaluation episodes.
-        trajectory: Trajectory of the first evaluation episode.
-        files: Contents of the trained agent's files by name; empty if nothing was trained.
-        scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
-    """
-
-    arm: str
-    index: int
-    train_steps: int
-    train_violation_steps: int
-    train_interventions: int
-    history: list[TrainingPoint]
-    episodes: list[Episode]
-    trajectory: Trajectory
-    files: dict[str, bytes] = field(default_factory=dict)
-    scenarios: dict[str, list[Episode]] = field(default_factory=dict)
-
-    @property
-    def outcome(self) -> str:
-        """What came out, in one line."""
-        violating = sum(episode.violation_steps > 0 for episode in self.episodes)
-        mean = sum(episode.episode_return for episode in self.episodes) / len(self.episodes)
-        training = f"{self.train_violation_steps:,} violating training steps, " if self.train_steps else ""
-        return f"{training}{violating} of {len(self.episodes)} episodes violating, return {mean:z.2f}"
-
-
 def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, bool]]:
     """Yields the values of a result by name, and whether they can be those of a run."""
     yield "arm", result.arm, result.arm == run.arm
@@ -304,14 +301,7 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 
 
 def _agent_of(run: TrainingRun) -> Agent | None:
-    """Returns the agent that a run does not train: the one whose files it has, or one with its initial weights.
-
-    Returns:
-        None for a run with a policy that is no agent.
-
-    Raises:
-        AgentError: If the files are no agent of an environment that is registered here.
-    """
+    """Returns the agent that a run does not train: that of its files, or one with initial weights; None for none."""
     if run.agent_files:
         return _loaded(run.agent_files)
     if run.policy_kind != "untrained":

@@ -5,6 +5,7 @@ from experiments.settings.certificates import (
     AttackSettings,
     AuditSettings,
     ChannelSettings,
+    LoopSettings,
     RenderSettings,
     ReproduceSettings,
     RequirementsSettings,
@@ -20,7 +21,6 @@ from experiments.settings.learning import (
     SweepSettings,
     TrainSettings,
 )
-from experiments.settings.network_loop import LoopSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
 
 __all__ = [

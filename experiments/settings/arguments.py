@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from decimal import Decimal, InvalidOperation
+from math import inf
 from typing import Annotated, Any
 
 from tyro.constructors import PrimitiveConstructorSpec
@@ -36,6 +37,11 @@ Assignments = Annotated[
         str_from_instance=lambda values: [f"{name}={value}" for name, value in values.items()],
     ),
 ]
+
+
+def id_alone(env_id: str) -> str:
+    """Returns the id of "module:id", by which the environment is registered."""
+    return env_id.rpartition(":")[2]
 
 
 def beside_those_of_file(settings: Any, of_file: Any) -> Any:
@@ -84,27 +90,26 @@ StepCount = Annotated[int, _argument("INT")]
 OptionalStepCount = Annotated[int | None, _argument("{None}|INT")]
 
 
-def require_least(settings: Any, **least: float) -> None:
-    """Returns if settings are at least so large; None may be anything, and a setting that is not there, too.
+def require_limits(settings: Any, **limits: float | tuple[float, float]) -> None:
+    """Returns if settings keep their limits, the least value or that and the largest; None keeps all.
 
     Raises:
-        ValueError: If one is smaller, infinite or NaN.
+        ValueError: If one does not, or is infinite or NaN.
     """
-    for name, low in least.items():
+    for name, limit in limits.items():
+        low, high = limit if isinstance(limit, tuple) else (limit, inf)
         value = getattr(settings, name, None)
-        if value is not None and not low <= value < float("inf"):
-            raise ValueError(f"--{name.replace('_', '-')} must be at least {low:g}, got {value}")
+        if value is not None and not (low <= value <= high and value < inf):
+            at_most = f" and at most {high:g}" if high < inf else ""
+            raise ValueError(f"--{name.replace('_', '-')} must be at least {low:g}{at_most}, got {value}")
 
 
-def require_horizon(horizon: int | None, *modes: str | None) -> None:
-    """Returns if a horizon may be given with these modes or arms; None may always.
+def require_horizon(settings: Any, *modes: str | None) -> None:
+    """Returns if the horizon, if there is one, is in its range and belongs to one of these modes or arms.
 
     Raises:
-        ValueError: If it is out of range, or none of them is or names "lookahead".
+        ValueError: If it does not.
     """
-    if horizon is None:
-        return
-    if not 1 <= horizon <= LONGEST_HORIZON:
-        raise ValueError(f"--horizon must be at least 1 and at most {LONGEST_HORIZON}, got {horizon}")
-    if not any("lookahead" in (mode or "") for mode in modes):
+    require_limits(settings, horizon=(1, LONGEST_HORIZON))
+    if (horizon := settings.horizon) is not None and not any("lookahead" in (mode or "") for mode in modes):
         raise ValueError(f"--horizon {horizon} is for mode lookahead, which is not asked for")

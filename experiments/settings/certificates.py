@@ -1,15 +1,15 @@
-"""Settings of the commands that train nothing: about certificates, networks, the paper, and episodes that are drawn."""
+"""Settings of the commands that train nothing: about certificates, networks, the paper, and drawing."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from experiments.settings.arguments import StepCount, require_horizon, require_least
+from experiments.settings.arguments import Assignments, StepCount, require_horizon, require_limits
 from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
@@ -48,7 +48,6 @@ class SynthesizeSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a setting contradicts another."""
         _refuse_both(self.env, self.plant)
 
 
@@ -74,7 +73,6 @@ class VerifySettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a setting contradicts another."""
         _refuse_both(self.env, self.plant)
 
 
@@ -160,19 +158,16 @@ class AttackSettings(BackendSettings):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range or contradicts another."""
         BackendSettings.__post_init__(self)
         _refuse_both(self.env, self.plant)
         if self.plant is None and (self.max_age is not None or self.quantization_step is not None):
             raise ValueError("--max-age and --quantization-step belong to --plant: environments have contracts already")
-        if self.delta is not None and not SMALLEST_DELTA <= self.delta <= 0.5:
-            raise ValueError(f"--delta must be between {SMALLEST_DELTA:g} and 0.5, got {self.delta:g}")
         if not 1.0 <= self.steps < 1e15:
             raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
-        require_least(self, random_plants=0, envs=FEWEST_ENVS, seed=0)
+        require_limits(self, random_plants=0, envs=FEWEST_ENVS, seed=0, delta=(SMALLEST_DELTA, 0.5))
         if self.unshielded and self.mode is not None:
             raise ValueError(f"give either --mode {self.mode} or --unshielded, not both")
-        require_horizon(self.horizon, self.mode)
+        require_horizon(self, self.mode)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,8 +207,7 @@ class ReproduceSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
-        require_least(self, starts=1, steps=1, seed=0)
+        require_limits(self, starts=1, steps=1, seed=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,7 +261,6 @@ class RequirementsSettings(BackendSettings):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a setting is out of range or contradicts another."""
         BackendSettings.__post_init__(self)
         _refuse_both(self.env, self.plant)
         if not 0.0 < self.keep <= 100.0:
@@ -296,8 +289,7 @@ class ChannelSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
-        require_least(self, seed=0)
+        require_limits(self, seed=0)
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")
@@ -344,5 +336,73 @@ class RenderSettings:
     smoke: bool = False
 
     def __post_init__(self) -> None:
-        """Raises ValueError if the horizon is wrong."""
-        require_horizon(self.horizon, self.shield)
+        require_horizon(self, self.shield)
+        require_limits(self, seed=0, steps=1, fps=(1, 50), scale=(1, 4), width=160)
+        if self.side_by_side and self.shield == "none":
+            raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSettings:
+    """Runs a control loop over UDP: plant, network and controller as processes, in real time (docs/network_loop.md).
+
+    Attributes:
+        env: Id of an environment with a plant of its own; module:id first imports the module.
+        channel: Changes of what the network does to samples and echoes, by the names that `ncs compare` lists, such as
+            loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
+        downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
+        policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", a regulator ("lqr",
+            "governor", "mpc"), or the folder of a trained agent.
+        shield: Mode of the shield.
+        horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
+        certificate: Certificate file to use instead of synthesizing one; both machines need the same.
+        steps: Steps of the controller.
+        speed: How much faster than the plant's own time the loop runs; below 1 for slow machines.
+        room: Steps by which samples and commands may be later than the network makes them, because the processes that
+            send and receive them are: the certificate counts them on both ways.
+        ask_age: Age from which the controller asks for a sample, where samples are on request; by default it never
+            does, and those are sent that the contract needs.
+        mischief: Share of lost datagrams that arrive corrupted, and probability that a datagram is duplicated,
+            replayed or forged.
+        worst: Lose all the datagrams in a row that the channel's promise allows, whenever one is lost.
+        seed: Of network, disturbance and controller.
+        role: What runs here: "all", or "plant" (with the network) and "controller" on two machines.
+        restarted: The plant has moved already: the controller claims nothing until samples tell where it is.
+        host: Name or address of the controller's machine.
+        port: Its UDP port; the two after it are used by the network.
+        key_file: File with the shared key, at least 16 bytes, needed on two machines; drawn anew otherwise.
+        out: Folder of the logs.
+        live: Show the loop in the terminal while it runs: "auto" where there is one.
+        smoke: A few steps only, to see that everything works.
+    """
+
+    env: str = "ncs_gym/CartPole-v0"
+    channel: Assignments = field(default_factory=dict)
+    downlink: Assignments = field(default_factory=dict)
+    policy: str = "push"
+    shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
+    horizon: int | None = None
+    certificate: Path | None = None
+    steps: StepCount = 3000
+    speed: float = 1.0
+    room: int = 1
+    ask_age: int | None = None
+    mischief: float = 0.05
+    worst: bool = False
+    seed: int = 0
+    role: Literal["all", "plant", "controller"] = "all"
+    restarted: bool = False
+    host: str = "127.0.0.1"
+    port: int = 47600
+    key_file: Path | None = None
+    out: Path = Path("runs/loop")
+    live: Literal["auto", "yes", "no"] = "auto"
+    smoke: bool = False
+
+    def __post_init__(self) -> None:
+        require_horizon(self, self.shield)
+        require_limits(self, steps=1, room=(0, 100), ask_age=0, mischief=(0, 1), port=(1, 65533))
+        if not 0.0 < self.speed < math.inf:
+            raise ValueError(f"--speed must be positive, got {self.speed}")
+        if self.role != "all" and self.key_file is None:
+            raise ValueError("on two machines give both the same --key-file, as `head -c 32 /dev/urandom > FILE` makes")

@@ -11,8 +11,15 @@ import tyro
 
 from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
-from experiments.baselines.margins import MARGINS
-from experiments.settings.arguments import Assignments, OptionalStepCount, StepCount, require_horizon, require_least
+from experiments.baselines import MARGINS
+from experiments.settings.arguments import (
+    Assignments,
+    OptionalStepCount,
+    StepCount,
+    id_alone,
+    require_horizon,
+    require_limits,
+)
 from ncs_gym.validation import shown
 
 # Address that starts a Ray cluster of its own on this machine.
@@ -42,8 +49,7 @@ class BackendSettings:
     gpus_per_run: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range or belongs to another engine."""
-        require_least(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
+        require_limits(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
         if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         whole = self.gpus_per_run <= 1.0 or self.gpus_per_run.is_integer()
@@ -121,7 +127,7 @@ class LearningSettings(BackendSettings):
             ValueError: If the file is damaged, or has none for the environment.
             OSError: If the file cannot be read.
         """
-        given, env_id = self._given_hyperparams, self._env_id
+        given, env_id = self._given_hyperparams, id_alone(self.env)
         tuned = None if given.keys() >= DEFAULTS[self.algo].keys() else tuned_hyperparams(env_id, self.algo)
         found = with_changes(with_changes(DEFAULTS[self.algo], tuned or {}), given)
         return {name: value for name, value in found.items() if name != "n_timesteps"}
@@ -135,7 +141,7 @@ class LearningSettings(BackendSettings):
         """
         if self.steps is not None:
             return self.steps
-        steps = self._given_hyperparams.get("n_timesteps", tuned_steps(self._env_id, self.algo) or _DEFAULT_STEPS)
+        steps = self._given_hyperparams.get("n_timesteps", tuned_steps(id_alone(self.env), self.algo) or _DEFAULT_STEPS)
         if type(steps) not in (int, float) or not 1 <= steps < 1e15 or steps != int(steps):
             raise ValueError(f"n_timesteps must be a whole number >= 1, got {shown(steps)}")
         return int(steps)
@@ -144,8 +150,8 @@ class LearningSettings(BackendSettings):
     def agent_line(self) -> str:
         """One line with all hyperparameters of the algorithm and where they come from."""
         found, given = self.all_hyperparams, self._given_hyperparams.keys() - {"n_timesteps"}
-        is_tuned = tuned_hyperparams(self._env_id, self.algo) is not None
-        source = f"hyperparameters tuned for {self._env_id}" if is_tuned else "default hyperparameters"
+        is_tuned = tuned_hyperparams(id_alone(self.env), self.algo) is not None
+        source = f"hyperparameters tuned for {id_alone(self.env)}" if is_tuned else "default hyperparameters"
         if given == found.keys():
             source = "hyperparameters as given"
         elif given:
@@ -158,22 +164,16 @@ class LearningSettings(BackendSettings):
         return replace(self, steps=self.training_steps, hyperparams=self.all_hyperparams, conf_file=None)
 
     @property
-    def _env_id(self) -> str:
-        """The id of "module:id", by which the environment is registered."""
-        return self.env.rpartition(":")[2]
-
-    @property
     def _given_hyperparams(self) -> dict[str, Any]:
         """Hyperparameters of the command line, and those of the file."""
-        of_file = {} if self.conf_file is None else read_hyperparams(self.conf_file, self._env_id)
+        of_file = {} if self.conf_file is None else read_hyperparams(self.conf_file, id_alone(self.env))
         return with_changes(of_file, self.hyperparams)
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
         BackendSettings.__post_init__(self)
-        require_least(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
+        require_limits(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
-        require_horizon(self.horizon, self.mode, *arms)
+        require_horizon(self, self.mode, *arms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,10 +271,9 @@ class EvaluateSettings:
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
-        require_least(self, episodes=1, seed=0)
+        require_limits(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
-            require_horizon(self.horizon, self.shield)
+            require_horizon(self, self.shield)
 
 
 # Environments in which the network decides.
@@ -387,9 +386,8 @@ class StudySettings(BackendSettings):
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
         BackendSettings.__post_init__(self)
-        require_least(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
+        require_limits(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
         if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):
@@ -398,4 +396,4 @@ class StudySettings(BackendSettings):
 
 def short_name(env_id: str) -> str:
     """Returns an environment's id without its namespace and module, as in names of folders."""
-    return env_id.rpartition(":")[2].rpartition("/")[2]
+    return id_alone(env_id).rpartition("/")[2]

@@ -10,6 +10,7 @@ from typing import Any
 
 from experiments.errors import SettingsError
 from experiments.json_values import from_json
+from experiments.settings.arguments import id_alone
 from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
@@ -21,19 +22,14 @@ _OF_THE_MACHINE = ("engine", "ray_address", "ray_wait", "cpus_per_run", "gpus_pe
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
-    """Returns a command's settings as JSON values; of an environment "module:id" the id alone."""
+    """Returns a command's settings as JSON values; of "module:id" the id alone: a file imports nothing."""
     values = json.loads(json.dumps(asdict(settings), default=str))
     if isinstance(values.get("env"), str):
-        values["env"] = _id_alone(values["env"])
+        values["env"] = id_alone(values["env"])
     if isinstance(values.get("envs"), list):
-        values["envs"] = [_id_alone(each) for each in values["envs"]]
+        values["envs"] = [id_alone(each) for each in values["envs"]]
     kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
     return {"format": FORMAT, "command": command, "settings": kept}
-
-
-def _id_alone(env_id: str) -> str:
-    """Returns the id of "module:id": a file names no module to import."""
-    return env_id.rpartition(":")[2]
 
 
 def save_settings(path: Path, command: str, settings: Any) -> None:
@@ -66,7 +62,6 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
 
 
 def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
-    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:
@@ -80,7 +75,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
     values = {name: value for name, value in document["settings"].items() if name not in _OF_THE_MACHINE}
     envs = values.get("envs")
     for env_id in (values.get("env"), *(envs if isinstance(envs, list) else ())):
-        if isinstance(env_id, str) and env_id != _id_alone(env_id):
+        if isinstance(env_id, str) and env_id != id_alone(env_id):
             raise SettingsError(
                 f"unknown environment {shown(env_id)}: settings in a file import no module; let {path} name the id "
                 "alone, and give --env module:id if you trust the module"

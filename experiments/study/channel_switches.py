@@ -60,12 +60,7 @@ def switched(channel: Channel, contract: ChannelContract | None, on: Sequence[st
 def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
     """Returns the agents of `SWITCHED_AGENTS` that a finished comparison trained, by the name of their arm.
 
-    They are those of the first runs, at most `MOST_AGENTS`.
-
-    Raises:
-        ValueError: If the environment is unknown.
-        Infeasible: If no certificate is found.
-        ResultsError: If the agents are missing or damaged.
+    They are those of the first runs, at most `MOST_AGENTS`. Raises ResultsError if they are missing or damaged.
     """
     loop, store = loop_config(settings.env, settings.channel), RunStore(settings.out)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
@@ -88,13 +83,6 @@ def channel_switches(settings: CompareSettings, agents: Mapping[str, AgentFiles]
     Returns:
         Rows of JSON values: `on`, the impairments that are on, `arm`, `policies`, `episodes`, `violating` and its exact
         interval.
-
-    Raises:
-        ValueError: If the environment is unknown or a stored result is damaged.
-        Infeasible: If no certificate is found for a channel.
-        RunError: If a run fails.
-        ClusterError: If a cluster cannot execute the runs.
-        OSError: If the folder cannot be written.
     """
     settings = replace(settings, scenarios=(ATTACKED,))
     points = [on for count in range(len(SWITCHES) + 1) for on in combinations(SWITCHES, count)]
@@ -126,7 +114,6 @@ def _files(store: RunStore, run: TrainingRun) -> dict[str, bytes]:
 
 
 def _runs(on: Sequence[str], settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[TrainingRun]:
-    """Returns the runs with some impairments on; nothing is trained in them."""
     env = registered_env(settings.env)
     loop = loop_config(settings.env, switched(env.channel, env.contract, on))
     certificate, point = certificate_of(loop, settings.certificate, settings.safe_set), "-".join(on) or "ideal"

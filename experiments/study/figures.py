@@ -87,7 +87,6 @@ def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
 
 
 def _by_run_figure(summary: dict[str, Any], caption: str, quantity: str, draw: Any) -> CaptionedFigure:
-    """Returns a figure with a line for every trained arm and a panel for every environment."""
     environments = summary["environments"]
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((4.1 * len(environments), 3.6), caption)
@@ -111,7 +110,6 @@ def _draw_runs(axis: Axes, style: ArmStyle, values: list[float], height: int) ->
 
 
 def _draw_point(axis: Axes, style: ArmStyle, scenarios: dict[str, Any], margin: str) -> None:
-    """Draws the return of an arm as trained against its violating episodes under attack, with both intervals."""
     own, attacked = scenarios[AS_TRAINED], scenarios.get(ATTACKED, scenarios[AS_TRAINED])
     draw_estimate(axis, style, attacked["rate"], attacked["rate_ci95"], own["return"], own["return_ci95"])
     if margin:

@@ -15,10 +15,10 @@ from experiments.analysis.episodes import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
 from experiments.report.html import render_page
-from experiments.runs.experiment import INCIDENTAL_SETTINGS
-from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.experiment import lasting_settings
+from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
-from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
+from experiments.settings import CompareSettings, StudySettings
 from experiments.settings.learning import short_name
 from experiments.study.channel_switches import channel_switches, trained_agents
 from experiments.study.figures import study_figures
@@ -39,8 +39,8 @@ from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`: enough to pass through every part, in the first environment, with baselines of one margin each.
 _SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 2, "channel_episodes": 1, "scenarios": ("ideal-channel", "attacked")}
-# Folder of the sweep of channels below that of its environment, and settings that say nothing of results.
-_CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "smoke")
+# Folder of the sweep of channels below that of its environment.
+_CHANNELS = "channels"
 
 
 def study(settings: StudySettings) -> None:
@@ -50,7 +50,6 @@ def study(settings: StudySettings) -> None:
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
     with claim_folder("study", settings):
-        prepare_output(settings.out)
         parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
         comparisons, channels = {}, {}
         for name, part in parts.items():
@@ -60,11 +59,8 @@ def study(settings: StudySettings) -> None:
                 sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
                 channels[name] = channel_switches(sweep, trained_agents(part))
             print(flush=True)
-        content = settings_json("study", settings)["settings"]
-        provenance = {
-            "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
-            "versions": versions(),
-        }
+        kept = {key: value for key, value in lasting_settings(settings).items() if key != "smoke"}
+        provenance = {"settings": kept, "versions": versions()}
         episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
         summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
         _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
@@ -72,27 +68,13 @@ def study(settings: StudySettings) -> None:
 
 
 def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSettings:
-    backend = {name: getattr(settings, name) for name in BackendSettings.__dataclass_fields__}
-    part = CompareSettings(
-        env=env_id,
-        out=settings.out / short_name(env_id),
-        seed=settings.seed,
-        seeds=settings.seeds,
-        episodes=settings.episodes,
-        algo=settings.algo,
-        arms=settings.arms,
-        baselines=settings.baselines,
-        scenarios=settings.scenarios,
-        safe_set=settings.safe_set,
-        tuned_arms=True,
-        force=settings.force,
-        **backend,
-    )
+    names = (vars(settings).keys() & CompareSettings.__dataclass_fields__.keys()) - {"config", "out", "smoke"}
+    shared = {name: getattr(settings, name) for name in names}
+    part = CompareSettings(env=env_id, out=settings.out / short_name(env_id), tuned_arms=True, **shared)
     return replace(part, steps=math.ceil(settings.budget * part.training_steps))
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
-    """Writes every file: those of the study, and those that the documentation asks for."""
     figures = study_figures(summary)
     if (page := settings.page) is not None:
         (page.parent / "images").mkdir(parents=True, exist_ok=True)

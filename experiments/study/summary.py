@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.analysis.statistics import CONFIDENCE, clopper_pearson, hierarchical_interval
+from experiments.analysis.statistics import CONFIDENCE, hierarchical_interval
 from experiments.baselines import MARGINS
-from experiments.runs.arms import Arm
 from experiments.runs.loops import AS_TRAINED
 
 IDEAL, ATTACKED, ATTACKED_IDEAL = "ideal channel", "attacked", "attacked on an ideal channel"
@@ -85,7 +84,7 @@ def difference(
 
 def _environment(comparison: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
     settings, known = comparison["settings"], comparison["arms"] | comparison["references"]
-    arms = {name: _arm(name, arm, episodes[episodes["arm"] == name]) for name, arm in known.items()}
+    arms = {name: _arm(arm, episodes[episodes["arm"] == name]) for name, arm in known.items()}
     level = 1.0 - (1.0 - CONFIDENCE) / len(SECONDARY)
     declared = [difference(episodes, PRIMARY), *(difference(episodes, each, confidence=level) for each in SECONDARY)]
     return {
@@ -101,38 +100,35 @@ def _environment(comparison: dict[str, Any], episodes: pd.DataFrame) -> dict[str
     }
 
 
-def _arm(name: str, arm: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
-    """Returns what pages show of an arm: its training, and its evaluation in every scenario."""
+def _arm(arm: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
     kept = ("mode", "train_steps", "train_violation_steps", "train_violation_steps_by_run")
-    is_fixed = Arm.of(name).policy not in ("trained", "untrained")
     scenarios = {
-        scenario: _evaluated(played, is_fixed=is_fixed)
-        for scenario, played in episodes.groupby("condition", sort=False)
+        scenario: _evaluated(numbers, episodes[episodes["condition"] == scenario])
+        for scenario, numbers in ({AS_TRAINED: arm} | arm["conditions"]).items()
     }
     return {key: arm[key] for key in kept} | {"scenarios": scenarios}
 
 
-def _evaluated(played: pd.DataFrame, *, is_fixed: bool) -> dict[str, Any]:
-    """Returns rate and return of an arm in a scenario, with intervals over runs and episodes, and those of each run.
+def _evaluated(numbers: dict[str, Any], played: pd.DataFrame) -> dict[str, Any]:
+    """Returns rate and return of an arm in a scenario, from a comparison, with intervals over runs and episodes.
 
     A fixed policy is the same in all runs, so that its episodes are as good as one run each. Where no episode violates
     or every one does, resampling says nothing, and the interval is the exact one of a single proportion.
     """
     violating, returns = _by_run(played, "violating"), _by_run(played, "episode_return")
-    if is_fixed:
+    if numbers["eval_return_ci95_over"] == "episodes":
         violating, returns = violating.reshape(-1, 1), returns.reshape(-1, 1)
-    rate, count = float(violating.mean()), violating.size
-    exact = rate in (0.0, 1.0)
+    rate, exact = numbers["eval_violation_rate"], numbers["eval_violation_rate_ci95"]
     return {
-        "episodes": count,
-        "violating": int(violating.sum()),
+        "episodes": numbers["eval_episodes"],
+        "violating": numbers["eval_violating_episodes"],
         "rate": rate,
-        "rate_ci95": clopper_pearson(int(violating.sum()), count) if exact else hierarchical_interval(violating),
-        "rate_by_run": _by_run(played, "violating").mean(axis=1).tolist(),
-        "return": float(returns.mean()),
+        "rate_ci95": exact if rate in (0.0, 1.0) else hierarchical_interval(violating),
+        "rate_by_run": numbers["eval_violation_rate_by_run"],
+        "return": numbers["eval_return_mean"],
         "return_ci95": hierarchical_interval(returns),
-        "return_by_run": _by_run(played, "episode_return").mean(axis=1).tolist(),
-        "overridden": float(played["interventions"].sum() / played["steps"].sum()),
+        "return_by_run": numbers["eval_return_by_run"],
+        "overridden": numbers["intervention_rate"],
     }
 
 

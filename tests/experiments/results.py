@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from agents.loop import LoopConfig, ShieldSettings
 from agents.results import Episode, TrainingPoint, Trajectory
-from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
-from experiments.runs.arms import Arm
-from experiments.runs.training_run import RunResult
+from experiments.analysis.episodes import arm_summaries, episodes_table, paired_differences
+from experiments.runs.training_run import RunResult, TrainingRun
+from shields import Certificate
 
 ALL_ARMS = [
     "unshielded",
@@ -37,6 +38,18 @@ def history(*steps: int, scale: float = 1.0) -> list[TrainingPoint]:
     ]
 
 
+def training_run(certificate: Certificate, shield: str | None = None, **change: Any) -> TrainingRun:
+    """A run with the shield of a mode, in which an agent is trained, else one that applies no input."""
+    settings = None if shield is None else ShieldSettings(certificate, shield)
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=settings)
+    small = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
+    content = dict(arm="zero input", policy_kind="zero input", steps=64, episodes=1, index=0, settings={})
+    if shield is not None:
+        content |= dict(arm="shielded", policy_kind="trained", steps=256, episodes=2, settings=small)
+    common = dict(training_loop=loop, loop=loop, seed=0, certificate=certificate, algorithm="PPO")
+    return TrainingRun(**common | content | change)
+
+
 def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> RunResult:
     """A run of an arm with an episode of 10 steps for each number of violating steps."""
     episodes = [
@@ -57,16 +70,10 @@ def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **cha
 
 def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str, Any]:
     """The summary of a comparison without reference policies."""
-
-    def arm(name: str) -> dict[str, Any]:
-        mode = Arm.of(name, "project").mode
-        summary = arm_summary(episodes_table(results[name]), mode, fixed_policy=False)
-        return summary | {"shielded": mode not in (None, "monitor")}
-
     baseline = next(iter(results))
     episodes = episodes_table(run for runs in results.values() for run in runs)
     return {
-        "arms": {name: arm(name) for name in results},
+        "arms": arm_summaries(episodes, "project"),
         "references": {},
         "paired_differences": {"baseline": baseline, "arms": paired_differences(episodes, baseline)},
     } | provenance(arms=list(results), **settings)

@@ -10,18 +10,18 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from agents.agent_file import AgentError
-from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
 from experiments.analysis.tables import summary_text
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
-from experiments.runs.output_folder import claim_folder, prepare_output
+from experiments.runs.output_folder import claim_folder
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import TrainingRun, _agent_of
+from experiments.runs.training_run import _agent_of
 from experiments.settings import AttackSettings, CompareSettings
 from shields.json_documents import document_of
 from tests.command import assert_one_sentence, ncs
+from tests.experiments.results import training_run
 from tests.fuzz import JSON_VALUES, examples
 
 # Names that lead out of a folder on some system, and names that are only wrong.
@@ -43,21 +43,7 @@ NAMES += [
 
 @pytest.fixture(scope="module")
 def run(certificate):
-    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate, "project"))
-    return TrainingRun(
-        arm="shielded",
-        policy_kind="trained",
-        training_loop=loop,
-        loop=loop,
-        seed=0,
-        index=0,
-        steps=256,
-        episodes=2,
-        certificate=certificate,
-        scenarios=("gaussian",),
-        algorithm="PPO",
-        settings=dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8])),
-    )
+    return training_run(certificate, "project", scenarios=("gaussian",))
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +152,8 @@ def test_only_files_that_commands_write_are_removed_before_they_are_written_agai
     for name in ("data.parquet", "figures/photo.png", "notes.html"):
         (tmp_path / name).write_text("mine")
     before = everything_in(tmp_path)
-    prepare_output(tmp_path)
+    with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
+        (tmp_path / "settings.json").unlink()
     assert everything_in(tmp_path) == before
 
 

@@ -9,32 +9,18 @@ from dataclasses import replace
 
 import pytest
 
-from agents.loop import LoopConfig
 from experiments.backends import execution
 from experiments.backends.execution import execute, results_of
 from experiments.backends.ray_cluster import _execute_on_node, portable_task, require_answer
 from experiments.errors import ClusterError, RunError
 from experiments.runs.provenance import versions
-from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
+from tests.experiments.results import training_run
 
 
 @pytest.fixture(scope="module")
 def run(certificate):
-    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
-    return TrainingRun(
-        arm="unshielded",
-        policy_kind="zero input",
-        training_loop=loop,
-        loop=loop,
-        seed=0,
-        index=0,
-        steps=64,
-        episodes=1,
-        certificate=certificate,
-        algorithm="PPO",
-        settings={},
-    )
+    return training_run(certificate, arm="unshielded")
 
 
 class FakeExecutor:

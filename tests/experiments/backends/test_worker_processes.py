@@ -7,30 +7,16 @@ from queue import Queue
 
 import pytest
 
-from agents.loop import LoopConfig
 from experiments.backends.execution import _execute_here, execute, local_workers, results_of
 from experiments.errors import RunStopped
-from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
+from tests.experiments.results import training_run
 
 
 @pytest.fixture(scope="module")
 def endless(certificate):
     """A run that would run for hours."""
-    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
-    return TrainingRun(
-        arm="zero input",
-        policy_kind="zero input",
-        training_loop=loop,
-        loop=loop,
-        seed=0,
-        index=0,
-        steps=0,
-        episodes=10_000_000,
-        certificate=certificate,
-        algorithm="PPO",
-        settings={},
-    )
+    return training_run(certificate, steps=0, episodes=10_000_000)
 
 
 def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
-from experiments.baselines.regulators import equilibrium
+from experiments.baselines.controllers import equilibrium
 from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym.envs.env import ncs_env
 

@@ -9,8 +9,7 @@ import pytest
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import FILTERS, EstimateFilterSettings, controller
-from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
-from experiments.baselines.predictive import PredictiveFilter
+from experiments.baselines.filters import CertaintyEquivalentFilter, PredictiveFilter
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter, synthesize

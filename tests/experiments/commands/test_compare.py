@@ -12,7 +12,7 @@ from experiments.analysis.episodes import arm_summary, covered_fraction, episode
 from experiments.analysis.tables import summary_text
 from experiments.commands.compare import _findings, _training_runs
 from experiments.runs.arms import Arm, by_arm
-from experiments.runs.output_folder import prepare_output
+from experiments.runs.output_folder import claim_folder
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 
@@ -241,12 +241,11 @@ def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
         "report.html",
         "episodes.parquet",
         "figures/episode.png",
-        "figures/trusting-CartPole-v0.png",
     ):
         (tmp_path / name).write_text("{}")
-    prepare_output(tmp_path)
-    assert not any((tmp_path / "figures").iterdir())
-    assert {path.name for path in tmp_path.iterdir()} == {"runs", "figures"}
+    with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
+        assert not any((tmp_path / "figures").iterdir())
+    assert {path.name for path in tmp_path.iterdir()} == {"runs", "figures", "settings.json"}
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from dataclasses import fields
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -120,10 +120,12 @@ def test_controller_that_is_killed_is_restarted_beside_the_running_plant(tmp_pat
     [{"speed": 2.0}, {"room": 3}, {"uplink": Channel(loss=0.1)}, {"downlink": Channel(loss=0.1)}, {"env": "a"}],
 )
 def test_machines_that_were_told_other_things_have_other_keys(changes):
-    told = {field.name: None for field in fields(NetworkLoop)} | {"secret": bytes(16), "speed": 1.0, "room": 1}
-    one, other = NetworkLoop(**told), NetworkLoop(**told | changes)
-    assert one.key == NetworkLoop(**told | {"seed": 7, "out": "elsewhere"}).key
-    assert one.key != other.key
+    told = {"settings": LoopSettings(), "uplink": Channel(), "downlink": Channel(), "secret": bytes(16), "max_age": 0}
+    of_settings = {name: value for name, value in changes.items() if name not in told}
+    other = told | changes if not of_settings else told | {"settings": LoopSettings(**of_settings)}
+    untold = told | {"settings": LoopSettings(seed=7, out=Path("elsewhere"))}
+    assert NetworkLoop(**told).key == NetworkLoop(**untold).key
+    assert NetworkLoop(**told).key != NetworkLoop(**other).key
     assert "--speed, --room" in waiting_text({"tag": 3})
 
 
@@ -161,9 +163,9 @@ def test_networks_of_both_ways_are_chosen_by_name(env, more):
     ("arguments", "words"),
     [
         (["--speed", 0], "--speed must be positive"),
-        (["--mischief", 2], "--mischief must be a probability"),
-        (["--port", 70000], "--port must be between 1 and 65533"),
-        (["--room", -1], "--room must be between 0 and 100 steps"),
+        (["--mischief", 2], "--mischief must be at least 0 and at most 1"),
+        (["--port", 70000], "--port must be at least 1 and at most 65533"),
+        (["--room", -1], "--room must be at least 0 and at most 100"),
         (["--role", "plant"], "give both the same --key-file"),
         (["--channel", "lag=3"], "--channel lag: a channel has no such setting"),
         (["--downlink", "delay=0"], "--downlink: what is sent at each step arrives at the next at best"),

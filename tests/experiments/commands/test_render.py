@@ -216,8 +216,8 @@ def test_wrong_settings_raise_before_anything_is_played(changes, words, tmp_path
 
 
 def test_errors_of_the_command_are_one_sentence(tmp_path):
-    assert_one_sentence(ncs("render", "--steps", 0, "--out", "a.gif", cwd=tmp_path), "--steps must be at least 1")
-    assert not (tmp_path / "a.gif").exists()
+    assert_one_sentence(ncs("render", "--out", "a.avi", cwd=tmp_path), "--out must end in one of .gif, .mp4, .png")
+    assert not (tmp_path / "a.avi").exists()
 
 
 def test_missing_pygame_is_one_sentence(tmp_path, monkeypatch):

@@ -60,14 +60,14 @@ def swept(*names, seeds=1, mode="project", change=None, **settings):
     sides = ("loss", "delay", "quantization_step", "burst_length", "mass_factor")
     cells = [dict(zip(sides, channel, strict=True)) | {"arms": arms} for channel in channels]
     own = provenance(arms=list(names), seeds=seeds, mode=mode, **settings)
-    return sweep_report({"cells": cells} | own, VERIFIED, {"Violations. Of all.": PNG})
+    return sweep_report({"cells": cells} | own, VERIFIED, {"violations": ("Violations. Of all.", PNG)})
 
 
 def safety(page):
     return {row[0]: row[1:] for row in Reader(page).tables["Violations and interventions of each arm"]}
 
 
-@pytest.mark.parametrize("page", [comparison(*ALL_ARMS, figures={"A. B.": PNG}), swept(*ALL_ARMS)])
+@pytest.mark.parametrize("page", [comparison(*ALL_ARMS, figures={"a": ("A. B.", PNG)}), swept(*ALL_ARMS)])
 def test_page_is_well_formed_and_needs_nothing_from_elsewhere(page):
     reader = Reader(page)
     assert reader.open == []
@@ -92,7 +92,7 @@ def test_captions_findings_and_conditions_are_escaped():
     summary = summary_of({"shielded": [run("shielded")]})
     summary["references"] = {ATTACK: summary["arms"]["shielded"]}
     summary["versions"] = {ATTACK: ATTACK}
-    page = comparison_report(summary, Report((flag(ATTACK, False),)), {f'"{ATTACK}. B': PNG}, [ATTACK])
+    page = comparison_report(summary, Report((flag(ATTACK, False),)), {"a": (f'"{ATTACK}. B', PNG)}, [ATTACK])
     assert "<script" not in page
     assert Reader(page).open == []
 
@@ -131,13 +131,13 @@ def test_a_text_anywhere_in_a_summary_stays_text(text):
     summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})
     summary["references"] = {"zero input": summary["arms"]["unshielded"] | {"train_steps": 0}}
     summary = json.loads(json.dumps(summary))
-    honest = tags_of(comparison_report(summary, VERIFIED, {"A. B.": PNG}, []))
+    honest = tags_of(comparison_report(summary, VERIFIED, {"a": ("A. B.", PNG)}, []))
     shown = set()
     for path, change in attacked(summary, text):
         if text in BREAKOUTS and path not in TEXTS:
             continue
         try:
-            page = comparison_report(change, VERIFIED, {"A. B.": PNG}, [])
+            page = comparison_report(change, VERIFIED, {"a": ("A. B.", PNG)}, [])
         except (AttributeError, IndexError, KeyError, TypeError, ValueError, UndefinedError):
             continue  # no page is as good as a harmless one
         assert tags_of(page) <= honest, path
@@ -152,7 +152,7 @@ def tags_of(page):
 
 
 def test_figures_are_embedded_with_their_captions():
-    reader = Reader(comparison("shielded", figures={"First. Of all.": PNG, "Second. Too.": b"other"}))
+    reader = Reader(comparison("shielded", figures={"a": ("First. Of all.", PNG), "b": ("Second. Too.", b"other")}))
     images = [attributes for tag, attributes in reader.tags if tag == "img"]
     assert [image["alt"] for image in images] == ["First", "Second"]
     assert images[0]["width"] == "648"

@@ -126,7 +126,7 @@ def test_settings_that_an_earlier_version_did_not_have_are_the_defaults(tmp_path
     for name in ("smoke", "horizon", "lagrangian"):
         del document["settings"][name]
     (tmp_path / "settings.json").write_text(json.dumps(document))
-    claim_folder("train", TrainSettings(out=tmp_path))
+    finished("train", TrainSettings(out=tmp_path))
     with pytest.raises(OtherResultsError, match="horizon null, now 3"):
         claim_folder("train", TrainSettings(out=tmp_path, arm="lookahead", horizon=3))
 

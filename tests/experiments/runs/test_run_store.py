@@ -4,31 +4,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
+from agents.loop import LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
 from experiments.errors import ResultsError
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
+from tests.experiments.results import training_run
 
 
 @pytest.fixture(scope="module")
 def run(certificate):
-    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate, "switch"))
-    return TrainingRun(
-        arm="shielded:switch+penalty",
-        policy_kind="trained",
-        training_loop=loop,
-        loop=loop,
-        seed=0,
-        index=1,
-        steps=256,
-        episodes=2,
-        certificate=certificate,
-        algorithm="PPO",
-        settings=dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8])),
-    )
+    return training_run(certificate, "switch", arm="shielded:switch+penalty", index=1)
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,7 @@ def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period
 )
 def test_impossible_bursts_are_refused(loss, length):
     with pytest.raises(ValueError, match="bursts of mean length"):
-        _bursts(loss, length)
+        _bursts(loss, length, 1)
 
 
 def test_unknown_name_is_refused_with_those_that_are_known():
@@ -64,7 +64,7 @@ def test_bursts_need_a_loss_probability():
     own = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5))
     with pytest.raises(ValueError, match="--channel burst_length needs loss"):
         changed_channel(own, {"burst_length": 3.0})
-    assert changed_channel(own, {"burst_length": 3.0, "loss": 0.2}).loss == _bursts(0.2, 3.0)
+    assert changed_channel(own, {"burst_length": 3.0, "loss": 0.2}).loss == _bursts(0.2, 3.0, 1)
     assert changed_channel(OWN, {"burst_length": 3.0}).loss == _bursts(0.3, 3.0, 2)
 
 

@@ -1,0 +1,323 @@
+"""Safety filters that take the estimate for the true state, as wrappers of vector environments; they prove nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+
+from ncs_gym import LinearPlant, NCSVectorEnv
+from shields import Certificate
+from shields.runtime.backup_plans.plan_check import Prediction
+from shields.runtime.backup_plans.program import PlanProgram
+from shields.runtime.one_step import OneStepTest
+from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.safety_filter import SafetyFilter
+from shields.verification import require_valid
+
+# Margins that filters and governors are given, of the safe set and the box, in percent.
+MARGINS = (5, 10, 20, 40)
+# Steps that are looked ahead; a tube leaves no room for more than a few.
+HORIZON, TUBE_HORIZON = 20, 3
+# A solution may miss the limits of box and safe set by this much, as solvers do.
+TOLERANCE = 1e-6
+
+# Maps estimates (N, n), proposed inputs (N, m) and where an episode has just begun (N,) to the inputs to apply, (N, m).
+Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+class CertaintyEquivalentFilter:
+    """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid.
+
+    This is what a safety filter does that is handed an estimate as if it were the state. Everything else is kept: the
+    safe set S, the disturbance bound E(D), the projection onto the inputs that pass, the margins against rounding,
+    K x_hat where no input passes, and in mode "lookahead" the plans. With the error ellipsoid goes the proof: x = x_hat
+    is all it would hold for.
+
+    Args:
+        certificate: Verified exactly here.
+        plant: The plant it was made for.
+        mode: "project" or "lookahead"; see `SafetyFilter`.
+        horizon: Longest plan of mode "lookahead" [steps]; None for that of `SafetyFilter`.
+        margin: Fraction of the safe set that is kept free after the next step: the next state is taken to be off by as
+            much, margin^2 L in the place of A Sigma_k A'.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the plant.
+        ValueError: If there is no such mode.
+    """
+
+    def __init__(
+        self,
+        certificate: Certificate,
+        plant: LinearPlant,
+        mode: str = "project",
+        horizon: int | None = None,
+        margin: float = 0.0,
+    ) -> None:
+        self._filter = SafetyFilter(certificate, plant, mode, horizon)
+        back = np.linalg.inv(plant.A) if margin else np.zeros_like(plant.A)
+        self._assumed = self._filter.errors_of_many((margin**2 * back @ certificate.L @ back.T)[None])
+        self._plans = np.empty((0, plant.m, 0))
+
+    def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
+        """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
+        errors, plans = self._assumed.of(np.zeros(len(estimates), np.intp)), None
+        if self._plans.shape[-1] == len(estimates):
+            plans = np.where(begun, np.nan, self._plans)
+        decided = self._filter.decide_columns(estimates.T, errors, proposed.T, plans)
+        self._plans = decided.plan
+        return decided.input.T
+
+
+class PredictiveFilter:
+    """The closest input from which a nominal plan exists that ends in the safe set.
+
+    It solves, with x_0 = x_hat taken for the true state and neither disturbance nor error set,
+
+        min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  |u_i| <= u_max,
+                                      |c_j x_i| <= 1 - t_ij (0 < i < N),  |x_N|_M <= 1 - t_N,
+
+    or |g x_N| <= 1 - t_N(g) for the rows g of the certificate's polytope, if it has one.
+    The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
+    the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
+    error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
+    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
+    do, and u = K x_hat when it is used up.
+
+    After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
+    is that of Mayne et al. 2006 (docs/bibliography.md).
+
+    Args:
+        certificate: Gives S and K; verified exactly here.
+        plant: The plant it was made for.
+        horizon: N [steps], at least 2.
+        margin: Fraction of box and safe set that is kept free.
+        tube: Whether the tightenings are those of the tube, beside the margin.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the plant.
+    """
+
+    def __init__(
+        self,
+        certificate: Certificate,
+        plant: LinearPlant,
+        horizon: int = HORIZON,
+        margin: float = 0.0,
+        *,
+        tube: bool = False,
+    ) -> None:
+        require_valid(certificate, plant)
+        self._plant, self._K, self._horizon = plant, certificate.K, horizon
+        self._plans = np.empty((0, horizon - 1, plant.m))
+        polytope = certificate.polytope
+        test = OneStepTest(certificate.L, plant) if polytope is None else PolytopeTest(polytope, plant)
+        self._root = np.linalg.cholesky(certificate.M).T if polytope is None else polytope.rows
+        self._ends_in_ellipsoid = polytope is None
+        self._prediction = Prediction(test, horizon)
+        self._program = PlanProgram(self._prediction)
+        self._limits = np.full((horizon - 1, len(plant.box_rows)), 1.0 - margin)
+        self._end_limits = np.full(1 if polytope is None else len(polytope.rows), 1.0 - margin)
+        if tube:
+            reach, end = _tube(certificate, plant, self._end_sizes, horizon)
+            self._limits, self._end_limits = self._limits - reach, self._end_limits - end
+        # As the program takes it: the last row is for ends in P.
+        self._all_limits = np.ones((horizon, max(self._limits.shape[1], len(self._end_limits))))
+        self._all_limits[:-1, : self._limits.shape[1]] = self._limits
+        self._all_limits[-1, : len(self._end_limits)] = self._end_limits
+        self._weighting = self._root if polytope is None else self._root[:0]
+        grid = self._prediction.grid
+        self._between = np.ones((horizon, 0 if grid is None else grid.free.shape[1]))
+
+    def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
+        """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
+        if len(self._plans) != len(estimates):
+            self._plans = np.full((len(estimates), self._horizon - 1, self._plant.m), np.nan)
+        self._plans[begun] = np.nan
+        applied, (fine, plans) = proposed.copy(), self._followed_by_gain(estimates, proposed)
+        self._plans[fine] = plans[fine]
+        for e in np.flatnonzero(~fine).tolist():
+            plan = self._solved(estimates[e], proposed[e])
+            if plan is None:
+                plan = np.concatenate([self._plans[e], np.full((1, self._plant.m), np.nan)])
+            if np.isnan(plan[0]).any():
+                plan[0] = self._gained(estimates[e])
+            applied[e], self._plans[e] = plan[0], plan[1:]
+        return applied
+
+    def _followed_by_gain(self, estimates: np.ndarray, proposed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns where a proposed input and then u = K x are a plan, (N,), and these inputs, (N, horizon - 1, m)."""
+        plant, plans = self._plant, []
+        states = estimates @ plant.A.T + proposed @ plant.B.T
+        fine = np.ones(len(states), np.bool_)
+        for limits in self._limits:
+            fine &= (np.abs(states @ plant.box_rows.T) <= limits).all(axis=1)
+            plans.append(self._gained(states))
+            states = states @ plant.A.T + plans[-1] @ plant.B.T
+        return fine & (self._levels(states) <= self._end_limits).all(axis=-1), np.stack(plans, axis=1)
+
+    def _solved(self, estimate: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
+        """Returns the inputs of the best plan, shape (horizon, m); None if the solver finds none."""
+        plant = self._plant
+        missed = np.abs(plant.box_rows @ plant.A @ estimate) - np.abs(plant.box_rows @ plant.B) @ plant.u_max
+        if not (missed <= self._limits[0]).all() or (self._end_limits <= 0.0).any():
+            return None  # no input brings the next state into the box, or nothing is left of the end
+        radius = float(self._end_limits[0])  # counts for ends in S
+        plan = self._program.solve(estimate, self._all_limits, self._weighting, radius, self._between, proposed)
+        if plan is None:
+            return None
+        plan = np.clip(plan, -plant.u_max, plant.u_max)
+        centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
+        inside = (np.abs(centers[:-1] @ plant.box_rows.T) <= self._limits + TOLERANCE).all()
+        return plan if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
+
+    def _levels(self, states: np.ndarray) -> np.ndarray:
+        """Returns |x|_M, shape (..., 1), or |g x| for all rows of P, shape (..., r), of states (..., n)."""
+        values = states @ self._root.T
+        return np.linalg.norm(values, axis=-1, keepdims=True) if self._ends_in_ellipsoid else np.abs(values)
+
+    def _end_sizes(self, shape: np.ndarray) -> np.ndarray:
+        """Returns the largest levels in an ellipsoid of a shape (n, n): shape (1,) or (r,)."""
+        moved = self._root @ shape @ self._root.T
+        return np.sqrt(np.maximum(np.linalg.eigvalsh(moved)[-1:] if self._ends_in_ellipsoid else np.diag(moved), 0.0))
+
+    def _gained(self, states: np.ndarray) -> np.ndarray:
+        """Returns u = K x within the limits, shape (m,) or (N, m)."""
+        return np.clip(states @ self._K.T, -self._plant.u_max, self._plant.u_max)
+
+
+def _tube(
+    certificate: Certificate, plant: LinearPlant, end_sizes: Callable[[np.ndarray], np.ndarray], horizon: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how far true states are off a plan in the rows of the box, shape (horizon - 1, k), and at its end.
+
+    `end_sizes` returns how far the states of an ellipsoid of a given shape reach at the end.
+    """
+    K, rows = certificate.K, plant.box_rows
+    first = list(certificate.error_shapes)
+    pushes = [plant.B @ K @ shape @ (plant.B @ K).T for shape in first]
+
+    def sizes(shapes: list[np.ndarray], power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the largest support of any of the shapes, moved by a matrix, in the rows and at the end."""
+        moved = [power @ shape @ power.T for shape in shapes]
+        supports = np.sqrt(np.maximum([np.einsum("ij,jk,ik->i", rows, each, rows) for each in moved], 0.0))
+        return supports.max(axis=0), np.max([end_sizes(each) for each in moved], axis=0)
+
+    power, summed, summed_end, reach = np.eye(plant.n), np.zeros(len(rows)), np.zeros(()), []
+    for _ in range(horizon):
+        for shapes in (pushes, [plant.disturbance.shape_matrix]):
+            support, at_end = sizes(shapes, power)
+            summed, summed_end = summed + support, summed_end + at_end
+        power = (plant.A + plant.B @ K) @ power
+        support, at_end = sizes(first, power)
+        reach.append(summed + support)
+    return np.array(reach[:-1]), summed_end + at_end
+
+
+# How each filter is made from a certificate and its plant.
+_NOMINAL: dict[str, Callable[..., Rule]] = {
+    "trusting": CertaintyEquivalentFilter,
+    "trusting:lookahead": partial(CertaintyEquivalentFilter, mode="lookahead"),
+    "psf": PredictiveFilter,
+}
+# Also with margins in percent of the safe set, as in "psf:10", and with a tube.
+FILTERS: dict[str, Callable[..., Rule]] = {
+    **_NOMINAL,
+    **{f"{name}:{each}": partial(make, margin=each / 100) for name, make in _NOMINAL.items() for each in MARGINS},
+    "psf:tube": partial(PredictiveFilter, horizon=TUBE_HORIZON, tube=True),
+}
+
+
+class EstimateFilter(VectorWrapper):
+    """Applies what a filter makes of the proposed inputs, given the estimates; it proves nothing.
+
+    The infos gain `shield_intervened`, `input_proposed` and `shield_correction` as behind a `VectorSafetyShield`, but
+    no `shield_guaranteed`. A step that only resets an environment counts no intervention.
+
+    Args:
+        env: A vector environment with `estimate` in its infos.
+        rule: Decides the inputs.
+        penalty: Subtracted from the reward per intervention.
+
+    Raises:
+        ValueError: If the innermost environment is not an `NCSVectorEnv`.
+    """
+
+    def __init__(self, env: VectorEnv, rule: Rule, penalty: float = 0.0) -> None:
+        super().__init__(env)
+        inner = _environment_behind(env)
+        self._limits, self._inputs_of, self._rule, self.penalty = inner.plant.u_max, inner.inputs_of, rule, penalty
+        self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
+        self._begins_next = inner.autoreset_mode is AutoresetMode.NEXT_STEP
+        self._done = self._begun = np.zeros(self.num_envs, np.bool_)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes; see `NCSVectorEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        self._done, self._begun = self._done & ~mask, self._begun | mask
+        self._estimates = info["estimate"].copy()
+        nothing = np.zeros((self.num_envs, len(self._limits)))
+        return observation, info | _info(nothing, nothing, self._done & False)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Steps the environments with the filtered actions.
+
+        Raises:
+            ValueError: If an action is not finite or the shape is wrong.
+        """
+        proposed = self._inputs_of(actions).T.copy()
+        applied = self._rule(self._estimates, proposed, self._begun)
+        intervened = (applied != proposed).any(axis=1) & ~self._done
+        actions = np.array(actions, np.float64)
+        actions[intervened] = applied[intervened] / self._limits
+        observation, rewards, terminated, truncated, info = self.env.step(actions)
+        self._estimates = info["estimate"].copy()
+        applied = np.where(intervened[:, None], applied, proposed)
+        ended = terminated | truncated
+        self._begun, self._done = ended if self._begins_at_once else self._done, ended & self._begins_next
+        info = info | _info(applied, proposed, intervened)
+        return observation, rewards - self.penalty * intervened, terminated, truncated, info
+
+
+@dataclass(frozen=True)
+class EstimateFilterSettings:
+    """Settings of a filter around a vector environment, which calling it puts there (`LoopConfig.filter`).
+
+    Attributes:
+        name: A name in `FILTERS`.
+        certificate: Certificate of the safe set; it is verified when the filter is built.
+        penalty: Subtracted from the reward per intervention.
+        horizon: Longest plan [steps], for a filter that plans; None for its default.
+    """
+
+    name: str
+    certificate: Certificate
+    penalty: float = 0.0
+    horizon: int | None = None
+
+    def __call__(self, env: VectorEnv) -> EstimateFilter:
+        """Returns the environment behind the filter; raises CertificateError if the certificate is not its plant's."""
+        given = {} if self.horizon is None else {"horizon": self.horizon}
+        rule = FILTERS[self.name](self.certificate, _environment_behind(env).plant, **given)
+        return EstimateFilter(env, rule, self.penalty)
+
+
+def _environment_behind(env: VectorEnv) -> NCSVectorEnv:
+    inner = env.unwrapped
+    if not isinstance(inner, NCSVectorEnv):
+        raise ValueError(f"a filter by the estimate needs an NCSVectorEnv inside, got {type(inner).__name__}")
+    return inner
+
+
+def _info(applied: np.ndarray, proposed: np.ndarray, intervened: np.ndarray) -> dict[str, Any]:
+    return {
+        "shield_intervened": intervened.copy(),
+        "input_proposed": proposed.copy(),
+        "shield_correction": np.linalg.norm(applied - proposed, axis=1),
+    }
