@@ -56,7 +56,8 @@ def run(loop: SafeLoop, steps: int) -> tuple[np.ndarray, float]:
         loop.decide(proposed)
         command = loop.command()
         wire.encode(Message(kind=Kind.COMMAND, episode=1, stamp=step, values=command.inputs))
-        wire.encode(Message(kind=Kind.BEACON, episode=1, stamp=step))
+        requests = (True,) * len(command.inputs)
+        wire.encode(Message(kind=Kind.BEACON, episode=1, stamp=step, requests=requests))
         taken[:, step] = np.array([time.thread_time(), time.perf_counter()]) - start
         actuator.receive([command])
         y = plant.H @ state + plant.sensor_noise.bound.sample_boundary(rng)
