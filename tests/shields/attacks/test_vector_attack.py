@@ -53,7 +53,7 @@ def attack(plant, channel, contract, mode, policy, count, steps, seed):
         disturbance="sphere" if policy == "random" else harmful(plant, contract),
         initial_set=certificate.safe_set,
     )
-    with mock.patch("shields.runtime.vector_wrapper.SafetyFilter", filter_of):
+    with mock.patch("shields.runtime.wrapper.SafetyFilter", filter_of):
         shield = VectorSafetyShield(env, certificate, mode)
     _, info = shield.reset(seed=seed)
     rng = np.random.default_rng(seed)
