@@ -47,6 +47,8 @@ _MORE_DIGITS = (
     "give states units in which the half-widths of the box are of similar size, and leave out rows of the box that are "
     "nearly the same as others"
 )
+# Where no set is found, half-widths of the box that differ by more are named as the reason.
+_WIDEST_SPREAD = 1e6
 # Called with a line of text: the stage, and the volume reached so far.
 Progress = Callable[[str], object]
 # Alternations of a search that begins near the design of a similar problem.
@@ -110,7 +112,7 @@ def synthesize(
     if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
         raise ValueError("candidates must be certificates of method 'certified'")
     if method == "paper" and (safe_set == "polytope" or several_gains):
-        raise ValueError("method 'paper' has an ellipsoid: polytopes are for method 'certified'")
+        raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if safe_set == "ellipsoid" and several_gains:
         raise ValueError("several_gains is for polytopes: the search for an ellipsoid finds its gain")
     if method == "paper":
@@ -403,6 +405,13 @@ def _found_certificate(
         raise _interrupted(plant, stage, best) from interrupt
     if tightened and not failure:  # there is a set in the plant's box
         raise _leaves_between_samples(float(np.abs(tightened[-1]).max() / np.abs(plant.box_rows).max() - 1.0))
+    if not failure and (spread := float(plant.half_widths.max() / plant.half_widths.min())) > _WIDEST_SPREAD:
+        failure = Infeasible(
+            f"the plant is too ill-conditioned for this search, its half-widths differ by a factor of {spread:.0e}: "
+            f"{_MORE_DIGITS}",
+            "I",
+            1.0,
+        )
     raise failure or infeasibility(problem)
 
 
