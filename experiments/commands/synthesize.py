@@ -26,7 +26,7 @@ def synthesize(settings: SynthesizeSettings) -> None:
                 settings.method,
                 contract=contract,
                 safe_set=settings.safe_set,
-                several_gains=settings.several_gains,
+                search_gain=settings.search_gain,
                 progress=show,
             )
     except SynthesisInterrupted as interrupt:

@@ -27,8 +27,8 @@ class SynthesizeSettings:
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
             keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
             an ellipsoid.
-        several_gains: Try regulators as well as the gain of the largest ellipsoid, and keep the largest polytope. Takes
-            several times as long.
+        search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
+            takes about as long again, longer for polytopes of many rows.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
@@ -41,7 +41,7 @@ class SynthesizeSettings:
     plant: Path | None = None
     method: Literal["certified", "paper"] = "certified"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
-    several_gains: bool = False
+    search_gain: bool = False
     out: Path = Path("certificate.json")
     max_age: int | None = None
     quantization_step: float | None = None

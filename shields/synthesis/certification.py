@@ -13,7 +13,6 @@ import numpy as np
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
-from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.validation import shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
@@ -29,6 +28,7 @@ from shields.synthesis.multipliers import (
     smallest_invariant_shape,
     with_best_multipliers,
 )
+from shields.synthesis.polytope_gain import gains_of_larger_polytopes
 from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
@@ -55,9 +55,8 @@ Progress = Callable[[str], object]
 _FEW_ALTERNATIONS = 4
 # Where no certificate is found, these fractions of the input limits are tried: wide limits can mislead the search.
 _LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
-# Weights of the inputs, in units of their limits, against those of the states, in units of the box, in regulators whose
-# polytopes are sought.
-_INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+# What a certificate records that does not depend on its gain.
+_OF_THE_PLANT = ("tolerated_scale",)
 # Multipliers from which those of a given set and gain are sought.
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
@@ -68,7 +67,7 @@ def synthesize(
     *,
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
-    several_gains: bool = False,
+    search_gain: bool = False,
     progress: Progress | None = None,
     dkappa: float = 0.02,
     drho: float = 0.05,
@@ -88,8 +87,8 @@ def synthesize(
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
             time the ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper"
             has an ellipsoid.
-        several_gains: Also seek polytopes of linear-quadratic regulators, which takes several times as long, and keep
-            the largest that verifies. Its ellipsoid is the one that proves its gain, which may be small ("certified").
+        search_gain: Also seek the gain whose polytope is the largest, which takes about as long again, longer for
+            polytopes of many rows. Its ellipsoid is the one that proves that gain, which may be small ("certified").
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -111,10 +110,10 @@ def synthesize(
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
     if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
         raise ValueError("candidates must be certificates of method 'certified'")
-    if method == "paper" and (safe_set == "polytope" or several_gains):
+    if method == "paper" and (safe_set == "polytope" or search_gain):
         raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
-    if safe_set == "ellipsoid" and several_gains:
-        raise ValueError("several_gains is for polytopes: the search for an ellipsoid finds its gain")
+    if safe_set == "ellipsoid" and search_gain:
+        raise ValueError("search_gain is for polytopes: the search for an ellipsoid finds its gain")
     if method == "paper":
         from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
 
@@ -133,7 +132,7 @@ def synthesize(
     certificate = _largest_certificate(plant, contract, report, known)
     if safe_set == "ellipsoid":
         return certificate
-    return (with_largest_polytope if several_gains else with_polytope)(certificate, plant, report)
+    return (with_largest_polytope if search_gain else with_polytope)(certificate, plant, report)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -173,10 +172,10 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
 def with_largest_polytope(
     certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None
 ) -> Certificate:
-    """Returns what `with_polytope` does, with the gain whose polytope is the largest of several.
+    """Returns what `with_polytope` does, with the gain whose polytope is the largest that a search finds.
 
-    Tried are the certificate's own and linear-quadratic regulators, each with an ellipsoid that proves it. What the
-    certificate's own gain would have kept is in the provenance of another one.
+    Another gain than the certificate's comes with an ellipsoid that proves it, and with what the certificate's own gain
+    would have kept in the provenance.
 
     Args:
         certificate: A verified one of method "certified".
@@ -184,24 +183,30 @@ def with_largest_polytope(
         progress: Called with a line of text now and then.
 
     Raises:
-        SynthesisInterrupted: A KeyboardInterrupt with a certificate.
+        SynthesisInterrupted: A KeyboardInterrupt with the certificate, and its own gain's polytope if that was found.
     """
 
     def share(each: Certificate) -> float:
         return each.provenance.get("polytope_share_of_box", 0.0)
 
-    own = best = with_polytope(certificate, plant, progress)
+    own = with_polytope(certificate, plant, progress)
     problem, _ = design_problem(plant, certificate.contract)
-    for effort in _INPUT_WEIGHTS:
-        K = lqr_gain(plant.A, plant.B, plant.weight, effort * np.diag(plant.u_max**-2.0))
-        proved = None if K is None else _with_gain(K, problem, plant, certificate.contract)
-        if proved is not None:
-            progress(f"polytope of a regulator with {effort:g} as the weight of inputs")
-            best = max(best, with_polytope(proved, plant, progress), key=share)
-    if best is own:
-        return own
-    kept = {name: certificate.provenance[name] for name in ("tolerated_scale",) if name in certificate.provenance}
-    return replace(best, provenance=best.provenance | kept | {"share_with_gain_of_ellipsoid": share(own)})
+
+    def is_provable(K: np.ndarray) -> bool:
+        return _small_shape(K, problem) is not None
+
+    try:
+        for K in gains_of_larger_polytopes(certificate, plant, is_provable, progress):
+            proved = _with_gain(K, problem, plant, certificate.contract)
+            found = own if proved is None else with_polytope(proved, plant, progress)
+            if share(found) > share(own):
+                kept = {name: certificate.provenance[name] for name in _OF_THE_PLANT if name in certificate.provenance}
+                gained = {"share_with_gain_of_ellipsoid": share(own)}
+                return replace(found, provenance=found.provenance | kept | gained)
+    except KeyboardInterrupt as interrupt:
+        message = "interrupted while a gain with a larger polytope was sought; the certificate has the first gain's"
+        raise SynthesisInterrupted(message, own) from interrupt
+    return own
 
 
 def _with_gain(
@@ -209,9 +214,15 @@ def _with_gain(
 ) -> Certificate | None:
     """Returns a verified certificate with a given gain, shape (m, n), and a small ellipsoid; None if there is none."""
     K = exact.rounded(K, _DIGITS, axis=1)
-    _, scaled = problem.to_scaled(np.eye(plant.n), K)
+    L = _small_shape(K, problem)
+    return None if L is None else certify(plant, L, K, contract)
+
+
+def _small_shape(K: np.ndarray, problem: DesignProblem) -> np.ndarray | None:
+    """Returns the shape, (n, n), of a small ellipsoid that proves a gain, shape (m, n); None if there is none."""
+    _, scaled = problem.to_scaled(np.eye(problem.n), K)
     L = smallest_invariant_shape(problem, scaled)
-    return None if L is None else certify(plant, problem.to_physical(L, scaled)[0], K, contract)
+    return None if L is None else problem.to_physical(L, scaled)[0]
 
 
 def certify(

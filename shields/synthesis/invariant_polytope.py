@@ -37,6 +37,8 @@ _DIGITS = 10
 _SOLVER = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 # Points at which the share of the box is counted: the third digit is right.
 _POINTS_LOG2 = 16
+# Steps after which it must be known which points a gain keeps in the box.
+_MOST_STEPS = 3000
 
 
 def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
@@ -102,12 +104,45 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
 
     None where states are inputs under way, or the box is no product of intervals.
     """
+    points = points_of_box(plant, _POINTS_LOG2)
+    return None if points is None else float((polytope.gauge(points) <= 1.0).mean())
+
+
+def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
+    """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`."""
     rows = plant.box_rows
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n
     if inputs_under_way(plant) or not is_product:
         return None
-    points = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(_POINTS_LOG2) - 1.0
-    return float((polytope.gauge(points / np.abs(rows).sum(axis=0)) <= 1.0).mean())
+    points = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(log2) - 1.0
+    return points / np.abs(rows).sum(axis=0)
+
+
+def share_of_points(certificate: Certificate, plant: LinearPlant, points: np.ndarray) -> float:
+    """Returns what share of points of the safe box a certificate's gain keeps in it for ever, by its error sets.
+
+    They are those of the polytope of `invariant_polytope`, found without linear programs, and without the limit of
+    rows. 0.0 where there is no such polytope, or `_MOST_STEPS` steps do not tell.
+
+    Args:
+        certificate: Of method "certified"; gives the gain, the error sets and D.
+        plant: Its plant.
+        points: Of the box, shape (count, n).
+    """
+    step, total = _ClosedLoop(certificate, plant), len(points)
+    if np.abs(np.linalg.eigvals(step.next)).max() >= 1.0:
+        return 0.0
+    try:
+        rows = step.first_rows()
+        for _ in range(_MOST_STEPS):
+            points = points[(np.abs(points @ (rows / step.widths).T) <= 1.0).all(axis=1)]
+            rows = step.predecessor(rows)
+            rows = rows[np.abs(rows).sum(axis=1) > 1.0]  # the others hold in all of the box
+            if not (len(rows) and len(points)):
+                return len(points) / total
+    except Infeasible:
+        pass
+    return 0.0
 
 
 class ClosedLoopGrid(NamedTuple):
@@ -170,19 +205,21 @@ class _ClosedLoop:
         grid = grid_in_closed_loop(self._plant, self._K, self._errors, self._D)
         return grid.images, grid.left - _RESERVE
 
-    def predecessor(self, row: np.ndarray) -> np.ndarray:
-        """Returns the row that states have to fulfil so that the next ones fulfil a row, both in units of the box.
+    def predecessor(self, rows: np.ndarray) -> np.ndarray:
+        """Returns what states have to fulfil so that the next ones fulfil a row, shape (n,), or rows, (k, n).
+
+        All are in units of the box.
 
         Raises:
-            Infeasible: If errors and disturbances alone leave the row.
+            Infeasible: If errors and disturbances alone leave a row.
         """
-        physical = row / self.widths
+        physical = rows / self.widths
         pushed = physical @ self._plant.B
-        left = 1.0 - _RESERVE - float(self._reach(pushed @ self._K)) - math.sqrt(physical @ self._D @ physical)
-        left -= float(ACTION_ROUNDING) * float(np.abs(pushed) @ self._plant.u_max)
-        if left <= 0.0:
+        left = 1.0 - _RESERVE - self._reach(pushed @ self._K) - np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
+        left = left - float(ACTION_ROUNDING) * (np.abs(pushed) @ self._plant.u_max)
+        if (left <= 0.0).any():
             raise _none("errors and disturbances alone leave one of its faces; smaller bounds leave room")
-        return (physical @ self.next) * self.widths / left
+        return (physical @ self.next) * self.widths / left[..., None]
 
     def _reach(self, rows: np.ndarray) -> np.ndarray:
         """Returns the largest support over the error sets of rows, shape (..., n) in physical units."""

@@ -58,30 +58,67 @@ def test_polytopes_fill_much_more_of_the_box_and_both_engines_prove_them(name):
     assert wide.polytope.gauge(points).max() <= 1.0 + 1e-5
 
 
-def test_gain_with_the_largest_polytope_is_kept_proved_and_says_what_it_gained():
-    wide, certificate, plant = found("TruckTrailerCruise")
+@pytest.mark.parametrize(
+    ("name", "before", "after"), [("TruckTrailerCruise", 0.95, 0.98), ("BatchReactor", 0.76, 0.81)]
+)
+def test_gain_with_the_largest_polytope_is_kept_proved_and_says_what_it_gained(name, before, after):
+    wide, certificate, plant = found(name)
     wider = with_largest_polytope(certificate, plant)
     shares = [each.provenance["polytope_share_of_box"] for each in (wide, wider)]
-    assert shares[0] == wider.provenance["share_with_gain_of_ellipsoid"] < 0.95 < 0.97 < shares[1]
-    assert "97.8 % of the safe box's volume (94 % with the gain of the largest ellipsoid)" in str(wider)
+    assert shares[0] == wider.provenance["share_with_gain_of_ellipsoid"] < before < after < shares[1]
+    assert f"{100.0 * shares[1]:.4g} % of the safe box's volume ({100.0 * shares[0]:.3g} % with the gain" in str(wider)
     assert both(wider, plant)
     assert (wider.K != wide.K).any()
     # The hardest disturbance and a policy that pushes outwards, from the edge of the polytope.
     hardest = AdversarialDisturbance(wider.M)
-    envs = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=40, disturbance=hardest)
+    envs = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=40, disturbance=hardest)
     shield, rng = VectorSafetyShield(envs, wider), np.random.default_rng(0)
     shield.reset(seed=0, options={"state": (1.0 - 1e-9) * wider.polytope.sample_boundary(rng, 40)})
     for step in range(150):
-        *_, info = shield.step(np.full((40, 1), 1.0 if step % 60 < 30 else -1.0, np.float32))
+        *_, info = shield.step(np.full((40, plant.m), 1.0 if step % 60 < 30 else -1.0, np.float32))
         assert wider.polytope.gauge(info["state"]).max() <= 1.0
         assert info["shield_guaranteed"].all()
 
 
+@pytest.mark.parametrize("name", IDS)
+def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
+    wide, certificate, plant = found(name)
+    points = search.points_of_box(plant, 12)
+    inside = wide.polytope.gauge(points) <= 1.0
+    assert search.share_of_points(certificate, plant, points) == pytest.approx(inside.mean(), abs=2.0 / len(points))
+    unstable = replace(certificate, K=-1e3 * certificate.K)
+    assert search.share_of_points(unstable, plant, points) == 0.0
+
+
 def test_gain_of_the_ellipsoid_stays_where_no_other_has_a_larger_polytope():
-    wide, certificate, plant = found("BatchReactor")
-    assert with_largest_polytope(certificate, plant) == wide
-    with pytest.raises(ValueError, match="several_gains is for polytopes"):
-        synthesize(plant, safe_set="ellipsoid", several_gains=True)
+    all_of_the_box = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, **QUIET)
+    assert_gain_stays(all_of_the_box)
+    tilted = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0], [0.9]], u_max=1.0, **QUIET)
+    assert search.points_of_box(tilted, 4) is None
+    assert_gain_stays(tilted)
+    with pytest.raises(ValueError, match="search_gain is for polytopes"):
+        synthesize(tilted, safe_set="ellipsoid", search_gain=True)
+
+
+QUIET = {"dt": 1.0, "disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
+
+
+def assert_gain_stays(plant):
+    certificate = synthesize(plant)
+    assert certificate.polytope is not None
+    assert synthesize(plant, search_gain=True) == certificate
+
+
+def test_interrupted_search_for_a_gain_keeps_the_polytope_of_the_first_gain():
+    wide, certificate, plant = found("TruckTrailerCruise")
+
+    def interrupt(line):
+        if line.startswith("gain of the polytope"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(SynthesisInterrupted, match="the first gain's") as interrupted:
+        with_largest_polytope(certificate, plant, interrupt)
+    assert interrupted.value.certificate == wide
 
 
 def test_file_holds_the_polytope_and_one_without_is_as_before(tmp_path):
