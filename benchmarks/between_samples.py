@@ -1,6 +1,6 @@
 """What it costs that the box counts between samples, too, for registered environments with a model in continuous time.
 
-    python benchmarks/between_samples.py [--ids TruckTrailerCruise BatchReactor] [--points 4] [--steps 4000]
+    python benchmarks/between_samples.py [--ids TruckTrailerCruise CSTR] [--points 4] [--steps 4000] [--search-gain]
 
 Each id has two lines: at sampling instants alone, and at all times. "S" and "P" are the shares of the safe box's volume
 that ellipsoid and polytope fill, "rows" those of P, "s" the time of both searches and proofs, and "bears" how much
@@ -86,6 +86,7 @@ def main() -> None:
     parser.add_argument("--ids", nargs="*", default=list(IDS))
     parser.add_argument("--points", type=int, default=0)
     parser.add_argument("--steps", type=int, default=8000)
+    parser.add_argument("--search-gain", action="store_true")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     print(
@@ -98,7 +99,7 @@ def main() -> None:
         for plant in plants:
             begin = time.perf_counter()
             try:
-                found.append(synthesize(plant, contract=env.certificate_contract))
+                found.append(synthesize(plant, contract=env.certificate_contract, search_gain=options.search_gain))
             except Infeasible as none:
                 print(f"{name:<24} {plant.between_samples or 1:>2} {none}", flush=True)
                 break
@@ -110,7 +111,7 @@ def main() -> None:
         times = [ratios(pair) for pair in works]
         for k, (plant, certificate) in enumerate(zip(plants, found, strict=True)):
             recorded, rows = certificate.provenance, getattr(certificate.polytope, "rows", ())
-            overridden, reward = behind(name, certificate, options.steps, plant=plant)
+            overridden, reward = behind(name, certificate, certificate.K, options.steps, plant=plant)
             print(
                 f"{name:<24} {plant.between_samples or 1:>2} {recorded['share_of_box']:>6.1%}"
                 f" {recorded.get('polytope_share_of_box', np.nan):>6.1%} {len(rows):>5} {seconds[k]:>5.1f}"

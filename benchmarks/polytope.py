@@ -15,7 +15,7 @@ import argparse
 import time
 import warnings
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -54,9 +54,9 @@ def per_decision(shields: list[SafetyFilter], count: int) -> list[float]:
     return least
 
 
-def behind(name: str, certificate: Certificate, K: np.ndarray, steps: int) -> tuple[float, float]:
+def behind(name: str, certificate: Certificate, K: np.ndarray, steps: int, **settings: Any) -> tuple[float, float]:
     """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
-    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20), certificate)
+    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, **settings), certificate)
     policy = controller("lqr", gym.make(f"ncs_gym/{name}-v0").unwrapped, K, 0)
     observations, info = envs.reset(seed=0)
     overridden = total = 0.0
