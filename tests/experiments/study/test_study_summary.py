@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.episodes import episodes_table
+from experiments.study.channel_switches import SWITCHES
 from experiments.study.figures import study_figures
 from experiments.study.study import quoted
 from experiments.study.summary import PRIMARY, Comparison, difference, margins_needed, members, study_summary
@@ -11,6 +12,7 @@ from experiments.study.tables import (
     agents_table,
     comparisons_table,
     evaluation_table,
+    impairments_table,
     margins_table,
     network_table,
     prices_table,
@@ -150,8 +152,22 @@ def test_switches_are_a_row_per_combination():
         ["100", "0"],
     ]
     assert table.splitlines()[-1].startswith("all four")
-    alone = switches_table(rows, combined=False).splitlines()[2:]
-    assert [line.partition(" ")[0] for line in alone] == ["ideal", "loss", "all"]
+
+
+def test_impairments_alone_are_a_row_per_arm():
+    rows = [
+        {"on": on, "arm": arm, "episodes": 4, "violating": len(on) * (arm == "lqr")}
+        for on in ([], *([each] for each in SWITCHES), ["loss", "delay"], [*SWITCHES])
+        for arm in ("lqr", "lookahead")
+    ]
+    table = impairments_table({"Plant-v0": rows, "Other-v0": rows}).splitlines()
+    assert table[0].split()[3:] == ["ideal", "loss", "delay", "rate", "rounding", "all", "four"]
+    assert table[2].split() == ["Plant-v0", "lqr", "0", "25", "25", "25", "25", "100"]
+    assert [line.split()[:2] for line in table[3:]] == [
+        ["Plant-v0", "lookahead"],
+        ["Other-v0", "lqr"],
+        ["Other-v0", "lookahead"],
+    ]
 
 
 def test_pages_show_the_same_after_their_numbers_were_stored(made):
