@@ -37,7 +37,6 @@ SLOW_PAGES = (
     "docs/requests.md",
     "docs/own_plant.md",
     "docs/deployment.md",
-    "docs/lookahead.md",
     "docs/agents.md",
     "docs/integrations.md",
     "docs/beyond_linear.md",
