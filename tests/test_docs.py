@@ -38,7 +38,6 @@ SLOW_PAGES = (
     "docs/own_plant.md",
     "docs/deployment.md",
     "docs/agents.md",
-    "docs/integrations.md",
     "docs/beyond_linear.md",
 )
 MODULE = re.compile(rf"\b(?:{'|'.join(PACKAGES)}|tests|benchmarks)/[\w/]+\.py\b")

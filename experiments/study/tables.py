@@ -186,12 +186,15 @@ def impairments_table(channels: Mapping[str, Sequence[dict[str, Any]]]) -> str:
 
 
 def budget_text(summary: dict[str, Any]) -> str:
-    """Returns what was spent in each environment, one line each."""
-    return "\n".join(
-        f"{name}: {env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps "
-        f"each, {env['episodes']} episodes per run and scenario"
-        for name, env in summary["environments"].items()
-    )
+    """Returns what was spent in each environment, one line for all that spent the same."""
+    spent: dict[str, list[str]] = {}
+    for name, env in summary["environments"].items():
+        text = (
+            f"{env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps each, "
+            f"{env['episodes']} episodes per run and scenario"
+        )
+        spent.setdefault(text, []).append(name)
+    return "\n".join(f"{', '.join(names)}: {text}" for text, names in spent.items())
 
 
 # What other pages can quote, by name.
