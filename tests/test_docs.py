@@ -26,7 +26,6 @@ QUICK_PAGES = (
     "docs/index.md",
     "docs/tutorial.md",
     "docs/ncs_gym.md",
-    "docs/shield.md",
     "docs/constrained_rl.md",
     "docs/vector.md",
 )
