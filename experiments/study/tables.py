@@ -55,24 +55,24 @@ def evaluation_table(env: dict[str, Any]) -> str:
 
 def comparisons_table(summary: dict[str, Any]) -> str:
     """Returns the declared comparisons: differences of violating episodes in points, the primary one first."""
-    rows = [["violating episodes [points]", "", "scenario", "difference", "interval"]]
+    rows = [["violating episodes [points]", "difference", "interval", "scenario"]]
     for name, env in summary["environments"].items():
+        rows += [[name]] if env["comparisons"] else []
         for index, each in enumerate(env["comparisons"]):
-            title = f"{name}, {'secondary' if index else 'primary'}"
+            title = f"  {each['first']} - {each['second']}{'' if index else ' (primary)'}"
             level = f"{_interval(each['interval'], 100.0)} ({100 * each['confidence']:.1f} %)"
-            compared = f"{each['first']} - {each['second']}"
-            rows.append([title, compared, each["scenario"], f"{100 * each['mean']:+z.1f}", level])
-    return text_table(rows, left_columns=3)
+            rows.append([title, f"{100 * each['mean']:+z.1f}", level, each["scenario"]])
+    return text_table(rows)
 
 
 def prices_table(summary: dict[str, Any]) -> str:
     """Returns the return of the arms with a proof less that of the best arm that violates anywhere."""
-    rows = [["return as trained", "with a proof", "best without", "difference [95 % CI]"]]
+    rows = [["return as trained, with a proof", "difference [95 % CI]", "from the best without"]]
     for name, env in summary["environments"].items():
         for price in env["prices"]:
-            cells = [f"{price['mean']:+z.1f} {_interval(price['interval'])}"]
-            rows.append([name, price["first"], price["second"], *cells])
-    return text_table(rows, left_columns=3)
+            difference = f"{price['mean']:+z.1f} {_interval(price['interval'])}"
+            rows.append([f"{name} {price['first']}", difference, price["second"]])
+    return text_table(rows)
 
 
 def margins_table(summary: dict[str, Any]) -> str:

@@ -92,9 +92,11 @@ def test_primary_comparison_comes_first_and_secondary_ones_share_a_level(made):
     assert (first["mean"], first["confidence"]) == (0.5, 0.95)
     assert [each["first"] for each in others] == ["trusting:20", "lqr+psf:20"]  # those whose arms there are
     assert all(each["confidence"] == pytest.approx(1.0 - 0.05 / 3.0) for each in others)
-    table = comparisons_table(made[0])
-    assert "Plant-v0, primary" in table.splitlines()[2]
-    assert "+50.0" in table
+    title, primary, *secondary = comparisons_table(made[0]).splitlines()[2:]
+    assert title == "Plant-v0"
+    assert primary.split()[:5] == ["unshielded", "-", "lookahead", "(primary)", "+50.0"]
+    assert len(secondary) == 2
+    assert not any("primary" in line for line in secondary)
 
 
 def test_arms_have_rates_of_every_run_and_intervals_over_runs(made):
