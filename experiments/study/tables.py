@@ -177,7 +177,8 @@ def impairments_table(channels: Mapping[str, Sequence[dict[str, Any]]]) -> str:
     Args:
         channels: What `channel_switches` returns, by environment.
     """
-    points = [(), *((name,) for name in SWITCHES), SWITCHES]
+    played = dict.fromkeys(tuple(row["on"]) for rows in channels.values() for row in rows)
+    points = [point for point in played if len(point) in (0, 1, len(SWITCHES))]
     table = [["attacked, violating [%]", *map(_impaired, points)]]
     for title, rows in channels.items():
         for arm in dict.fromkeys(row["arm"] for row in rows):
