@@ -388,7 +388,8 @@ def register_plant(
         contract: What the channel promises; by default that of the channel if the plant is unstable, else none.
         max_episode_steps: Steps after which an episode is truncated.
         settings: Other keywords of `NCSEnv`: `process`, `disturbance`, `noise`, `initial_set`,
-            `terminate_on_violation` and `allow_assumption_violation`.
+            `terminate_on_violation`, `allow_assumption_violation`, `downlink`, `downlink_contract` and `observe`.
+            `horizon` is always `max_episode_steps`, whatever is given.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.

@@ -29,6 +29,7 @@ from experiments.study.tables import (
     budget_text,
     comparisons_table,
     evaluation_table,
+    impairments_table,
     margins_table,
     prices_table,
     switches_table,
@@ -130,7 +131,7 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
         "agents": {name: agents_of(env) for name, env in environments.items()},
         "training": training_table(summary),
         "channels": {name: switches_table(rows) for name, rows in summary["channels"].items()},
-        "switches": {name: switches_table(rows, combined=False) for name, rows in summary["channels"].items()},
+        "impairments": impairments_table(summary["channels"]),
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from experiments.runs.loops import AS_TRAINED
@@ -55,24 +55,24 @@ def evaluation_table(env: dict[str, Any]) -> str:
 
 def comparisons_table(summary: dict[str, Any]) -> str:
     """Returns the declared comparisons: differences of violating episodes in points, the primary one first."""
-    rows = [["violating episodes [points]", "", "scenario", "difference", "interval"]]
+    rows = [["violating episodes [points]", "difference", "interval", "scenario"]]
     for name, env in summary["environments"].items():
+        rows += [[name]] if env["comparisons"] else []
         for index, each in enumerate(env["comparisons"]):
-            title = f"{name}, {'secondary' if index else 'primary'}"
+            title = f"  {each['first']} - {each['second']}{'' if index else ' (primary)'}"
             level = f"{_interval(each['interval'], 100.0)} ({100 * each['confidence']:.1f} %)"
-            compared = f"{each['first']} - {each['second']}"
-            rows.append([title, compared, each["scenario"], f"{100 * each['mean']:+z.1f}", level])
-    return text_table(rows, left_columns=3)
+            rows.append([title, f"{100 * each['mean']:+z.1f}", level, each["scenario"]])
+    return text_table(rows)
 
 
 def prices_table(summary: dict[str, Any]) -> str:
     """Returns the return of the arms with a proof less that of the best arm that violates anywhere."""
-    rows = [["return as trained", "with a proof", "best without", "difference [95 % CI]"]]
+    rows = [["return as trained, with a proof", "difference [95 % CI]", "from the best without"]]
     for name, env in summary["environments"].items():
         for price in env["prices"]:
-            cells = [f"{price['mean']:+z.1f} {_interval(price['interval'])}"]
-            rows.append([name, price["first"], price["second"], *cells])
-    return text_table(rows, left_columns=3)
+            difference = f"{price['mean']:+z.1f} {_interval(price['interval'])}"
+            rows.append([f"{name} {price['first']}", difference, price["second"]])
+    return text_table(rows)
 
 
 def margins_table(summary: dict[str, Any]) -> str:
@@ -103,15 +103,15 @@ def network_table(summary: dict[str, Any]) -> str:
 
     These are violating episodes under attack, on an ideal channel and over the environment's own network.
     """
-    rows = [["violating episodes under attack [%]", "", "ideal channel", "over the network", "95 % interval"]]
+    rows = [["attacked, violating [%]", "ideal", "network", "95 % interval"]]
     for title, env in summary["environments"].items():
         for name in (SECONDARY[0].first, SECONDARY[0].second):
             scenarios = env["arms"].get(name, {"scenarios": {}})["scenarios"]
             if {ATTACKED, ATTACKED_IDEAL} <= set(scenarios):
                 ideal, own = scenarios[ATTACKED_IDEAL], scenarios[ATTACKED]
                 rates = [f"{100 * each['rate']:.1f}" for each in (ideal, own)]
-                rows.append([title, name, *rates, _interval(own["rate_ci95"], 100.0)])
-    return text_table(rows, left_columns=2)
+                rows.append([f"{title} {name}", *rates, _interval(own["rate_ci95"], 100.0)])
+    return text_table(rows)
 
 
 def regulators_table(summary: dict[str, Any]) -> str:
@@ -157,33 +157,45 @@ def training_table(summary: dict[str, Any]) -> str:
     return text_table(rows, left_columns=2)
 
 
-def switches_table(rows: Sequence[dict[str, Any]], *, combined: bool = True) -> str:
+def switches_table(rows: Sequence[dict[str, Any]]) -> str:
     """Returns violating episodes under attack [%] with each impairment of the channel on or off.
 
     Args:
         rows: What `channel_switches` returns.
-        combined: Whether to show combinations, beside each impairment alone, none and all.
     """
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     points = list(dict.fromkeys(tuple(row["on"]) for row in rows))
-    if not combined:
-        points = [point for point in points if len(point) in (0, 1, len(SWITCHES))]
     table = [["attacked, violating [%]", *arms]]
     for point in points:
-        at_point = {row["arm"]: row for row in rows if tuple(row["on"]) == point}
-        rates = [f"{100 * at_point[arm]['violating'] / at_point[arm]['episodes']:.0f}" for arm in arms]
-        title = "ideal" if not point else "all four" if len(point) == len(SWITCHES) else " + ".join(point)
-        table.append([title, *rates])
+        table.append([_impaired(point), *(_violating(rows, arm, point) for arm in arms)])
+    return text_table(table)
+
+
+def impairments_table(channels: Mapping[str, Sequence[dict[str, Any]]]) -> str:
+    """Returns violating episodes under attack [%] with no impairment of the channel, each alone, and all.
+
+    Args:
+        channels: What `channel_switches` returns, by environment.
+    """
+    played = dict.fromkeys(tuple(row["on"]) for rows in channels.values() for row in rows)
+    points = [point for point in played if len(point) in (0, 1, len(SWITCHES))]
+    table = [["attacked, violating [%]", *map(_impaired, points)]]
+    for title, rows in channels.items():
+        for arm in dict.fromkeys(row["arm"] for row in rows):
+            table.append([f"{title} {arm}", *(_violating(rows, arm, point) for point in points)])
     return text_table(table)
 
 
 def budget_text(summary: dict[str, Any]) -> str:
-    """Returns what was spent in each environment, one line each."""
-    return "\n".join(
-        f"{name}: {env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps "
-        f"each, {env['episodes']} episodes per run and scenario"
-        for name, env in summary["environments"].items()
-    )
+    """Returns what was spent in each environment, one line for all that spent the same."""
+    spent: dict[str, list[str]] = {}
+    for name, env in summary["environments"].items():
+        text = (
+            f"{env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps each, "
+            f"{env['episodes']} episodes per run and scenario"
+        )
+        spent.setdefault(text, []).append(name)
+    return "\n".join(f"{', '.join(names)}: {text}" for text, names in spent.items())
 
 
 # What other pages can quote, by name.
@@ -231,3 +243,14 @@ def _return(evaluated: dict[str, Any]) -> str:
     interval = evaluated["return_ci95"]
     half = "[n/a]" if interval is None else f"+-{0.5 * (interval[1] - interval[0]):.1f}"
     return f"{evaluated['return']:z.1f} {half}"
+
+
+def _impaired(point: Sequence[str]) -> str:
+    """Returns the name of a combination of impairments."""
+    return "ideal" if not point else "all four" if len(point) == len(SWITCHES) else " + ".join(point)
+
+
+def _violating(rows: Sequence[dict[str, Any]], arm: str, point: Sequence[str]) -> str:
+    """Returns the violating episodes [%] of an arm at a combination of impairments."""
+    (row,) = [row for row in rows if row["arm"] == arm and tuple(row["on"]) == tuple(point)]
+    return f"{100 * row['violating'] / row['episodes']:.0f}"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.episodes import episodes_table
+from experiments.study.channel_switches import SWITCHES
 from experiments.study.figures import study_figures
 from experiments.study.study import quoted
 from experiments.study.summary import PRIMARY, Comparison, difference, margins_needed, members, study_summary
@@ -11,6 +12,7 @@ from experiments.study.tables import (
     agents_table,
     comparisons_table,
     evaluation_table,
+    impairments_table,
     margins_table,
     network_table,
     prices_table,
@@ -90,9 +92,11 @@ def test_primary_comparison_comes_first_and_secondary_ones_share_a_level(made):
     assert (first["mean"], first["confidence"]) == (0.5, 0.95)
     assert [each["first"] for each in others] == ["trusting:20", "lqr+psf:20"]  # those whose arms there are
     assert all(each["confidence"] == pytest.approx(1.0 - 0.05 / 3.0) for each in others)
-    table = comparisons_table(made[0])
-    assert "Plant-v0, primary" in table.splitlines()[2]
-    assert "+50.0" in table
+    title, primary, *secondary = comparisons_table(made[0]).splitlines()[2:]
+    assert title == "Plant-v0"
+    assert primary.split()[:5] == ["unshielded", "-", "lookahead", "(primary)", "+50.0"]
+    assert len(secondary) == 2
+    assert not any("primary" in line for line in secondary)
 
 
 def test_arms_have_rates_of_every_run_and_intervals_over_runs(made):
@@ -150,8 +154,22 @@ def test_switches_are_a_row_per_combination():
         ["100", "0"],
     ]
     assert table.splitlines()[-1].startswith("all four")
-    alone = switches_table(rows, combined=False).splitlines()[2:]
-    assert [line.partition(" ")[0] for line in alone] == ["ideal", "loss", "all"]
+
+
+def test_impairments_alone_are_a_row_per_arm():
+    rows = [
+        {"on": on, "arm": arm, "episodes": 4, "violating": len(on) * (arm == "lqr")}
+        for on in ([], *([each] for each in SWITCHES), ["loss", "delay"], [*SWITCHES])
+        for arm in ("lqr", "lookahead")
+    ]
+    table = impairments_table({"Plant-v0": rows, "Other-v0": rows}).splitlines()
+    assert table[0].split()[3:] == ["ideal", "loss", "delay", "rate", "rounding", "all", "four"]
+    assert table[2].split() == ["Plant-v0", "lqr", "0", "25", "25", "25", "25", "100"]
+    assert [line.split()[:2] for line in table[3:]] == [
+        ["Plant-v0", "lookahead"],
+        ["Other-v0", "lqr"],
+        ["Other-v0", "lookahead"],
+    ]
 
 
 def test_pages_show_the_same_after_their_numbers_were_stored(made):
