@@ -28,8 +28,8 @@ _BOUNDS = (
     "remainder",
 )
 _SMALLEST_FACTOR, _FACTOR_PRECISION = 1e-6, 1.02
-# Limits are widened by at most this factor.
-_WIDEST = 100.0
+# Limits are widened by these factors, until one works; two changes together by at most the last number.
+_WIDENINGS, _WIDEST_PAIR = (2.0, 10.0, 100.0, 1e3, 1e4, 1e6), 100.0
 
 
 def infeasibility(problem: DesignProblem) -> Infeasible:
@@ -41,7 +41,7 @@ def infeasibility(problem: DesignProblem) -> Infeasible:
     binding = "U" if _margin(problem, input_limits=False) >= 1.0 else "I"
     what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
-        f"{what}: one is found once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those given",
+        f"{what}: a quick search finds one once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those given",
         binding,
         1.0 - fraction,
         {"share_of_radii": fraction},
@@ -95,9 +95,9 @@ def with_feasible_bounds(
             hints.append(f"{factor:.3g} times {change.what} is the smallest that works")
             details[f"{change.name}_factor"] = factor
     if useless:
-        hints.append(f"a smaller {' or '.join(useless)} is not enough")
+        hints.append(f"none is found with a smaller {' or '.join(useless)}")
     if useless_limits:
-        hints.append(f"a larger one of {', '.join(useless_limits)} is not enough")
+        hints.append(f"none is found with {' or '.join(useless_limits)} up to {_WIDENINGS[-1]:.0e} times as large")
     together = ""
     if len(details) == len(infeasible.details):
         progress("no certificate: searching for two changes that have one")
@@ -200,14 +200,14 @@ def _smallest_pair(
     changes = [*shrinkings, *(each for each in _widenings(plant) if not each.name.startswith("box_row"))]
     best: tuple[tuple[_Change, _Change], float] | None = None
     for pair in combinations(changes, 2):
-        factor = _smallest_factor(plant, pair, contract, _WIDEST if best is None else best[1] / _FACTOR_PRECISION)
+        factor = _smallest_factor(plant, pair, contract, _WIDEST_PAIR if best is None else best[1] / _FACTOR_PRECISION)
         if factor is not None:
             best = pair, factor
     return best
 
 
 def _smallest_factor(
-    plant: LinearPlant, changes: Sequence[_Change], contract: ChannelContract | None, widest: float = _WIDEST
+    plant: LinearPlant, changes: Sequence[_Change], contract: ChannelContract | None, widest: float = _WIDENINGS[-1]
 ) -> float | None:
     """Returns nearly the smallest factor, at most `widest`, with which all changes together certify; None for none."""
 
@@ -217,10 +217,11 @@ def _smallest_factor(
             changed = change.of(changed, factor)
         return is_feasible(changed, contract)
 
-    low = 1.0
-    high = next((factor for factor in (2.0, 10.0, widest) if factor <= widest and certifies(factor)), None)
-    if high is None:
+    tried = [1.0, *(factor for factor in _WIDENINGS if factor < widest), widest]
+    works = next((k for k, factor in enumerate(tried) if k and certifies(factor)), None)
+    if works is None:
         return None
+    low, high = tried[works - 1], tried[works]
     while high > _FACTOR_PRECISION * low:
         middle = (low * high) ** 0.5
         low, high = (low, middle) if certifies(middle) else (middle, high)
