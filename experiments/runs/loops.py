@@ -36,6 +36,8 @@ def registered_env(env_id: str) -> NCSEnv:
         if name not in gym.registry:
             raise ValueError(f"module {module!r} registers no environment {name!r}")
     elif name not in registered_ids() and name not in needing_extras():
+        if f"ncs_gym/{name}" in registered_ids():
+            raise ValueError(f"unknown environment {env_id!r}; did you mean 'ncs_gym/{name}'?")
         raise ValueError(
             f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "
             "module that registers one of your own"

@@ -179,7 +179,7 @@ class SafeLoop:
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
         self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
-        self._discarded, self._told_of_late = DiscardedPackets(), False
+        self._discarded, self._told_of_late, self._told_of_other_episode = DiscardedPackets(), False, False
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
@@ -296,7 +296,8 @@ class SafeLoop:
         if self._unknown is not None:
             self._find(arrived)
         oldest = self._estimator.channel.longest_delay
-        self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
+        before = self._discarded
+        self._discarded = before.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
         estimate = self.estimate
         if self._discarded.too_late and not self._told_of_late:
@@ -304,6 +305,15 @@ class SafeLoop:
             warnings.warn(
                 f"a packet was discarded: it came later than the {oldest} steps that the channel of this loop delays "
                 "any; give SafeLoop the channel with its longest delay (`discarded` counts such packets)",
+                UnusedPacketsWarning,
+                stacklevel=3,
+            )
+        from_elsewhere = self._discarded.other_episode > before.other_episode
+        if from_elsewhere and self.steps > oldest and not self._told_of_other_episode:  # none of these is a straggler
+            self._told_of_other_episode = True
+            warnings.warn(
+                f"a packet was discarded: its episode is not that of the loop, {self.episode}; send "
+                "Packet(stamp, measurement, loop.episode) (`discarded` counts such packets)",
                 UnusedPacketsWarning,
                 stacklevel=3,
             )

@@ -41,7 +41,8 @@ def infeasibility(problem: DesignProblem) -> Infeasible:
     binding = "U" if _margin(problem, input_limits=False) >= 1.0 else "I"
     what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
-        f"{what}: a quick search finds one once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those given",
+        f"{what}: a quick search finds one once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those "
+        "given",
         binding,
         1.0 - fraction,
         {"share_of_radii": fraction},

@@ -58,7 +58,8 @@ def in_round_numbers(problem: DesignProblem, found: CandidateDesign, slack: floa
         if design is None or design.log_det < found.log_det - _LARGEST_LOSS:
             continue
         tuned, _ = best_multipliers(problem, problem.error_shapes, design.L, design.K, design.multipliers)
-        inputs = np.round(best_input_multipliers(problem.error_shapes, design.L, design.K), 3)
+        shares = best_input_multipliers(problem.error_shapes, design.L, design.K)
+        inputs = np.clip(np.round(shares, 3), 1e-3, 1.0 - 1e-3)
         again = replace(design, multipliers=_in_proportion(tuned, _STEP), inputs=inputs)
         again = _with_largest_set_and_gain(problem, again, slack)
         if again is not None and again.log_det > design.log_det + _PREFERENCE:

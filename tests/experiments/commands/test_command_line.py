@@ -474,6 +474,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
     [
         (["compare", "--env", "CartPole-v1"], ["unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"]),
         (["compare", "--env", "ncs_gym/LinearNCS-v0"], ["unknown environment"]),
+        (["compare", "--env", "CSTR-v0"], ["unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"]),
         (["compare", "--arms", "shielded", "hope"], ["unknown arm 'hope'", "shielded:MODE"]),
         (["compare", "--arms", "shielded", "shielded"], ["--arms must be different"]),
         (["compare", "--config", "nowhere.json"], ["cannot read settings nowhere.json"]),

@@ -518,7 +518,8 @@ def test_packets_that_are_of_no_use_are_counted_by_reason():
     loop.step(0.0, [Packet(1, zero), Packet(1, zero), Packet(0, zero)])  # used, twice the same, and the first estimate
     assert loop.discarded == (0, 0, 0)
     loop.step(0.0, [Packet(3, zero), Packet(2000, zero)])
-    loop.step(0.0, [Packet(1, zero), Packet(3, zero, episode=1)])
+    with pytest.warns(UnusedPacketsWarning, match="its episode is not that of the loop, 0"):
+        loop.step(0.0, [Packet(1, zero), Packet(3, zero, episode=1)])
     loop.receive([Packet(1, zero)])
     assert loop.discarded == (1, 2, 1)
     assert (loop.discarded.too_late, loop.discarded.ahead, loop.discarded.other_episode) == (1, 2, 1)

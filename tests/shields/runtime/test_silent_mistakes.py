@@ -9,8 +9,8 @@ from stable_baselines3.common.monitor import Monitor
 
 from agents import LoopConfig, SafetyCallback
 from agents.loop import CostPenalty
-from ncs_gym import Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
+from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from tests.certificates import certificate_of
 
 PLANT = truck_trailer(mass=4000.0)
@@ -84,6 +84,31 @@ def test_packets_that_come_too_late_for_a_loop_are_named_once(certificate):
         loop.step(0.0, [Packet(1, np.zeros(2))])
     loop.step(0.0, [Packet(2, np.zeros(2))])
     assert loop.discarded.too_late == 2
+
+
+def test_packets_without_the_number_of_a_later_episode_are_named_once(certificate):
+    loop = SafeLoop(certificate, PLANT, Channel(delay=1))
+    for _ in range(2):
+        loop.start([0.0, 0.0])
+        loop.step(0.0)
+        loop.step(0.0, [Packet(1, np.zeros(2))])  # in the second episode this could be a straggler of the first
+    with pytest.warns(UnusedPacketsWarning, match=r"its episode is not that of the loop, 1; send Packet\(stamp"):
+        loop.step(0.0, [Packet(2, np.zeros(2))])
+    loop.step(0.0, [Packet(3, np.zeros(2))])
+    assert loop.discarded.other_episode == 3
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+def test_settings_of_the_channel_say_where_they_belong(make):
+    with pytest.raises(ValueError, match=r"delay is a setting of the channel: give channel=Channel\(delay=...\)"):
+        make("ncs_gym/TruckTrailerCruise-v0", delay="a", loss=0.1)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_bounds_of_zero_are_certified_without_a_word():
+    none = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
+    plant = LinearPlant(A=[[1.0, 0.1], [-0.3, 0.85]], B=[[0.0], [0.1]], box=[1.0, 2.0], u_max=5.0, dt=0.1, **none)
+    assert synthesize(plant).provenance["share_of_box"] > 0.7
 
 
 class Alarming(gym.Wrapper):
