@@ -27,7 +27,7 @@ from shields.runtime.projection import closest_between
 # Projections onto either of two sets of inputs, in turn.
 ALTERNATIONS = 8
 # Entries of an array that are worked on together: as many as a processor keeps near.
-BLOCK = 524_288
+BLOCK = 131_072
 # Outward rounding of rows that are divided by what is left of the box.
 _OUTWARD = 1.0 + 1e-12
 
