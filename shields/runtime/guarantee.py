@@ -51,7 +51,7 @@ class MonitorState(NamedTuple):
         certified: Whether the error ellipsoid lies inside a certified one.
         wait: Behind a downlink, number of steps until x in S is proved now, if `inside` stays true: that is about the
             time at which the next input takes effect. Where the box counts between samples, too, also after a step
-            that nothing proved, wherever it led. 0 otherwise.
+            that nothing proved, or that began where nothing did, wherever it led. 0 otherwise.
     """
 
     broken: Any
@@ -167,7 +167,9 @@ class GuaranteeMonitor:
         if not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
-        return self._observe(broken, inside, report, state.wait, inside)
+        # A passed test proves the times on the grid and the next state; the first one needs x itself in the box.
+        on_the_way = inside & state.inside if self._on_grid else True
+        return self._observe(broken, inside, report, state.wait, on_the_way)
 
     def reasons(self, state: MonitorState, age: Any = 0) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does.

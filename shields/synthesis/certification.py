@@ -13,7 +13,7 @@ import numpy as np
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
-from ncs_gym.validation import shown
+from ncs_gym.validation import as_flag, shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
@@ -110,6 +110,7 @@ def synthesize(
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
     if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
         raise ValueError("candidates must be certificates of method 'certified'")
+    as_flag(search_gain, "search_gain")
     if method == "paper" and (safe_set == "polytope" or search_gain):
         raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if safe_set == "ellipsoid" and search_gain:
@@ -132,7 +133,9 @@ def synthesize(
     certificate = _largest_certificate(plant, contract, report, known)
     if safe_set == "ellipsoid":
         return certificate
-    return (with_largest_polytope if search_gain else with_polytope)(certificate, plant, report)
+    found = (with_largest_polytope if search_gain else with_polytope)(certificate, plant, report)
+    others = [with_polytope(each, plant, report) for each in known if each is not certificate]
+    return max([found, *others], key=_polytope_share)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -185,10 +188,6 @@ def with_largest_polytope(
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt with the certificate, and its own gain's polytope if that was found.
     """
-
-    def share(each: Certificate) -> float:
-        return each.provenance.get("polytope_share_of_box", 0.0)
-
     own = with_polytope(certificate, plant, progress)
     problem, _ = design_problem(plant, certificate.contract)
 
@@ -199,14 +198,21 @@ def with_largest_polytope(
         for K in gains_of_larger_polytopes(certificate, plant, is_provable, progress):
             proved = _with_gain(K, problem, plant, certificate.contract)
             found = own if proved is None else with_polytope(proved, plant, progress)
-            if share(found) > share(own):
+            if _polytope_share(found) > _polytope_share(own):
                 kept = {name: certificate.provenance[name] for name in _OF_THE_PLANT if name in certificate.provenance}
-                gained = {"share_with_gain_of_ellipsoid": share(own)}
+                gained = {"share_with_gain_of_ellipsoid": _polytope_share(own)}
                 return replace(found, provenance=found.provenance | kept | gained)
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a gain with a larger polytope was sought; the certificate has the first gain's"
         raise SynthesisInterrupted(message, own) from interrupt
+    except (ArithmeticError, ValueError, CertificateError):  # a gain whose numbers are out of reach of float64
+        pass
     return own
+
+
+def _polytope_share(certificate: Certificate) -> float:
+    """Returns the share of the safe box that a certificate's polytope fills, as far as it is known; 0.0 otherwise."""
+    return certificate.provenance.get("polytope_share_of_box", 0.0)
 
 
 def _with_gain(

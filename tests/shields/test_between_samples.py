@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Channel, LinearPlant, Packet
+from ncs_gym import Channel, LinearPlant, Packet, truck_trailer
 from ncs_gym.network import downlink_protocol
 from shields import Certificate, CertificateError, Infeasible, SafeLoop, SafetyFilter, SafetyShield, synthesize, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
@@ -350,6 +350,28 @@ def test_inputs_on_their_way_at_a_start_in_the_middle_count_between_samples(mode
             assert worst <= 1.0 or not guaranteed
             x = plant.A @ x + plant.B @ both[2:]
     assert seen > 0
+
+
+def test_a_passed_test_does_not_prove_a_step_that_began_where_nothing_did():
+    tiny = 1e-12 * np.eye(2)
+    settings = {"process_noise_cov": 0.0 * tiny, "initial_cov": tiny, "measurement_noise_cov": tiny, "gamma": 1e-8}
+    plant = truck_trailer(mass=1000.0, dt=0.2, between_samples=2, **settings)
+    loop = SafeLoop(synthesize(plant), plant, channel=Channel(), on_unproved="ignore")
+    x = np.array([1.9999946541265599, 0.27376498913178876])  # in the box, out of what the proof begins with
+    loop.start(x)
+    loop.receive()
+    assert not loop.guaranteed
+    decision = loop.decide(-4.0)
+    assert decision.passed
+    G = np.concatenate([plant.continuous_model, np.zeros((1, 3))])
+    joint = np.concatenate([x, decision.input])
+    times = np.linspace(0.0, plant.dt, 401)
+    assert max(np.abs(plant.box_rows @ expm(G * each)[:2] @ joint).max() for each in times) > 1.001
+    loop.receive()
+    assert not loop.guaranteed  # of this step
+    loop.decide(0.0)
+    loop.receive()
+    assert loop.guaranteed
 
 
 def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():

@@ -22,6 +22,7 @@ from shields import Certificate, CertificateError, SafetyFilter, VectorSafetyShi
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.json_documents import document_of
 from shields.polytope import Polytope
+from shields.synthesis import certification
 from shields.synthesis import invariant_polytope as search
 from shields.synthesis.certification import with_largest_polytope, with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
@@ -107,6 +108,27 @@ def assert_gain_stays(plant):
     certificate = synthesize(plant)
     assert certificate.polytope is not None
     assert synthesize(plant, search_gain=True) == certificate
+
+
+def test_polytope_of_a_candidate_is_kept_where_it_is_larger():
+    wide, certificate, plant = found("TruckTrailerCruise")
+    wider = with_largest_polytope(certificate, plant)
+    again = synthesize(plant, candidates=[wider])
+    shares = [each.provenance["polytope_share_of_box"] for each in (wide, wider, again)]
+    assert shares[0] < shares[1] <= shares[2]
+    assert both(again, plant)
+
+
+def test_search_for_a_gain_that_fails_keeps_the_polytope_of_the_first_gain(monkeypatch):
+    wide, certificate, plant = found("TruckTrailerCruise")
+
+    def failing(*_, **__):
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr(certification, "smallest_invariant_shape", failing)
+    assert with_largest_polytope(certificate, plant) == wide
+    with pytest.raises(ValueError, match="search_gain"):
+        synthesize(plant, search_gain="no")
 
 
 def test_interrupted_search_for_a_gain_keeps_the_polytope_of_the_first_gain():
