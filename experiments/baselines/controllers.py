@@ -222,6 +222,7 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     )
     settings, bounds = _clarabel.DefaultSettings(), np.tile(plant.u_max, 2 * steps)
     settings.verbose = settings.presolve_enable = False
+    without_limits = -np.linalg.lstsq(effect, drift)[0]
 
     def solved(entries: np.ndarray) -> np.ndarray:
         slope, place = effect.T @ (drift @ entries), moved @ entries
@@ -233,7 +234,16 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
             raise RuntimeError(f"the predictive controller's program was not solved: {found.status}")
         return np.array(found.x[:m])
 
-    return lambda observations, estimates: np.array([solved(each) for each in problem.entries(observations, estimates)])
+    def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
+        entries = problem.entries(observations, estimates)
+        plans = entries @ without_limits.T  # the minimum without limits is the minimum where it keeps them
+        kept = (np.abs(plans) <= bounds[: steps * m]).all(axis=1)
+        kept &= (np.abs(entries @ moved.T + plans @ felt.T) <= 1.0 - margin).all(axis=1)
+        for k in np.flatnonzero(~kept):
+            plans[k, :m] = solved(entries[k])
+        return plans[:, :m]
+
+    return inputs
 
 
 def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -373,13 +373,13 @@ class StudySettings(BackendSettings):
     seed: int = 0
     seeds: int = 5
     budget: float = 1.0
-    episodes: int = 100
+    episodes: int = 50
     algo: Algorithm = "PPO"
     arms: tuple[str, ...] = TRAINED_ARMS
     baselines: tuple[str, ...] = REGULATED_ARMS
     scenarios: tuple[str, ...] = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
     safe_set: Literal["polytope", "ellipsoid"] = "polytope"
-    channel_episodes: int = 100
+    channel_episodes: int = 25
     page: Path | None = None
     quote: tuple[Path, ...] = ()
     smoke: bool = False
