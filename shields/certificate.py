@@ -45,14 +45,16 @@ class Multipliers:
         disturbance: Multiplier ld of the disturbance in (I), > 0; lx + le + ld <= 1.
         inputs: Multipliers mu_i of the input limits (U), one per input, in (0, 1).
         rounding: Multiplier s of D_u, the disturbance set enlarged by the rounding of actions to float32, > 0.
+
+    Those of (I) and (U) are None where the polytope alone is invariant.
     """
 
     error: float
-    state: float
-    estimate: float
-    disturbance: float
-    inputs: tuple[float, ...]
     rounding: float
+    state: float | None = None
+    estimate: float | None = None
+    disturbance: float | None = None
+    inputs: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,22 +66,26 @@ class Proof(ReadOnlyArrays):
     Attributes:
         Sigma: Shape of the error set, (n, n).
         rate: Multiplier lam of (E1), under a contract of (C1): without a sample the error is in the next set.
-        shares: Multipliers lx, le, ld of state, estimation error and disturbance in (I), shape (3,).
-        inputs: Multipliers mu_i of the input limits (U), shape (m,).
+        shares: Multipliers lx, le, ld of state, estimation error and disturbance in (I), shape (3,); None if the state
+            is kept in the certificate's polytope alone, whose multipliers are those of (P) and (PU).
+        inputs: Multipliers mu_i of the input limits (U), shape (m,); None with `shares`.
     """
 
     Sigma: np.ndarray
     rate: float
-    shares: np.ndarray
-    inputs: np.ndarray
+    shares: np.ndarray | None = None
+    inputs: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Raises CertificateError if a field is of the wrong kind; the ranges of multipliers are verified."""
         try:
             object.__setattr__(self, "Sigma", as_matrix(self.Sigma, (None, None), "Sigma"))
             object.__setattr__(self, "rate", float(_as_array(self.rate, (), "the rate of an error set")))
-            object.__setattr__(self, "shares", _as_array(self.shares, (3,), "the multipliers of (I)"))
-            object.__setattr__(self, "inputs", _as_array(self.inputs, (None,), "the multipliers of (U)"))
+            if (self.shares is None) != (self.inputs is None):
+                raise ValueError("the multipliers of (I) and (U) must both be given, or neither")
+            if self.shares is not None:
+                object.__setattr__(self, "shares", _as_array(self.shares, (3,), "the multipliers of (I)"))
+                object.__setattr__(self, "inputs", _as_array(self.inputs, (None,), "the multipliers of (U)"))
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
         self._make_arrays_read_only()
@@ -134,13 +140,15 @@ class PaperConstants(NamedTuple):
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
 
-    It may also have a polytope around S that the same gain keeps invariant; shields keep the state in that then.
+    It may also have a polytope around S that the same gain keeps invariant; shields keep the state in that then. Where
+    the gain keeps a polytope but no ellipsoid, that is all that is proved, and S is merely an ellipsoid inside
+    (`keeps_ellipsoid`).
 
     A certificate is not trusted until `shields.verify` has checked it in exact arithmetic. Two certificates are equal
     if their files are, every digit of them. `print(certificate)` says what it is for.
 
     Attributes:
-        L: Shape of the safe set, (n, n) [squares of the states' units]; S = E(L).
+        L: Shape of the ellipsoid S = E(L), (n, n) [squares of the states' units].
         K: Gain of the fallback input u = K x_hat, shape (m, n) [input per state].
         proofs: One for each error set: under a channel contract for the ages 0..h of the newest sample, otherwise a
             single one; none for "paper".
@@ -217,6 +225,10 @@ class Certificate(ReadOnlyArrays):
             raise ValueError(f"it must have {ages} proofs, one per error set, got {len(self.proofs)}")
         for Sigma in (*(proof.Sigma for proof in self.proofs), *self.next_error_shapes):
             as_matrix(Sigma, (n, n), "Sigma")
+        if len({proof.shares is None for proof in self.proofs}) > 1:
+            raise ValueError("either all of its proofs have multipliers of (I), or none has")
+        if self.polytope is None and not self.keeps_ellipsoid:
+            raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
 
     def constants(self) -> PaperConstants:
         """Returns the constants with which the constraints of OP are verified.
@@ -246,8 +258,13 @@ class Certificate(ReadOnlyArrays):
 
     @cached_property
     def ellipsoid(self) -> Ellipsoid:
-        """The robust control invariant ellipsoid S = E(L)."""
+        """The ellipsoid S = E(L), invariant itself if `keeps_ellipsoid`."""
         return Ellipsoid(self.L)
+
+    @property
+    def keeps_ellipsoid(self) -> bool:
+        """Whether S is claimed to be invariant; otherwise the polytope alone is, and S is an ellipsoid inside it."""
+        return all(proof.shares is not None for proof in self.proofs)
 
     @property
     def safe_set(self) -> Ellipsoid | Polytope:
@@ -270,6 +287,8 @@ class Certificate(ReadOnlyArrays):
         if not self.proofs or self.rounding is None:
             return None
         last = self.proofs[-1]
+        if last.shares is None or last.inputs is None:
+            return Multipliers(error=last.rate, rounding=self.rounding)
         lx, le, ld = last.shares.tolist()
         return Multipliers(
             error=last.rate,
@@ -287,7 +306,7 @@ class Certificate(ReadOnlyArrays):
 
     @cached_property
     def error_shapes(self) -> np.ndarray:
-        """The shapes of all error sets for which K x_hat keeps the state in S, (k, n, n); k = 0 for method "paper"."""
+        """Shapes of all error sets for which K x_hat keeps the state safe, (k, n, n); k = 0 for method "paper"."""
         return read_only(np.array([proof.Sigma for proof in self.proofs]).reshape(-1, *self.L.shape))
 
     @property
@@ -319,7 +338,8 @@ class Certificate(ReadOnlyArrays):
             claim = "at the sampling instants; nothing is claimed of the times between them"
         safe_set = ""
         if self.polytope is not None:
-            safe_set = f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; inside it the ellipsoid "
+            inside = "inside it the ellipsoid" if self.keeps_ellipsoid else "inside it, not invariant, the ellipsoid"
+            safe_set = f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; {inside} "
         widths = ", ".join(f"{width:.4g}" for width in np.sqrt(np.diag(self.L)))
         rows = [
             ("method", METHODS[self.method]),
@@ -392,7 +412,7 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
             "rates": [proof.rate for proof in c.proofs],
             **{name: getattr(updates, name).tolist() for name in ("gains", "shares", "noise")},
         }
-        by_age = {name: [getattr(proof, name).tolist() for proof in c.proofs] for name in ("shares", "inputs")}
+        by_age = {name: [_listed(getattr(proof, name)) for proof in c.proofs] for name in ("shares", "inputs")}
         ages = {"contract": asdict(updates.contract), "sets": sets, **by_age}
     optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
     optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
@@ -413,6 +433,10 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
     }
 
 
+def _listed(array: np.ndarray | None) -> list[float] | None:
+    return None if array is None else array.tolist()
+
+
 def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     """Returns the fields of a certificate from the content of its file.
 
@@ -431,7 +455,8 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     fields["between_samples"] = content.get("between_samples")
     if content.get("polytope") is not None:
         fields["polytope"] = polytope_of(content["polytope"])
-    own = Sigma, stated.error, [stated.state, stated.estimate, stated.disturbance], stated.inputs
+    shares = [stated.state, stated.estimate, stated.disturbance]
+    own = Sigma, stated.error, None if shares == [None] * 3 else shares, stated.inputs
     rows: list[tuple[Any, Any, Any, Any]] = [own]
     if ages is not None:
         sets = ages["sets"]

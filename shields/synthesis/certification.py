@@ -20,15 +20,17 @@ from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
-from shields.synthesis.invariant_polytope import grid_in_closed_loop, invariant_polytope, share_in_polytope
-from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.multipliers import (
-    best_input_multipliers,
-    best_multipliers,
-    smallest_invariant_shape,
-    with_best_multipliers,
+from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
+from shields.synthesis.invariant_polytope import (
+    Feedback,
+    feedback_of,
+    grid_in_closed_loop,
+    invariant_polytope,
+    share_in_polytope,
 )
-from shields.synthesis.polytope_gain import gains_of_larger_polytopes
+from shields.synthesis.max_margin_gain import max_margin_gain
+from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
+from shields.synthesis.polytope_gain import gains_of_larger_polytopes, most_tolerant_gain
 from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
@@ -42,6 +44,8 @@ _BETWEEN_RESERVE, _MOST_BOXES = 1e-3, 8
 # Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
 # that are for people have fewer.
 _DIGITS, _SHOWN_DIGITS = 12, 6
+# The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by.
+_INSIDE = 1.0 - 1e-9
 # What helps where float64 has too few digits.
 _MORE_DIGITS = (
     "give states units in which the half-widths of the box are of similar size, and leave out rows of the box that are "
@@ -76,8 +80,9 @@ def synthesize(
 ) -> Certificate:
     """Returns a verified certificate.
 
-    Method "certified" (docs/shield_proof.md) seeks the largest ellipsoid with hard bounds. Method "paper" solves OP
-    of Liu et al. as printed with their Algorithm 1; its certificate carries no error set (docs/paper.md).
+    Method "certified" (docs/shield_proof.md) seeks the largest ellipsoid with hard bounds, and the polytope around it.
+    Where there is no ellipsoid, a polytope alone is sought: it bears larger disturbances and errors. Method "paper"
+    solves OP of Liu et al. as printed with their Algorithm 1; its certificate carries no error set (docs/paper.md).
 
     Args:
         plant: The plant with its bounds, Schur stable for "certified" without a contract.
@@ -88,7 +93,7 @@ def synthesize(
             time the ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper"
             has an ellipsoid.
         search_gain: Also seek the gain whose polytope is the largest, which takes about as long again, longer for
-            polytopes of many rows. Its ellipsoid is the one that proves that gain, which may be small ("certified").
+            polytopes of many rows. That gain keeps the polytope alone ("certified").
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -120,8 +125,9 @@ def synthesize(
 
         certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
         holds = _is_certifiable(plant, certificate.L, certificate.K)
-        volume = np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box_rows), certificate.L)) ** 0.5
-        description = _description(plant, certificate.L, float(volume)) | {"exact_conditions_hold": holds}
+        description = _description(plant, certificate.L, _volume(plant, certificate.L)) | {
+            "exact_conditions_hold": holds
+        }
         return replace(certificate, provenance=certificate.provenance | description)
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(
@@ -130,7 +136,9 @@ def synthesize(
         )
     report = progress or (lambda line: None)
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
-    certificate = _largest_certificate(plant, contract, report, known)
+    if safe_set == "ellipsoid":
+        known = [each for each in known if each.keeps_ellipsoid]
+    certificate = _largest_certificate(plant, contract, report, known, polytope=safe_set != "ellipsoid")
     if safe_set == "ellipsoid":
         return certificate
     found = (with_largest_polytope if search_gain else with_polytope)(certificate, plant, report)
@@ -141,7 +149,8 @@ def synthesize(
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
     """Returns a verified certificate with the largest polytope that its gain keeps in the box.
 
-    Without one if none is found; its provenance, and so the printed certificate, says why.
+    One that keeps a polytope alone is returned as it is. Without a polytope if none is found; its provenance, and so
+    the printed certificate, says why.
 
     Args:
         certificate: A verified one of method "certified".
@@ -151,17 +160,11 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt with the certificate as it was.
     """
+    if not certificate.keeps_ellipsoid:
+        return certificate
     try:
-        polytope = invariant_polytope(certificate, plant, progress)
-        found = replace(certificate, polytope=polytope)
-        progress(f"exact verification: a polytope of {len(polytope.rows)} rows")
-        report = verify(found, plant)
-        if report.valid:
-            share = share_in_polytope(polytope, plant)
-            size = {} if share is None else {"polytope_share_of_box": float(exact.rounded(share, 3))}
-            return replace(found, provenance=certificate.provenance | size)
-        failed = next(condition for condition in report.conditions if not condition.holds)
-        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {_MORE_DIGITS}"
+        polytope = invariant_polytope(feedback_of(certificate), plant, progress)
+        return _verified_polytope(replace(certificate, polytope=polytope), plant, progress)
     except Infeasible as none:
         reason = str(none)
     except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
@@ -177,8 +180,8 @@ def with_largest_polytope(
 ) -> Certificate:
     """Returns what `with_polytope` does, with the gain whose polytope is the largest that a search finds.
 
-    Another gain than the certificate's comes with an ellipsoid that proves it, and with what the certificate's own gain
-    would have kept in the provenance.
+    Another gain than the certificate's keeps the polytope alone; what the certificate's own would have kept is in the
+    provenance.
 
     Args:
         certificate: A verified one of method "certified".
@@ -189,18 +192,12 @@ def with_largest_polytope(
         SynthesisInterrupted: A KeyboardInterrupt with the certificate, and its own gain's polytope if that was found.
     """
     own = with_polytope(certificate, plant, progress)
-    problem, _ = design_problem(plant, certificate.contract)
-
-    def is_provable(K: np.ndarray) -> bool:
-        return _small_shape(K, problem) is not None
-
     try:
-        for K in gains_of_larger_polytopes(certificate, plant, is_provable, progress):
-            proved = _with_gain(K, problem, plant, certificate.contract)
-            found = own if proved is None else with_polytope(proved, plant, progress)
-            if _polytope_share(found) > _polytope_share(own):
+        for K in gains_of_larger_polytopes(feedback_of(certificate), plant, progress):
+            found = certify_polytope(plant, K, certificate.contract, progress)
+            if found is not None and _polytope_share(found) > _polytope_share(own):
                 kept = {name: certificate.provenance[name] for name in _OF_THE_PLANT if name in certificate.provenance}
-                gained = {"share_with_gain_of_ellipsoid": _polytope_share(own)}
+                gained = {"share_with_gain_of_ellipsoid": _polytope_share(own)} if own.keeps_ellipsoid else {}
                 return replace(found, provenance=found.provenance | kept | gained)
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a gain with a larger polytope was sought; the certificate has the first gain's"
@@ -215,20 +212,22 @@ def _polytope_share(certificate: Certificate) -> float:
     return certificate.provenance.get("polytope_share_of_box", 0.0)
 
 
-def _with_gain(
-    K: np.ndarray, problem: DesignProblem, plant: LinearPlant, contract: ChannelContract | None
-) -> Certificate | None:
-    """Returns a verified certificate with a given gain, shape (m, n), and a small ellipsoid; None if there is none."""
-    K = exact.rounded(K, _DIGITS, axis=1)
-    L = _small_shape(K, problem)
-    return None if L is None else certify(plant, L, K, contract)
+def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress) -> Certificate:
+    """Returns a certificate with a polytope, verified, with the polytope's size.
 
-
-def _small_shape(K: np.ndarray, problem: DesignProblem) -> np.ndarray | None:
-    """Returns the shape, (n, n), of a small ellipsoid that proves a gain, shape (m, n); None if there is none."""
-    _, scaled = problem.to_scaled(np.eye(problem.n), K)
-    L = smallest_invariant_shape(problem, scaled)
-    return None if L is None else problem.to_physical(L, scaled)[0]
+    Raises:
+        Infeasible: If it does not verify.
+    """
+    assert certificate.polytope is not None
+    progress(f"exact verification: a polytope of {len(certificate.polytope.rows)} rows")
+    report = verify(certificate, plant)
+    if not report.valid:
+        failed = next(condition for condition in report.conditions if not condition.holds)
+        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {_MORE_DIGITS}"
+        raise Infeasible(reason, "P", -failed.margin)
+    share = share_in_polytope(certificate.polytope, plant)
+    size = {} if share is None else {"polytope_share_of_box": float(exact.rounded(share, 3))}
+    return replace(certificate, provenance=certificate.provenance | size)
 
 
 def certify(
@@ -251,12 +250,51 @@ def certify(
     return certificate if verify(certificate, plant).valid else None
 
 
+def certify_polytope(
+    plant: LinearPlant,
+    K: np.ndarray,
+    contract: ChannelContract | None = None,
+    progress: Progress = lambda line: None,
+) -> Certificate | None:
+    """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
+
+    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it.
+
+    Args:
+        plant: The plant with its bounds.
+        K: Gain, shape (m, n) [input per state].
+        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        Infeasible: If the plant has no error set or its safe box is unbounded.
+    """
+    problem, errors = design_problem(plant, contract)
+    K, proofs = exact.rounded(K, _DIGITS, axis=1), _proofs(errors)
+    D = inflated(plant.disturbance.shape_matrix)
+    try:
+        polytope = invariant_polytope(Feedback(K, np.array([proof.Sigma for proof in proofs]), D), plant, progress)
+        L = largest_box_ellipsoid(polytope.rows)
+        L = _in_digits(L * (_INSIDE / ((polytope.rows @ L) * polytope.rows).sum(axis=1).max()))
+        certificate = Certificate(
+            L=L,
+            K=K,
+            proofs=proofs,
+            polytope=polytope,
+            **_of_the_problem(plant, problem, errors),
+            provenance=_provenance(plant, L, _volume(plant, L)),
+        )
+        return _verified_polytope(certificate, plant, progress)
+    except (Infeasible, ArithmeticError, ValueError, CertificateError):  # numbers that a linear program cannot hold
+        return None
+
+
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
     """Returns a certificate of a tighter problem as one of this problem; None if it does not verify here.
 
     A problem is tighter with larger bounds, closer limits, an older largest age or a coarser quantization. A
     certificate of the same plant is returned as it is: channels that keep this contract keep its own. For another plant
-    its set and gain are proved anew, with this plant's error sets.
+    its ellipsoid and gain are proved anew, with this plant's error sets; where its gain keeps a polytope alone, that.
 
     Args:
         certificate: A verified one of method "certified".
@@ -274,7 +312,9 @@ def carried_over(certificate: Certificate, plant: LinearPlant, contract: Channel
     if certificate.L.shape != (plant.n, plant.n) or certificate.K.shape != (plant.m, plant.n):
         return None
     try:
-        return certify(plant, certificate.L, certificate.K, contract)
+        if certificate.keeps_ellipsoid:
+            return certify(plant, certificate.L, certificate.K, contract)
+        return certify_polytope(plant, certificate.K, contract)
     except Infeasible:
         return None
 
@@ -284,6 +324,8 @@ def nearby_certificate(
     contract: ChannelContract | None,
     start: Certificate | None = None,
     alternations: int = _FEW_ALTERNATIONS,
+    *,
+    polytope: bool = True,
 ) -> Certificate | None:
     """Returns a verified certificate, found faster and with a slightly smaller set than `synthesize`; None if none is.
 
@@ -292,12 +334,14 @@ def nearby_certificate(
         contract: Channel contract; None for none.
         start: Certificate of a similar problem with as many states and inputs, which the search begins near.
         alternations: How often the set is enlarged at most.
+        polytope: Whether a polytope is sought where no ellipsoid is found.
     """
     try:
         certificate = _nearby(plant, contract, start, alternations)
     except Infeasible:
         certificate = None
-    return certificate or (None if start is None else carried_over(start, plant, contract))
+    carried = None if certificate or start is None else carried_over(start, plant, contract)
+    return certificate or carried or (_polytope_alone(plant, contract) if polytope else None)
 
 
 def _nearby(
@@ -314,8 +358,8 @@ def _nearby(
     """
     problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
     near = None
-    if start is not None:
-        lx, le, ld = start.proofs[-1].shares.tolist()
+    if start is not None and (shares := start.proofs[-1].shares) is not None:
+        lx, le, ld = shares.tolist()
         near = _design_at(problem, start.L, start.K, (lx, le, ld))
     for slack in _SLACKS:
         found = largest_set(problem, slack, lambda stage, design: None, near, alternations)
@@ -349,9 +393,17 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
 
 
 def _largest_certificate(
-    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, known: Sequence[Certificate]
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    known: Sequence[Certificate],
+    *,
+    polytope: bool,
 ) -> Certificate:
-    """Returns the verified certificate of the largest set found, or the largest of known ones."""
+    """Returns the verified certificate of the largest ellipsoid found, or the largest of known ones.
+
+    Where there is none and `polytope` says so, one of a polytope alone.
+    """
 
     def volume(certificate: Certificate) -> float:
         return float(np.linalg.slogdet(certificate.L)[1])
@@ -364,8 +416,14 @@ def _largest_certificate(
         was_sought = "share_of_radii" in infeasible.details
         if was_sought and (certificate := _with_closer_limits(plant, contract)) is not None:
             return certificate
+        if polytope and (was_sought or infeasible.binding == "B"):
+            progress("no ellipsoid: seeking the gain whose polytope bears most")
+            if (certificate := _polytope_alone(plant, contract, progress)) is not None:
+                return certificate
+            if was_sought:
+                infeasible = infeasibility(design_problem(plant, contract)[0], polytope=True)
         if was_sought or infeasible.binding == "E1":
-            raise _with_hints(infeasible, plant, contract, progress) from infeasible
+            raise _with_hints(infeasible, plant, contract, progress, polytope) from infeasible
         raise
 
 
@@ -373,11 +431,37 @@ def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) ->
     """Returns a certificate that is found with closer input limits and holds for the plant's own; None if none is."""
     for fraction in _LIMIT_FRACTIONS if plant.remainder is None else ():
         closer = replace(plant, u_max=fraction * plant.u_max)
-        found = nearby_certificate(closer, contract) if is_feasible(closer, contract) else None
+        certifies = is_feasible(closer, contract, polytope=False)
+        found = nearby_certificate(closer, contract, polytope=False) if certifies else None
         certificate = found and carried_over(found, plant, contract)
         if certificate is not None:
             return certificate
     return None
+
+
+def _polytope_alone(
+    plant: LinearPlant, contract: ChannelContract | None, progress: Progress = lambda line: None
+) -> Certificate | None:
+    """Returns a verified certificate of a polytope for the gain that bears the largest radii; None if none is found.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt.
+    """
+    try:
+        problem, _ = design_problem(plant, contract)
+        start = max_margin_gain(problem, problem.covering_error_shape, searches=1)
+        gain = start and most_tolerant_gain(problem, start)
+        if gain is None or gain.margin < SUFFICIENT_MARGIN:
+            return None
+        _, K = problem.to_physical(np.eye(plant.n), gain.K)
+        found = certify_polytope(plant, K, contract, progress)
+    except Infeasible:
+        return None
+    except KeyboardInterrupt as interrupt:
+        message = "interrupted while a polytope was sought, and had no certificate yet"
+        raise SynthesisInterrupted(message) from interrupt
+    record = {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
+    return found and replace(found, provenance=found.provenance | record)
 
 
 def _found_certificate(
@@ -429,7 +513,7 @@ def _found_certificate(
             "I",
             1.0,
         )
-    raise failure or infeasibility(problem)
+    raise failure or infeasibility(problem, polytope=False)
 
 
 def _tightened_box(
@@ -440,7 +524,7 @@ def _tightened_box(
     Raises:
         Infeasible: If it still does after several boxes.
     """
-    grid = grid_in_closed_loop(plant, certificate.K, certificate.error_shapes, certificate.disturbances()[0])
+    grid = grid_in_closed_loop(feedback_of(certificate), plant)
     if not len(grid.left):
         return None
     reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / np.maximum(grid.left, 1e-300)
@@ -471,7 +555,7 @@ def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> I
 
 
 def _with_hints(
-    infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None, progress: Progress
+    infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None, progress: Progress, polytope: bool
 ) -> Infeasible:
     """Returns the exception with the bounds that would be feasible.
 
@@ -479,7 +563,7 @@ def _with_hints(
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
     try:
-        return with_feasible_bounds(infeasible, plant, contract, progress)
+        return with_feasible_bounds(infeasible, plant, contract, progress, polytope=polytope)
     except KeyboardInterrupt as interrupt:
         raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt
 
@@ -526,26 +610,45 @@ def _certificate(
 ) -> Certificate:
     """Returns the certificate of a design, not yet verified."""
     L, K = problem.to_physical(design.L, design.K)
-    extents = np.array([float(exact.rounded(extent, 1)) for extent in np.sqrt(np.diag(L))])
-    units = np.outer(extents, extents)
-    L, K = np.round(L / units, _DIGITS) * units, exact.rounded(K, _DIGITS, axis=1)
+    L, K = _in_digits(L), exact.rounded(K, _DIGITS, axis=1)
+    volume = float(np.exp(0.5 * design.log_det)) * _share_of_ellipsoid(plant, problem)
     return Certificate(
         L=L,
         K=K,
-        D=inflated(plant.disturbance.shape_matrix),
-        rounding=problem.rounding,
-        proofs=_proofs(problem, design, errors),
-        updates=_updates(errors),
-        between_samples=plant.between_samples,
-        method="certified",
-        fingerprint=plant.fingerprint,
-        provenance={
-            "source": "docs/shield_proof.md",
-            "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
-            "slack": slack,
-        }
-        | _description(plant, L, float(np.exp(0.5 * design.log_det)) * _share_of_ellipsoid(plant, problem)),
+        proofs=_proofs(errors, problem, design),
+        **_of_the_problem(plant, problem, errors),
+        provenance=_provenance(plant, L, volume) | {"slack": slack},
     )
+
+
+def _in_digits(L: np.ndarray) -> np.ndarray:
+    """Returns a shape, (n, n), with entries of few digits."""
+    extents = np.array([float(exact.rounded(extent, 1)) for extent in np.sqrt(np.diag(L))])
+    units = np.outer(extents, extents)
+    return np.round(L / units, _DIGITS) * units
+
+
+def _of_the_problem(plant: LinearPlant, problem: DesignProblem, errors: ErrorSet) -> dict[str, Any]:
+    """Returns the fields of a certificate that set and gain have no part in."""
+    return {
+        "D": inflated(plant.disturbance.shape_matrix),
+        "rounding": problem.rounding,
+        "updates": _updates(errors),
+        "between_samples": plant.between_samples,
+        "method": "certified",
+        "fingerprint": plant.fingerprint,
+    }
+
+
+def _provenance(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:
+    """Returns how a certificate was made, and `_description` of its ellipsoid."""
+    solver = f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}"
+    return {"source": "docs/shield_proof.md", "solver": solver} | _description(plant, L, volume)
+
+
+def _volume(plant: LinearPlant, L: np.ndarray) -> float:
+    """Returns the volume of an ellipsoid in units of the largest one in the safe box."""
+    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box_rows), L)) ** 0.5)
 
 
 def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
@@ -575,16 +678,22 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
     return description
 
 
-def _proofs(problem: DesignProblem, design: CandidateDesign, errors: ErrorSet) -> tuple[Proof, ...]:
-    """Returns a proof per error set, with the multipliers that suit it best."""
+def _proofs(
+    errors: ErrorSet, problem: DesignProblem | None = None, design: CandidateDesign | None = None
+) -> tuple[Proof, ...]:
+    """Returns a proof per error set, with the multipliers of an ellipsoid that suit it best if a design is given."""
     if errors.ages is None:
-        sets = [(errors.Sigma, errors.rate, design)]
+        sets, designs = [(errors.Sigma, errors.rate)], [design]
     else:
-        designs = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
-        sets = zip(errors.ages.shapes[:-1], errors.ages.rates.tolist(), designs, strict=True)
+        sets = list(zip(errors.ages.shapes[:-1], errors.ages.rates.tolist(), strict=True))
+        designs = [None] * len(sets)
+        if problem is not None and design is not None:
+            designs = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
     return tuple(
-        Proof(Sigma=Sigma, rate=rate, shares=_rounded_down(each.multipliers), inputs=each.inputs)
-        for Sigma, rate, each in sets
+        Proof(Sigma=Sigma, rate=rate)
+        if each is None
+        else Proof(Sigma=Sigma, rate=rate, shares=_rounded_down(each.multipliers), inputs=each.inputs)
+        for (Sigma, rate), each in zip(sets, designs, strict=True)
     )
 
 

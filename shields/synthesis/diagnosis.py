@@ -14,6 +14,7 @@ from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.max_margin_gain import max_margin_gain
+from shields.synthesis.polytope_gain import most_tolerant_gain, polytope_margin
 
 # What may be declared of the uncertainties. The largest feasible value of each is sought down to this fraction of the
 # given one, and to this ratio.
@@ -32,14 +33,28 @@ _SMALLEST_FACTOR, _FACTOR_PRECISION = 1e-6, 1.02
 _WIDENINGS, _WIDEST_PAIR = (2.0, 10.0, 100.0, 1e3, 1e4, 1e6), 100.0
 
 
-def infeasibility(problem: DesignProblem) -> Infeasible:
-    """Returns the exception that names the binding condition and the fraction of the radii that is feasible."""
-    fraction = min(_margin(problem), 1.0)
+# A gain that bears less of the radii than this is not made better: no search has doubled that.
+_HOPELESS = 0.5
+# Whether a quick search finds a safe set for a plant.
+_Certifies = Callable[[LinearPlant], bool]
+
+
+def infeasibility(problem: DesignProblem, *, polytope: bool) -> Infeasible:
+    """Returns the exception that names the binding condition and the fraction of the radii that is feasible.
+
+    Args:
+        problem: The scaled design problem.
+        polytope: Whether a polytope alone would do, too.
+    """
+    fraction = min(_margin(problem, polytope=polytope), 1.0)
     if fraction == 0.0:
         unstabilized = "(I) no gain was found that stabilizes the plant, whatever the bounds are"
         return Infeasible(unstabilized, "I", 1.0, {"share_of_radii": 0.0})
-    binding = "U" if _margin(problem, input_limits=False) >= 1.0 else "I"
-    what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
+    binding = "U" if _margin(problem, polytope=polytope, input_limits=False) >= 1.0 else "I"
+    missing = "ellipsoid or polytope" if polytope else "ellipsoid"
+    what = (
+        "(U) the input limits are too tight" if binding == "U" else f"(I) no invariant {missing} in the box was found"
+    )
     return Infeasible(
         f"{what}: a quick search finds one once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those "
         "given",
@@ -54,6 +69,8 @@ def with_feasible_bounds(
     plant: LinearPlant,
     contract: ChannelContract | None,
     progress: Callable[[str], object] = lambda line: None,
+    *,
+    polytope: bool = True,
 ) -> Infeasible:
     """Returns the exception with the largest feasible max_age, and with that of each bound that the plant declares.
 
@@ -65,14 +82,19 @@ def with_feasible_bounds(
         contract: The channel contract. An unstable plant without one, or that no gain stabilizes, and an unbounded safe
             box have no feasible bounds: the exception is then returned as it is.
         progress: Called with a line of text per figure that is sought.
+        polytope: Whether a polytope alone would do, too.
     """
+
+    def certifies(changed: LinearPlant) -> bool:
+        return is_feasible(changed, contract, polytope=polytope)
+
     without_contract = contract is None and infeasible.binding == "E1"
     if without_contract or infeasible.binding == "S" or infeasible.details.get("share_of_radii") == 0.0:
         return infeasible
     hints, useless, useless_limits, details = [], [], [], dict(infeasible.details)
     if contract is not None and contract.max_age > 0:
         progress("no certificate: searching for a max_age that has one")
-        age = _largest_age(plant, contract)
+        age = _largest_age(plant, contract, polytope)
         if age is None:
             useless.append("max_age")
         else:
@@ -81,7 +103,7 @@ def with_feasible_bounds(
     for name in _BOUNDS:
         if _is_declared(plant, name):
             progress(f"no certificate: searching for a {name} that has one")
-            factor = _largest_factor(plant, name, contract)
+            factor = _largest_factor(plant, name, certifies)
             if factor is None:
                 useless.append(name)
             else:
@@ -89,7 +111,7 @@ def with_feasible_bounds(
                 details |= _figure(plant, name, factor)
     for change in _widenings(plant):
         progress(f"no certificate: searching for {change.what} that has one")
-        factor = _smallest_factor(plant, (change,), contract)
+        factor = _smallest_factor(plant, (change,), certifies)
         if factor is None:
             useless_limits.append(change.what)
         else:
@@ -102,7 +124,7 @@ def with_feasible_bounds(
     together = ""
     if len(details) == len(infeasible.details):
         progress("no certificate: searching for two changes that have one")
-        if (pair := _smallest_pair(plant, contract)) is not None:
+        if (pair := _smallest_pair(plant, certifies)) is not None:
             (first, second), factor = pair
             together = f"; the smallest pair of changes: {first.what} and {second.what}, {factor:.3g} times each"
             details |= {"pair_factor": factor}
@@ -189,9 +211,7 @@ def _widenings(plant: LinearPlant) -> list[_Change]:
     return changes
 
 
-def _smallest_pair(
-    plant: LinearPlant, contract: ChannelContract | None
-) -> tuple[tuple[_Change, _Change], float] | None:
+def _smallest_pair(plant: LinearPlant, certifies: _Certifies) -> tuple[tuple[_Change, _Change], float] | None:
     """Returns the two changes that certify together with the smallest factor, the same for both; None for none."""
 
     def smaller(name: str) -> Callable[[LinearPlant, float], LinearPlant]:
@@ -201,31 +221,31 @@ def _smallest_pair(
     changes = [*shrinkings, *(each for each in _widenings(plant) if not each.name.startswith("box_row"))]
     best: tuple[tuple[_Change, _Change], float] | None = None
     for pair in combinations(changes, 2):
-        factor = _smallest_factor(plant, pair, contract, _WIDEST_PAIR if best is None else best[1] / _FACTOR_PRECISION)
+        factor = _smallest_factor(plant, pair, certifies, _WIDEST_PAIR if best is None else best[1] / _FACTOR_PRECISION)
         if factor is not None:
             best = pair, factor
     return best
 
 
 def _smallest_factor(
-    plant: LinearPlant, changes: Sequence[_Change], contract: ChannelContract | None, widest: float = _WIDENINGS[-1]
+    plant: LinearPlant, changes: Sequence[_Change], certifies: _Certifies, widest: float = _WIDENINGS[-1]
 ) -> float | None:
     """Returns nearly the smallest factor, at most `widest`, with which all changes together certify; None for none."""
 
-    def certifies(factor: float) -> bool:
+    def is_enough(factor: float) -> bool:
         changed = plant
         for change in changes:
             changed = change.of(changed, factor)
-        return is_feasible(changed, contract)
+        return certifies(changed)
 
     tried = [1.0, *(factor for factor in _WIDENINGS if factor < widest), widest]
-    works = next((k for k, factor in enumerate(tried) if k and certifies(factor)), None)
+    works = next((k for k, factor in enumerate(tried) if k and is_enough(factor)), None)
     if works is None:
         return None
     low, high = tried[works - 1], tried[works]
     while high > _FACTOR_PRECISION * low:
         middle = (low * high) ** 0.5
-        low, high = (low, middle) if certifies(middle) else (middle, high)
+        low, high = (low, middle) if is_enough(middle) else (middle, high)
     return high
 
 
@@ -239,36 +259,55 @@ def _with_scaled(plant: LinearPlant, name: str, factor: float) -> LinearPlant:
     return replace(plant, **{name: scaled})
 
 
-def is_feasible(plant: LinearPlant, contract: ChannelContract | None) -> bool:
-    """Returns whether a gain is found that tolerates the plant's radii."""
+def is_feasible(plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool) -> bool:
+    """Returns whether a gain is found that bears the plant's radii.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract, if there is one.
+        polytope: Whether it is enough that it keeps a polytope.
+    """
     try:
         problem, _ = design_problem(plant, contract)
     except Infeasible:
         return False
-    return _margin(problem) >= SUFFICIENT_MARGIN
+    return _margin(problem, polytope=polytope, enough=SUFFICIENT_MARGIN) >= SUFFICIENT_MARGIN
 
 
-def _largest_age(plant: LinearPlant, contract: ChannelContract) -> int | None:
+def _largest_age(plant: LinearPlant, contract: ChannelContract, polytope: bool) -> int | None:
     """Returns the largest feasible max_age below the contract's; None if there is none."""
     low, high = -1, contract.max_age
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if is_feasible(plant, replace(contract, max_age=middle)) else (low, middle)
+        certifies = is_feasible(plant, replace(contract, max_age=middle), polytope=polytope)
+        low, high = (middle, high) if certifies else (low, middle)
     return low if low >= 0 else None
 
 
-def _largest_factor(plant: LinearPlant, name: str, contract: ChannelContract | None) -> float | None:
+def _largest_factor(plant: LinearPlant, name: str, certifies: _Certifies) -> float | None:
     """Returns nearly the largest feasible fraction of a bound; None if there is none above a millionth."""
     low, high = _SMALLEST_FACTOR, 1.0
-    if not is_feasible(_with_scaled(plant, name, low), contract):
+    if not certifies(_with_scaled(plant, name, low)):
         return None
     while high > _FACTOR_PRECISION * low:
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if is_feasible(_with_scaled(plant, name, middle), contract) else (low, middle)
+        low, high = (middle, high) if certifies(_with_scaled(plant, name, middle)) else (low, middle)
     return low
 
 
-def _margin(problem: DesignProblem, *, input_limits: bool = True) -> float:
-    """Returns the factor on all radii that the max-margin gain tolerates; 0 if no gain stabilizes."""
+def _margin(problem: DesignProblem, *, polytope: bool, input_limits: bool = True, enough: float = np.inf) -> float:
+    """Returns the factor on all radii that the best gain bears; 0 if no gain stabilizes.
+
+    Args:
+        problem: The scaled design problem.
+        polytope: Whether it is enough that it keeps a polytope; no better gain is sought for that without input limits.
+        input_limits: False leaves the input limits out.
+        enough: A factor beyond which no larger one is sought.
+    """
     gain = max_margin_gain(problem, problem.covering_error_shape, input_limits=input_limits)
-    return 0.0 if gain is None else gain.margin
+    if gain is None or not polytope or gain.margin >= enough:
+        return 0.0 if gain is None else gain.margin
+    at_hand = max(gain.margin, polytope_margin(problem, gain.K, input_limits=input_limits))
+    if not input_limits or at_hand < _HOPELESS:
+        return at_hand
+    return max(at_hand, most_tolerant_gain(problem, gain, enough).margin)

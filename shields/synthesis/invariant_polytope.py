@@ -41,18 +41,37 @@ _POINTS_LOG2 = 16
 _MOST_STEPS = 3000
 
 
-def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
-    """Returns the largest polytope that the gain of a certificate keeps invariant, not yet verified.
+class Feedback(NamedTuple):
+    """The fallback u = K x_hat with what disturbs it.
+
+    Attributes:
+        K: The gain, shape (m, n).
+        errors: Shapes of the sets of the estimation error, (l, n, n).
+        D: Shape of the disturbance set, (n, n).
+    """
+
+    K: np.ndarray
+    errors: np.ndarray
+    D: np.ndarray
+
+
+def feedback_of(certificate: Certificate) -> Feedback:
+    """Returns the fallback of a certificate of method "certified"."""
+    return Feedback(certificate.K, certificate.error_shapes, certificate.disturbances()[0])
+
+
+def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
+    """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
     Args:
-        certificate: Of method "certified"; gives the gain, the error sets and D.
+        feedback: The fallback.
         plant: Its plant.
         progress: Called with a line of text now and then.
 
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
-    step = _ClosedLoop(certificate, plant)
+    step = _ClosedLoop(feedback, plant)
     return _rounded(step, invariant_rows(step.first_rows(), step.predecessor, len(plant.box_rows), progress))
 
 
@@ -118,18 +137,18 @@ def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
     return points / np.abs(rows).sum(axis=0)
 
 
-def share_of_points(certificate: Certificate, plant: LinearPlant, points: np.ndarray) -> float:
-    """Returns what share of points of the safe box a certificate's gain keeps in it for ever, by its error sets.
+def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) -> float:
+    """Returns what share of points of the safe box a fallback keeps in it for ever.
 
     They are those of the polytope of `invariant_polytope`, found without linear programs, and without the limit of
     rows. 0.0 where there is no such polytope, or `_MOST_STEPS` steps do not tell.
 
     Args:
-        certificate: Of method "certified"; gives the gain, the error sets and D.
+        feedback: The fallback.
         plant: Its plant.
         points: Of the box, shape (count, n).
     """
-    step, total = _ClosedLoop(certificate, plant), len(points)
+    step, total = _ClosedLoop(feedback, plant), len(points)
     if np.abs(np.linalg.eigvals(step.next)).max() >= 1.0:
         return 0.0
     try:
@@ -157,18 +176,11 @@ class ClosedLoopGrid(NamedTuple):
     left: np.ndarray
 
 
-def grid_in_closed_loop(plant: LinearPlant, K: np.ndarray, errors: np.ndarray, D: np.ndarray) -> ClosedLoopGrid:
-    """Returns the rows of docs/shield_proof.md, "Between the samples"; none for a plant without a grid.
-
-    Args:
-        plant: The plant.
-        K: The gain, shape (m, n).
-        errors: Shapes of the error sets, (l, n, n).
-        D: Shape of the disturbance set, (n, n).
-    """
+def grid_in_closed_loop(feedback: Feedback, plant: LinearPlant) -> ClosedLoopGrid:
+    """Returns the rows of docs/shield_proof.md, "Between the samples"; none for a plant without a grid."""
     if plant.grid_rows is None:
         return ClosedLoopGrid(np.empty((0, plant.n)), np.empty(0))
-    state, pushed, remainder = plant.grid_rows
+    (K, errors, D), (state, pushed, remainder) = feedback, plant.grid_rows
     answer = pushed @ K
     reach = np.sqrt(np.einsum("...i,lij,...j->l...", answer, errors, answer).max(axis=0))
     rho = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, D, plant.box_rows))
@@ -179,12 +191,11 @@ def grid_in_closed_loop(plant: LinearPlant, K: np.ndarray, errors: np.ndarray, D
 class _ClosedLoop:
     """What one step makes of rows, in units of the safe box."""
 
-    def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
-        self._plant, self._K = plant, certificate.K
+    def __init__(self, feedback: Feedback, plant: LinearPlant) -> None:
+        self._plant, self._feedback = plant, feedback
+        self._K, self._errors, self._D = feedback
         self.widths = plant.half_widths
-        self.next = plant.A + plant.B @ certificate.K
-        self._D = certificate.disturbances()[0]
-        self._errors = certificate.error_shapes
+        self.next = plant.A + plant.B @ self._K
 
     def first_rows(self) -> np.ndarray:
         """Returns the rows of the box and of the input limits, in units of the box.
@@ -202,7 +213,7 @@ class _ClosedLoop:
 
     def _on_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns what u = K x_hat makes of x at the times of the grid, rows (g, n), and what |row x| may be, (g,)."""
-        grid = grid_in_closed_loop(self._plant, self._K, self._errors, self._D)
+        grid = grid_in_closed_loop(self._feedback, self._plant)
         return grid.images, grid.left - _RESERVE
 
     def predecessor(self, rows: np.ndarray) -> np.ndarray:

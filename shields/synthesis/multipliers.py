@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import fminbound, minimize
+from scipy.optimize import minimize
 
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 
@@ -69,38 +69,6 @@ def best_input_multipliers(error_shapes: np.ndarray, L: np.ndarray, K: np.ndarra
     by_state = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
     by_error = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)
     return np.clip(np.round(by_state / np.maximum(by_state + by_error, 1e-300), 6), 1e-6, 1.0 - 1e-6)
-
-
-def smallest_invariant_shape(problem: DesignProblem, K: np.ndarray) -> np.ndarray | None:
-    """Returns L, scaled, shape (n, n), of an ellipsoid with (I) and (S) for a given gain; None if none is found.
-
-    For multipliers lx, le, ld the smallest L with (I) solves a Lyapunov equation. le and ld share what lx leaves such
-    that errors and disturbances add the least trace; lx is sought for which L reaches least far out of the box.
-
-    Args:
-        problem: The scaled design problem.
-        K: Gain, scaled, shape (m, n).
-    """
-    from scipy.linalg import solve_discrete_lyapunov  # takes long to import
-
-    closed_loop, answer = problem.A + problem.B @ K, problem.B @ K
-    moved = answer @ problem.covering_error_shape @ answer.T
-    by_errors, by_disturbance = np.sqrt(np.trace(moved)), np.sqrt(np.trace(problem.D_u))
-    added = (by_errors + by_disturbance) * (moved / max(by_errors, 1e-300) + problem.D_u / by_disturbance)
-    rate = float(np.abs(np.linalg.eigvals(closed_loop)).max()) ** 2
-
-    def shape(lx: float) -> np.ndarray:
-        return solve_discrete_lyapunov(closed_loop / np.sqrt(lx), added / (1.0 - lx))
-
-    def reach(lx: float) -> float:
-        return float(((problem.C @ shape(lx)) * problem.C).sum(axis=1).max())
-
-    if rate >= 1.0:
-        return None
-    lx = float(fminbound(reach, rate + 1e-3 * (1.0 - rate), 1.0 - 1e-6))  # pyright: ignore[reportArgumentType]
-    # Room for rounding, as far as the box has it.
-    L = shape(lx) * min(1.1, 1.0 / max(reach(lx), 1e-300))
-    return L if reach(lx) < 1.0 else None
 
 
 def with_best_multipliers(problem: DesignProblem, design: CandidateDesign, error_shapes: np.ndarray) -> CandidateDesign:

@@ -1,17 +1,18 @@
-"""Gains whose polytope fills more of the safe box than that of the largest ellipsoid's gain."""
+"""Gains for polytopes: those that fill more of the safe box than others, and the one that tolerates most."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
-from ncs_gym import LinearPlant
+from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.lqr import lqr_gain
-from shields.certificate import Certificate
-from shields.synthesis.invariant_polytope import points_of_box, share_of_points
+from shields.synthesis.design_problem import DesignProblem
+from shields.synthesis.invariant_polytope import Feedback, points_of_box, share_of_points
+from shields.synthesis.max_margin_gain import MaxMarginGain
 
 # Weights of the inputs, in units of their limits, against those of the states, in units of the box, in the
 # linear-quadratic regulators that the search begins with.
@@ -21,24 +22,25 @@ _INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _CHANGES, _TRIES_PER_ENTRY = (0.15, 0.08), 25
 # It counts so many points of the box.
 _POINTS_LOG2 = 13
+# Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
+# over no more steps than the second number.
+_LEFT_OVER, _MOST_STEPS = 1e-9, 4000
+# Digits of a tolerated factor: a search takes the same steps on every processor.
+_DIGITS = 9
 
 
 def gains_of_larger_polytopes(
-    certificate: Certificate,
-    plant: LinearPlant,
-    is_provable: Callable[[np.ndarray], bool],
-    progress: Callable[[str], object],
+    feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]
 ) -> Iterator[np.ndarray]:
-    """Yields gains, shape (m, n), that keep more of the safe box than a certificate's, those that keep most first.
+    """Yields gains, shape (m, n), that keep more of the safe box than a fallback's, those that keep most first.
 
-    The search begins with regulators and the certificate's own gain, and goes on from the best of them: Nelder and
-    Mead's simplex search for the entries whose polytope fills the largest share of the box. Nothing is yielded where
-    that share is unknown (`points_of_box`).
+    The search begins with regulators and the fallback's own gain, and goes on from the best of them: Nelder and Mead's
+    simplex search for the entries whose polytope fills the largest share of the box. Nothing is yielded where that
+    share is unknown (`points_of_box`).
 
     Args:
-        certificate: Of method "certified", for the gain, the error sets and D.
-        plant: Its plant.
-        is_provable: Whether an ellipsoid is known that proves a gain; others are not taken.
+        feedback: The gain, the error sets and D.
+        plant: The plant.
         progress: Called with a line of text now and then.
     """
     points = points_of_box(plant, _POINTS_LOG2)
@@ -47,13 +49,11 @@ def gains_of_larger_polytopes(
 
     def lost(entries: np.ndarray) -> float:
         """Returns the share of the box that a gain, its entries in one row, does not keep."""
-        K = entries.reshape(plant.m, plant.n)
-        kept = share_of_points(replace(certificate, K=K, polytope=None), plant, points)
-        return 1.0 - kept if kept > 0.0 and is_provable(K) else 1.0
+        return 1.0 - share_of_points(feedback._replace(K=entries.reshape(plant.m, plant.n)), plant, points)
 
     efforts = (effort * np.diag(plant.u_max**-2.0) for effort in _INPUT_WEIGHTS)
     regulators = (lqr_gain(plant.A, plant.B, plant.weight, effort) for effort in efforts)
-    gains = [K.ravel() for K in (certificate.K, *regulators) if K is not None]
+    gains = [K.ravel() for K in (feedback.K, *regulators) if K is not None]
     losses = [lost(entries) for entries in gains]
     best = gains[int(np.argmin(losses))]
     units = np.diag((plant.u_max[:, None] / plant.half_widths).ravel())
@@ -68,3 +68,69 @@ def gains_of_larger_polytopes(
     for k in np.argsort(losses, kind="stable"):
         if losses[k] < losses[0]:
             yield gains[k].reshape(plant.m, plant.n)
+
+
+class TolerantGain(NamedTuple):
+    """A gain with the factor that all radii may grow by until it keeps no polytope in the box.
+
+    Attributes:
+        K: The gain in scaled coordinates, shape (m, n).
+        margin: The factor, as far as floats tell.
+    """
+
+    K: np.ndarray
+    margin: float
+
+
+def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: float = np.inf) -> TolerantGain:
+    """Returns the gain that keeps a polytope for the largest radii: Nelder and Mead's search from the ellipsoid's.
+
+    Args:
+        problem: The scaled design problem.
+        start: The gain that keeps an ellipsoid for the largest radii.
+        enough: The search ends once the radii may grow by this factor.
+    """
+
+    def loss(entries: np.ndarray) -> float:
+        return -polytope_margin(problem, entries.reshape(start.K.shape))
+
+    def stop(intermediate_result: OptimizeResult) -> None:
+        if -intermediate_result.fun >= enough:
+            raise StopIteration
+
+    options = {"maxfev": _TRIES_PER_ENTRY * start.K.size}
+    found = minimize(loss, start.K.ravel(), method="Nelder-Mead", callback=stop, options=options)
+    return TolerantGain(found.x.reshape(start.K.shape), -found.fun)
+
+
+def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool = True) -> float:
+    """Returns the factor that all radii may grow by until a gain keeps no polytope in the box; 0.0 if it keeps none.
+
+    From x = 0 errors and disturbances take c x at most as far as the sum of their supports, step by step, by what the
+    closed loop makes of the row c. Where that stays below 1 for the box and the input limits, the states that stay in
+    them for ever are a set around 0 (Kolmanovsky and Gilbert 1998, docs/bibliography.md).
+
+    Args:
+        problem: The scaled design problem.
+        K: The gain, scaled, shape (m, n).
+        input_limits: False leaves the input limits out.
+    """
+    closed_loop = problem.A + problem.B @ K
+    radius = float(np.abs(np.linalg.eigvals(closed_loop)).max()) if np.isfinite(closed_loop).all() else np.inf
+    steps = np.inf if radius >= 1.0 else np.log(_LEFT_OVER) / np.log(max(radius, 1e-3))
+    if steps > _MOST_STEPS:
+        return 0.0
+    powers = np.eye(problem.n)[None]
+    while len(powers) < steps + problem.n:
+        powers = np.concatenate([powers, powers @ (powers[-1] @ closed_loop)])
+    inputs = K if input_limits else K[:0]
+    rows = np.concatenate([problem.C, inputs]) @ powers  # (steps, rows, n)
+    used = (_reach(rows @ (problem.B @ K), problem.error_shapes) + _reach(rows, problem.D_u[None])).sum(axis=0)
+    used[len(problem.C) :] += _reach(inputs, problem.error_shapes)
+    return float(exact.rounded(1.0 / max(float(used.max()), 1e-300), _DIGITS))
+
+
+def _reach(rows: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Returns the largest support over ellipsoids, shape (l, n, n), of rows, shape (..., n)."""
+    squares = [((rows @ shape) * rows).sum(axis=-1) for shape in shapes]
+    return np.sqrt(np.maximum(np.max(squares, axis=0), 0.0))

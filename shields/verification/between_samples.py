@@ -77,9 +77,9 @@ def _closed_loop_conditions(
             image = add(rational(rows.state[i, j]), multiply(pushed, K))[0]
             left = allowed - root_above(max(quadratic(pushed, error) for error in errors))
             left -= ACTION_ROUNDING * weighted_size(pushed[0], limits)
-            yield scalar_condition(
-                f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", left - root_above(quadratic([image], L))
-            )
+            if certificate.keeps_ellipsoid:
+                on_ellipsoid = left - root_above(quadratic([image], L))
+                yield scalar_condition(f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", on_ellipsoid)
             if polytope is not None and G is not None:
                 multipliers = polytope.multipliers[len(G) + plant.m + i * k + j]
                 left -= reach(image, multipliers, G, widths)

@@ -30,7 +30,7 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
     """Returns all conditions; only those of shapes or multipliers where these are wrong: others prove nothing then."""
     updates = certificate.updates
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
-    fits = fits and all(len(proof.inputs) == plant.m for proof in certificate.proofs)
+    fits = fits and all(proof.inputs is None or len(proof.inputs) == plant.m for proof in certificate.proofs)
     fits = fits and (updates is None or updates.gains.shape[1:] == (plant.n, plant.p))
     conditions = [flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits)]
     if not fits:
@@ -49,19 +49,21 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
 
 def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
     proofs, (_, rounding) = certificate.proofs, certificate.disturbances()
-    fractions = [each for proof in proofs for each in (proof.rate, *proof.inputs)]
+    fractions = [proof.rate for proof in proofs]
+    fractions += [mu for proof in proofs if proof.inputs is not None for mu in proof.inputs.tolist()]
     if certificate.updates is not None:
         fractions += certificate.updates.shares.tolist()
-    finite = bool(np.isfinite([*fractions, rounding]).all() and np.isfinite([proof.shares for proof in proofs]).all())
+    triples = [proof.shares.tolist() for proof in proofs if proof.shares is not None]
+    finite = bool(np.isfinite([*fractions, rounding]).all() and np.isfinite(triples).all())
     yield flag("multipliers: finite", finite)
     if not finite:
         return
     inside = all(0.0 < multiplier < 1.0 for multiplier in fractions)
     yield flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
-    exact = [[Fraction(share) for share in proof.shares.tolist()] for proof in proofs]
-    positive = min(*(min(shares) for shares in exact), Fraction(rounding)) > 0
+    exact = [[Fraction(share) for share in shares] for shares in triples]
+    positive = min([Fraction(rounding), *(min(shares) for shares in exact)]) > 0
     yield flag("multipliers: lx, le, ld, s > 0", positive)
-    smallest_margin = min(1 - sum(shares, Fraction(0)) for shares in exact)
+    smallest_margin = min((1 - sum(shares, Fraction(0)) for shares in exact), default=Fraction(0))
     yield scalar_condition("multipliers: lx + le + ld <= 1", smallest_margin)
 
 
@@ -140,9 +142,16 @@ def _update_conditions(
 
 
 def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (I), (S), (U): the safe set is invariant and in the box, and the fallback respects the input limits."""
+    """Checks (I), (S), (U): the ellipsoid is invariant and in the box, and the fallback respects the input limits.
+
+    Where the polytope alone is claimed to be invariant, only that the ellipsoid lies in it.
+    """
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
+    if not certificate.keeps_ellipsoid and certificate.polytope is not None:
+        for i, row in enumerate(certificate.polytope.rows):
+            yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", 1 - quadratic(rational(row), L))
+        return
     BK, (D, s) = multiply(B, K), certificate.disturbances()
     D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))
     closed_loop = congruence(add(rational(plant.A), BK), L)
@@ -150,6 +159,8 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
         yield scalar_condition(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for age, proof in enumerate(certificate.proofs):
         label = "" if certificate.updates is None else f" at age {age}"
+        assert proof.shares is not None  # `keeps_ellipsoid`
+        assert proof.inputs is not None
         Sigma, (lx, le, ld) = rational(proof.Sigma), map(Fraction, proof.shares.tolist())
         successors = add(scale(1 / lx, closed_loop), scale(1 / le, congruence(BK, Sigma)), scale(1 / ld, D_u))
         name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{label}"

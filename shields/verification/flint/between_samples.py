@@ -101,7 +101,9 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[
             left = arb(rest) - arb(form(matrix(plant.box_rows[j]), D)).sqrt()
             left -= arb(max(form(push, error) for error in errors)).sqrt()
             where = f"tau_{i} of row {j + 1}"
-            yield ball_at_least_zero(f"(B) |c x| + rho <= 1 - eta on S at {where}", left - arb(form(image, L)).sqrt())
+            if certificate.keeps_ellipsoid:
+                name = f"(B) |c x| + rho <= 1 - eta on S at {where}"
+                yield ball_at_least_zero(name, left - arb(form(image, L)).sqrt())
             if polytope is not None and G is not None:
                 given = polytope.multipliers[len(polytope.rows) + plant.m + i * k + j]
                 used = [(int(index), number(given[index])) for index in np.flatnonzero(given)]

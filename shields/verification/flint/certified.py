@@ -52,7 +52,9 @@ def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
     n, m, p, updates = plant.n, plant.m, plant.p, certificate.updates
     shapes = [(certificate.L, (n, n)), (certificate.K, (m, n)), (certificate.disturbances()[0], (n, n))]
     for proof in certificate.proofs:
-        shapes += [(proof.Sigma, (n, n)), (proof.shares, (3,)), (proof.inputs, (m,))]
+        shapes.append((proof.Sigma, (n, n)))
+        if proof.shares is not None and proof.inputs is not None:
+            shapes += [(proof.shares, (3,)), (proof.inputs, (m,))]
     if updates is None:
         count = 1
     else:
@@ -65,15 +67,16 @@ def _range_conditions(certificate: Certificate) -> Iterator[Condition]:
     """Checks that every multiplier lies where the inequality that uses it is true."""
     s = certificate.disturbances()[1]
     between = [] if certificate.updates is None else certificate.updates.shares.tolist()
-    between += chain.from_iterable([proof.rate, *proof.inputs.tolist()] for proof in certificate.proofs)
-    triples = [proof.shares.tolist() for proof in certificate.proofs]
+    between += [proof.rate for proof in certificate.proofs]
+    between += chain.from_iterable(proof.inputs.tolist() for proof in certificate.proofs if proof.inputs is not None)
+    triples = [proof.shares.tolist() for proof in certificate.proofs if proof.shares is not None]
     finite = all(math.isfinite(value) for value in chain(between, *triples, [s]))
     yield is_so("multipliers: finite", finite)
     if not finite:
         return
     yield is_so("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", all(0 < number(value) < 1 for value in between))
     yield is_so("multipliers: lx, le, ld, s > 0", all(number(value) > 0 for value in chain(*triples, [s])))
-    least = min(1 - sum(map(number, triple), fmpq(0)) for triple in triples)
+    least = min((1 - sum(map(number, triple), fmpq(0)) for triple in triples), default=fmpq(0))
     yield at_least_zero("multipliers: lx + le + ld <= 1", least)
 
 
@@ -106,10 +109,14 @@ def _error_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -> I
 
 
 def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (S), and (I) and (U) for every error set."""
+    """Checks (S), and (I) and (U) for every error set; of an ellipsoid that is merely in the polytope only that."""
     L, B = matrix(certificate.L), matrix(plant.B)
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
+    if certificate.polytope is not None and not certificate.keeps_ellipsoid:
+        for i, row in enumerate(certificate.polytope.rows):
+            yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", 1 - form(matrix(row), L))
+        return
     for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
     BK, s = B * matrix(certificate.K), number(certificate.disturbances()[1])
@@ -121,6 +128,8 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
         rounding += plant.m * (FLOAT32 * number(limit)) ** 2 * (column.transpose() * column)
     D_u = (1 + s) * (s * D + rounding)
     for age, proof in enumerate(certificate.proofs):
+        assert proof.shares is not None  # `keeps_ellipsoid`
+        assert proof.inputs is not None
         label = "" if certificate.updates is None else f" at age {age}"
         Sigma, (lx, le, ld) = matrix(proof.Sigma), map(number, proof.shares)
         unit = lx * le * ld * s

@@ -86,8 +86,9 @@ def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
     wide, certificate, plant = found(name)
     points = search.points_of_box(plant, 12)
     inside = wide.polytope.gauge(points) <= 1.0
-    assert search.share_of_points(certificate, plant, points) == pytest.approx(inside.mean(), abs=2.0 / len(points))
-    unstable = replace(certificate, K=-1e3 * certificate.K)
+    feedback = search.feedback_of(certificate)
+    assert search.share_of_points(feedback, plant, points) == pytest.approx(inside.mean(), abs=2.0 / len(points))
+    unstable = feedback._replace(K=-1e3 * certificate.K)
     assert search.share_of_points(unstable, plant, points) == 0.0
 
 
@@ -125,7 +126,7 @@ def test_search_for_a_gain_that_fails_keeps_the_polytope_of_the_first_gain(monke
     def failing(*_, **__):
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(certification, "smallest_invariant_shape", failing)
+    monkeypatch.setattr(certification, "certify_polytope", failing)
     assert with_largest_polytope(certificate, plant) == wide
     with pytest.raises(ValueError, match="search_gain"):
         synthesize(plant, search_gain="no")
@@ -271,7 +272,7 @@ def test_units_of_inputs_do_not_matter():
     certificate = synthesize(plant)
     tiny = replace(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
     K = certificate.K * 1e-39
-    found_there = search.invariant_polytope(replace(certificate, K=K), tiny, lambda line: None)
+    found_there = search.invariant_polytope(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
     broken = [
         [c.name for c in verify(replace(certificate, K=K, polytope=found_there), tiny, engine=engine).conditions
          if not c.holds and c.name.startswith("(P")]
@@ -400,7 +401,7 @@ def test_errors_that_leave_a_face_alone_leave_no_polytope():
     certificate = synthesize(plant)
     wide = replace(certificate, proofs=(replace(certificate.proofs[0], Sigma=1e4 * certificate.Sigma),))
     with pytest.raises(Infeasible):
-        search.invariant_polytope(wide, plant, lambda line: None)
+        search.invariant_polytope(search.feedback_of(wide), plant, lambda line: None)
 
 
 def test_interrupted_search_keeps_the_ellipsoid():

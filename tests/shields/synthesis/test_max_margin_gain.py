@@ -32,7 +32,8 @@ def test_derivatives_are_those_of_finite_differences(name, input_limits):
 
 def feasible_bounds_not_sought():
     """Where nothing is asked of the message: that search takes longer than the synthesis."""
-    return mock.patch("shields.synthesis.certification.with_feasible_bounds", lambda infeasible, *others: infeasible)
+    unchanged = mock.Mock(side_effect=lambda infeasible, *others, **more: infeasible)
+    return mock.patch("shields.synthesis.certification.with_feasible_bounds", unchanged)
 
 
 def radii_scaled(plant, factor):
@@ -49,7 +50,7 @@ def test_its_margin_is_what_exact_verification_accepts(name):
     tolerated = radii_scaled(plant, 0.99 * margin)
     assert verified(synthesize(tolerated, contract=contract), tolerated).valid
     with feasible_bounds_not_sought(), pytest.raises(Infeasible, match="radii shrink to") as caught:
-        synthesize(radii_scaled(plant, 2.0 * margin), contract=contract)
+        synthesize(radii_scaled(plant, 2.0 * margin), contract=contract, safe_set="ellipsoid")
     assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
 
 
@@ -99,15 +100,18 @@ def test_largest_gamma_and_age_are_what_synthesis_accepts():
     bounds = {"gamma": 1e-2, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
     plant = LinearPlant(**PENDULUM | bounds)
     with pytest.raises(Infeasible, match=r"gamma = .* is the largest that works") as caught:
-        synthesize(plant, contract=ChannelContract(4, 1e-4))
+        synthesize(plant, contract=ChannelContract(4, 1e-4), safe_set="ellipsoid")
     gamma = caught.value.details["largest_gamma"]
     assert 0.0 < gamma < 1e-2
-    assert synthesize(replace(plant, gamma=0.98 * gamma), contract=ChannelContract(4, 1e-4)) is not None
+    smaller = replace(plant, gamma=0.98 * gamma)
+    assert synthesize(smaller, contract=ChannelContract(4, 1e-4), safe_set="ellipsoid").keeps_ellipsoid
+    larger = replace(plant, gamma=1.05 * gamma)
     with feasible_bounds_not_sought(), pytest.raises(Infeasible):
-        synthesize(replace(plant, gamma=1.05 * gamma), contract=ChannelContract(4, 1e-4))
+        synthesize(larger, contract=ChannelContract(4, 1e-4), safe_set="ellipsoid")
+    assert not synthesize(larger, contract=ChannelContract(4, 1e-4)).keeps_ellipsoid
     plant = replace(plant, gamma=1e-7)
     with pytest.raises(Infeasible, match=r"max_age = .* is the largest that works") as caught:
-        synthesize(plant, contract=ChannelContract(40, 1e-3))
+        synthesize(plant, contract=ChannelContract(40, 1e-3), safe_set="ellipsoid")
     age = caught.value.details["max_age"]
     problem, _ = design_problem(plant, ChannelContract(age, 1e-3))
     assert max_margin_gain(problem, problem.covering_error_shape).margin >= 1.0
@@ -115,6 +119,7 @@ def test_largest_gamma_and_age_are_what_synthesis_accepts():
     assert max_margin_gain(problem, problem.covering_error_shape).margin < 1.0 + 1e-4
 
 
+@pytest.mark.parametrize("safe_set", ["ellipsoid", "polytope"])
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -124,10 +129,10 @@ def test_largest_gamma_and_age_are_what_synthesis_accepts():
         ("process_noise_cov", 1e-3 * np.eye(2)),
     ],
 )
-def test_message_names_what_was_declared_and_the_largest_factor_that_works(name, value):
+def test_message_names_what_was_declared_and_the_largest_factor_that_works(name, value, safe_set):
     plant = LinearPlant(**PENDULUM | SMALL | {name: value})
     with pytest.raises(Infeasible, match=rf"{name} is the largest that works") as caught:
-        synthesize(plant, contract=ChannelContract(0))
+        synthesize(plant, contract=ChannelContract(0), safe_set=safe_set)
     assert "gamma" not in str(caught.value)
     assert all(declared in str(caught.value) for declared in SMALL)
     factor = caught.value.details[f"{name}_factor"]
@@ -139,9 +144,9 @@ def test_message_names_what_was_declared_and_the_largest_factor_that_works(name,
             plant, **{name: Ellipsoid(by**2 * size.shape_matrix) if isinstance(size, Ellipsoid) else by * size}
         )
 
-    assert synthesize(scaled(0.98 * factor), contract=ChannelContract(0)) is not None
+    assert synthesize(scaled(0.98 * factor), contract=ChannelContract(0), safe_set=safe_set) is not None
     with feasible_bounds_not_sought(), pytest.raises(Infeasible):
-        synthesize(scaled(1.05 * factor), contract=ChannelContract(0))
+        synthesize(scaled(1.05 * factor), contract=ChannelContract(0), safe_set=safe_set)
 
 
 def test_bounds_of_a_stable_plant_are_named_without_a_contract_too():

@@ -198,7 +198,7 @@ def test_infeasible_names_a_pair_where_no_change_alone_is_enough(monkeypatch):
 
     plant = servo()
 
-    def certifies(changed, contract):
+    def certifies(changed, contract, *, polytope):
         """Feasible once the input limit and the box are both at least three times as wide."""
         return bool(changed.u_max[0] >= 3.0 * plant.u_max[0] and changed.half_widths[1] >= 3.0 * plant.half_widths[1])
 

@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, LinearPlant, certified_error_set, exact, truck_trailer
-from shields import Infeasible, SafetyShield, synthesize
+from ncs_gym import Channel, ChannelContract, LinearPlant, certified_error_set, exact, stirred_tank, truck_trailer
+from shields import Infeasible, SafetyShield, synthesize, verify
 from shields.synthesis.alternating_optimization import largest_set
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.round_numbers import in_round_numbers
@@ -221,11 +221,15 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
     # Feasible bounds are sought at length, without this solver.
-    monkeypatch.setattr("shields.synthesis.certification.with_feasible_bounds", lambda infeasible, *others: infeasible)
+    monkeypatch.setattr(
+        "shields.synthesis.certification.with_feasible_bounds", lambda infeasible, *others, **more: infeasible
+    )
     with pytest.raises(Infeasible):
-        synthesize(plant)
+        synthesize(plant, safe_set="ellipsoid")
     with pytest.raises(Infeasible):
-        SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant))
+        SafetyShield(gym.make("ncs_gym/CSTR-v0", plant=stirred_tank(u_max=19.0), channel=Channel()))
+    # A polytope of no other rows than the box's needs no such program.
+    assert verify(synthesize(plant), plant).valid
     with pytest.raises(Infeasible, match="largest ellipsoid"):
         synthesize(truck_trailer(box=np.array([[0.5, 0.0], [0.0, 0.5], [0.4, 0.4]])))
 
