@@ -420,8 +420,9 @@ def _largest_certificate(
             progress("no ellipsoid: seeking the gain whose polytope bears most")
             if (certificate := _polytope_alone(plant, contract, progress)) is not None:
                 return certificate
-            if was_sought:
-                infeasible = infeasibility(design_problem(plant, contract)[0], polytope=True)
+            sought = infeasibility(design_problem(plant, contract)[0], polytope=True) if was_sought else infeasible
+            polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
+            infeasible = sought if polytope else infeasible
         if was_sought or infeasible.binding == "E1":
             raise _with_hints(infeasible, plant, contract, progress, polytope) from infeasible
         raise
