@@ -28,7 +28,7 @@ class SynthesizeSettings:
             keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
             an ellipsoid.
         search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
-            takes about as long again, longer for polytopes of many rows.
+            takes about as long again, longer for polytopes of many rows, and keeps the polytope alone.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
