@@ -201,8 +201,8 @@ def _answers(searches: Sequence[Search], settings: RequirementsSettings, store: 
         store.save(run.search, result)
         answers[run.name] = result
         largest = max((age for age, answer in result.items() if answer.certificate is not None), default=None)
-        outcome = "none found" if largest is None else f"certified up to age {largest:g}"
-        tqdm.write(f"{run.name}: {outcome}", file=sys.stderr)
+        outcome = "no certificate found" if largest is None else f"certified up to {largest:g}"
+        tqdm.write(f"{run.search.title}: {outcome}", file=sys.stderr)
 
     if missing:
         executor = executor_of(settings, len(missing), store.folder / "tensorboard")
@@ -322,13 +322,7 @@ def _index_of(found: Requirements, network: Network) -> int | None:
 
 def _boundary_text(largest: LargestAge) -> str:
     network = largest.network
-    where = f"Sampled every {network.sampling_period:g} s"
-    if network.quantization_step:
-        where += f", rounded to {network.quantization_step:g}"
-    if network.disturbance != 1.0:
-        where += f", disturbances times {network.disturbance:g}"
-    if network.noise != 1.0:
-        where += f", noise times {network.noise:g}"
+    where = network.setting.capitalize()
     if largest.certified is None:
         return f"{where}: no certificate was found for any age of the newest sample that was asked."
     if largest.certified == inf:

@@ -85,6 +85,16 @@ class Network:
         return promised and ChannelContract(promised.max_age + self.input_delay, promised.quantization_step)
 
     @property
+    def setting(self) -> str:
+        """In words what it says besides the age of samples: period, rounding, and sizes of what disturbs."""
+        words = f"sampled every {self.sampling_period:g} s"
+        if self.quantization_step:
+            words += f", rounded to {self.quantization_step:g}"
+        if self.disturbance != 1.0:
+            words += f", disturbances times {self.disturbance:g}"
+        return words if self.noise == 1.0 else f"{words}, noise times {self.noise:g}"
+
+    @property
     def age(self) -> float:
         """The largest age of the newest sample when an input takes effect [steps]; infinite without a limit."""
         return inf if self.contract is None else self.contract.max_age
@@ -257,7 +267,8 @@ class Search:
     """Certificates for some ages of one plant, each sought near that of the age before; the unit of parallel work.
 
     Attributes:
-        name: Name in messages and of its file.
+        name: Name of its file.
+        title: What it searches, for messages.
         plant: The plant, as it is sampled and disturbed.
         quantization_step: Of the contract.
         ages: Largest ages [steps], ascending; infinite for no contract.
@@ -265,6 +276,7 @@ class Search:
     """
 
     name: str
+    title: str
     plant: LinearPlant
     quantization_step: float
     ages: tuple[float, ...]
@@ -469,6 +481,7 @@ class _Ages:
         return [
             Search(
                 name=f"{self._name}-{part[0]:g}-{part[-1]:g}",
+                title=f"{self.network.setting}, ages {part[0]:g} to {part[-1]:g}",
                 plant=self.plant,
                 quantization_step=self.network.quantization_step,
                 ages=part,
@@ -486,6 +499,7 @@ class _Ages:
         assert certificate is not None
         return BoundarySearch(
             name=f"{self._name}-beyond-{low:g}",
+            title=f"{self.network.setting}, ages beyond {low:g}",
             plant=self.plant,
             quantization_step=self.network.quantization_step,
             ages=(low,) if high is None or high == inf else (low, high),
