@@ -95,7 +95,13 @@ class Factory:
         """
         return (NCSVectorEnv if self.is_vector else NCSEnv)(**self.settings(**settings))
 
-    def settings(self, *, plant: LinearPlant | str | os.PathLike[str] | None = None, **given: Any) -> dict[str, Any]:
+    def settings(
+        self,
+        *,
+        plant: LinearPlant | str | os.PathLike[str] | None = None,
+        between_samples: int | None = None,
+        **given: Any,
+    ) -> dict[str, Any]:
         """Returns the arguments of `NCSEnv`.
 
         Settings may be JSON values, so that an `EnvSpec` may: dictionaries of fields (`Channel(**channel)`), a
@@ -103,6 +109,7 @@ class Factory:
 
         Args:
             plant: The plant; None for the default one.
+            between_samples: Times per step at which the box counts (`LinearPlant`); None for the plant's own.
             given: Other arguments of `NCSEnv`; None stands for the default where there is one.
 
         Raises:
@@ -125,6 +132,8 @@ class Factory:
                     "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
                 )
             plant, own["contract"] = self.plant(), self.contract or contract_of(self.channel)
+        if between_samples is not None:
+            plant = replace(plant, between_samples=between_samples)
         own |= {"plant": plant, "disturbance": self._disturbance(plant)}
         if self.start is not None and getattr(plant, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))

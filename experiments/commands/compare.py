@@ -49,7 +49,8 @@ _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
 def compare(settings: CompareSettings) -> None:
     """Runs `ncs compare`: prints the table and writes the files."""
     settings = _with_full_names(short_version(settings, **_SMOKE))
-    loop = loop_config(settings.env, settings.channel, noise="gaussian" if settings.noise == "gaussian" else None)
+    noise = "gaussian" if settings.noise == "gaussian" else None
+    loop = loop_config(settings.env, settings.channel, noise=noise, between_samples=settings.between_samples)
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):

@@ -36,7 +36,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     agent, folder = agent_named(str(settings.model), env_id)
     if env_id is None:
         registered_env(agent.env)
-    loop = with_channel(LoopConfig(env=agent.env, kwargs={"channel": agent.channel}), settings.channel)
+    kwargs = {"channel": agent.channel, "between_samples": settings.between_samples}
+    loop = with_channel(LoopConfig(env=agent.env, kwargs=kwargs), settings.channel)
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
     require_horizon(settings, mode)

@@ -105,7 +105,7 @@ def _loop(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
     changes = {name: point[name] for name in ("loss", "delay", "quantization_step") if point[name] is not None}
     if point["burst_length"] and point["loss"]:
         changes["burst_length"] = point["burst_length"]
-    loop = loop_config(settings.env, settings.channel | changes)
+    loop = loop_config(settings.env, settings.channel | changes, between_samples=settings.between_samples)
     env, kwargs = ncs_env(loop.single()), {}
     if point["mass_factor"] is not None:
         kwargs["process"] = asdict(env.process.with_mass(point["mass_factor"]))  # pyright: ignore

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import shields
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
@@ -52,4 +54,6 @@ def _plant_and_contract(settings: SynthesizeSettings) -> tuple[LinearPlant, Chan
         plant, contract = env.plant, env.certificate_contract
     else:
         plant, contract = LinearPlant.load(settings.plant), None
+    if settings.between_samples is not None:
+        plant = replace(plant, between_samples=settings.between_samples)
     return plant, changed_contract(contract, settings.max_age, settings.quantization_step)

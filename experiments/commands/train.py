@@ -23,7 +23,7 @@ def train(settings: TrainSettings) -> None:
     """Runs `ncs train`."""
     settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
-    loop = loop_config(settings.env, settings.channel)
+    loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("train", settings.completed):

@@ -29,6 +29,8 @@ class SynthesizeSettings:
             an ellipsoid.
         search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
             takes about as long again, longer for polytopes of many rows, and keeps the polytope alone.
+        between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
+            own, mostly the sampling instants alone (docs/shield.md).
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
@@ -42,6 +44,7 @@ class SynthesizeSettings:
     method: Literal["certified", "paper"] = "certified"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     search_gain: bool = False
+    between_samples: int | None = None
     out: Path = Path("certificate.json")
     max_age: int | None = None
     quantization_step: float | None = None

@@ -88,6 +88,8 @@ class LearningSettings(BackendSettings):
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
         safe_set: What the shield keeps if its certificate is synthesized: the polytope, or the ellipsoid inside it.
+        between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
+            own, mostly the sampling instants alone (docs/shield.md).
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter and send_period [steps], quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
@@ -112,6 +114,7 @@ class LearningSettings(BackendSettings):
     violation_penalty: float = 1.0
     certificate: Path | None = None
     safe_set: Literal["polytope", "ellipsoid"] = "polytope"
+    between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
     conf_file: Path | None = None
@@ -254,6 +257,7 @@ class EvaluateSettings:
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
+        between_samples: Times per step at which the safe box counts; by default the plant's own.
         channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
         smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
@@ -266,6 +270,7 @@ class EvaluateSettings:
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
+    between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
     smoke: bool = False
     out: Path | None = None

@@ -6,6 +6,7 @@ import pytest
 
 from agents import Agent, SafetyCallback
 from experiments.errors import RunStopped
+from shields import Certificate
 from tests.command import assert_one_sentence, ncs
 
 SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
@@ -97,3 +98,17 @@ def test_damaged_history_is_one_sentence(tmp_path, without_workers, text):
 def stored(folder):
     result = json.loads((folder / "runs" / "shielded-0.json").read_text())["run"]["result"]
     return {name: value for name, value in result.items() if name != "files"}  # which have the time in them
+
+
+def test_agents_are_trained_and_evaluated_where_the_box_counts_at_all_times(tmp_path):
+    folder = tmp_path / "cruise"
+    at_all_times = ("--between-samples", "4")
+    trained = ncs("train", "--steps", "2048", "--episodes", "2", "--jobs", "1", "--out", folder, *at_all_times)
+    assert trained.returncode == 0, trained.stderr
+    certificate = Certificate.load(folder / "certificate.json")
+    assert certificate.between_samples == 4
+    model = next((folder / "models").iterdir())
+    assert ncs("evaluate", model, "--episodes", "2", *at_all_times).returncode == 0
+    assert "another plant" in ncs("evaluate", model, "--episodes", "2").stderr
+    assert ncs("synthesize", "--out", tmp_path / "c.json", *at_all_times).returncode == 0
+    assert Certificate.load(tmp_path / "c.json") == certificate

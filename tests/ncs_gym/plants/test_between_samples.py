@@ -205,3 +205,13 @@ def test_rows_of_a_grid_are_read_only():
     grid = replace(truck_trailer(), between_samples=3).grid_rows
     assert isinstance(grid, GridRows)
     assert not any(array.flags.writeable for array in grid)
+
+
+@pytest.mark.parametrize("make", [gym.make, lambda env_id, **settings: gym.make_vec(env_id, num_envs=2, **settings)])
+def test_registered_environments_count_between_samples_if_they_are_told_so(make):
+    env = make("ncs_gym/CSTR-v0", between_samples=4).unwrapped
+    own = replace(make("ncs_gym/CSTR-v0").unwrapped.plant, between_samples=4)
+    assert env.plant.fingerprint == own.fingerprint
+    assert env.contract == make("ncs_gym/CSTR-v0").unwrapped.contract
+    with pytest.raises(ValueError, match="between_samples must be"):
+        make("ncs_gym/CSTR-v0", between_samples=1)
