@@ -24,7 +24,7 @@ from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import DownlinkProtocol, downlink_protocol
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.wire import Wire
-from ncs_gym.processes.plant_simulation import PlantSimulation
+from ncs_gym.processes.plant_step import PlantSimulation
 from shields import Certificate, SafeLoop
 from shields.nodes import (
     ActuatorNode,

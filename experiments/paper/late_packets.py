@@ -16,7 +16,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation import VectorEstimator
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
-from ncs_gym.processes.plant_simulation import PlantSimulation
+from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.registration import CASE_STUDY_CHANNEL
 
 # As in Section 5.

@@ -31,7 +31,7 @@ from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.plant_simulation import PlantSimulation
+from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task

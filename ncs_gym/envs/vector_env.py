@@ -24,7 +24,7 @@ from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkSta
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.plant_simulation import PlantSimulation
+from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task

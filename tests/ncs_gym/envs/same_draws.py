@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.network.packet_loss_and_delay import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.processes.plant_simulation import PlantSimulation
+from ncs_gym.processes.plant_step import PlantSimulation
 from tests import arrays
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from ncs_gym import Channel, NCSVectorEnv, batch_reactor, cart_pole
 from ncs_gym.network.contract import contract_of
-from ncs_gym.processes.plant_simulation import BlockSampler
+from ncs_gym.processes.plant_step import BlockSampler
 from shields import VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import CHANNELS, RANDOM, TRUCKS, filter_of, harmful, largest_gauge

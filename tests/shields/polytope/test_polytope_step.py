@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid, LinearPlant
-from ncs_gym.processes.plant_simulation import BlockSampler
+from ncs_gym.processes.plant_step import BlockSampler
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from shields.runtime.projection import closest_between
 from shields.runtime.safety_filter import MARGIN

@@ -1,4 +1,4 @@
-"""The rule of mode "lookahead": what becomes of an input that fails the one-step test."""
+"""The rule of mode "lookahead": what becomes of an input that fails the test, and what is stored of its backup plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What really moves, with the noise, the disturbances and the sensors of the plant, in one environment or in many."""
+"""The step of the plant: what really moves, with disturbances, noise and sensors, in one environment or in many."""
 
 from __future__ import annotations
 
