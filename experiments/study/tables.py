@@ -54,14 +54,19 @@ def evaluation_table(env: dict[str, Any]) -> str:
 
 
 def comparisons_table(summary: dict[str, Any]) -> str:
-    """Returns the declared comparisons: differences of violating episodes in points, the primary one first."""
-    rows = [["violating episodes [points]", "difference", "interval", "scenario"]]
+    """Returns the declared comparisons: differences of violating episodes in points, the primary one first.
+
+    Beside them is what the first arm violates under the same attack on an ideal channel.
+    """
+    rows = [["violating episodes [points]", "difference", "interval", "scenario", "ideal [%]"]]
     for name, env in summary["environments"].items():
         rows += [[name]] if env["comparisons"] else []
         for index, each in enumerate(env["comparisons"]):
             title = f"  {each['first']} - {each['second']}{'' if index else ' (primary)'}"
             level = f"{_interval(each['interval'], 100.0)} ({100 * each['confidence']:.1f} %)"
-            rows.append([title, f"{100 * each['mean']:+z.1f}", level, each["scenario"]])
+            ideal = env["arms"][each["first"]]["scenarios"].get(ATTACKED_IDEAL)
+            without_network = "-" if ideal is None else f"{100 * ideal['rate']:.1f}"
+            rows.append([title, f"{100 * each['mean']:+z.1f}", level, each["scenario"], without_network])
     return text_table(rows)
 
 
