@@ -40,7 +40,7 @@ from shields.verification import Report, verify
 _SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
 # Where a set leaves the box between samples, one in a box that is smaller by what is missing and this is sought, so
 # many times at most.
-_BETWEEN_RESERVE, _MOST_BOXES = 1e-3, 8
+_BETWEEN_MARGIN, _MOST_BOXES = 1e-3, 8
 # Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
 # that are for people have fewer.
 _DIGITS, _SHOWN_DIGITS = 12, 6
@@ -530,11 +530,11 @@ def _tightened_box(
         return None
     reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / np.maximum(grid.left, 1e-300)
     over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
-    if over.max() <= 1.0 - 0.1 * _BETWEEN_RESERVE:
+    if over.max() <= 1.0 - 0.1 * _BETWEEN_MARGIN:
         return None
     if len(tightened) == _MOST_BOXES or grid.left.min() <= 0.0:
         raise _leaves_between_samples(float(over.max() - 1.0))
-    return (tightened[-1] if tightened else plant.box_rows) * np.maximum(over / (1.0 - _BETWEEN_RESERVE), 1.0)[:, None]
+    return (tightened[-1] if tightened else plant.box_rows) * np.maximum(over / (1.0 - _BETWEEN_MARGIN), 1.0)[:, None]
 
 
 def _leaves_between_samples(shortfall: float) -> Infeasible:

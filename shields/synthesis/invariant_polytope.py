@@ -26,12 +26,12 @@ from shields.verification import ACTION_ROUNDING
 # The search takes at most so long [s], of its thread's own time: what else a machine does decides no certificate.
 LONGEST_SEARCH = 60.0
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers.
-_RESERVE = 1e-6
-# A row counts as implied by others up to this: a thousandth of the reserve.
+_MARGIN = 1e-6
+# A row counts as implied by others up to this: a thousandth of the margin.
 _IMPLIED = 1e-9
 # Where fewer rows than this share of the most are left of a search that has too many, it goes on.
 _LEAST_PRUNED = 0.9
-# Significant digits of rows and multipliers; what a row lacks by that is far below the reserve.
+# Significant digits of rows and multipliers; what a row lacks by that is far below the margin.
 _DIGITS = 10
 # The solver's own tolerances, next to units of 1.
 _SOLVER = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
@@ -203,7 +203,7 @@ class _ClosedLoop:
         Raises:
             Infeasible: If errors of the estimate alone take an input beyond its limit.
         """
-        allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _RESERVE) - self._reach(self._K)
+        allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _MARGIN) - self._reach(self._K)
         if (allowed <= 0.0).any():
             raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
         rows, (images, left) = np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]), self._on_grid()
@@ -214,7 +214,7 @@ class _ClosedLoop:
     def _on_grid(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns what u = K x_hat makes of x at the times of the grid, rows (g, n), and what |row x| may be, (g,)."""
         grid = grid_in_closed_loop(self._feedback, self._plant)
-        return grid.images, grid.left - _RESERVE
+        return grid.images, grid.left - _MARGIN
 
     def predecessor(self, rows: np.ndarray) -> np.ndarray:
         """Returns what states have to fulfil so that the next ones fulfil a row, shape (n,), or rows, (k, n).
@@ -226,7 +226,7 @@ class _ClosedLoop:
         """
         physical = rows / self.widths
         pushed = physical @ self._plant.B
-        left = 1.0 - _RESERVE - self._reach(pushed @ self._K) - np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
+        left = 1.0 - _MARGIN - self._reach(pushed @ self._K) - np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
         left = left - float(ACTION_ROUNDING) * (np.abs(pushed) @ self._plant.u_max)
         if (left <= 0.0).any():
             raise _none("errors and disturbances alone leave one of its faces; smaller bounds leave room")
