@@ -33,8 +33,9 @@ _SMALLEST_FACTOR, _FACTOR_PRECISION = 1e-6, 1.02
 _WIDENINGS, _WIDEST_PAIR = (2.0, 10.0, 100.0, 1e3, 1e4, 1e6), 100.0
 
 
-# A gain that bears less of the radii than this is not made better: no search has doubled that.
-_HOPELESS = 0.5
+# Where the ellipsoid's gain bears less of the radii than this with a polytope no better gain is sought: searches have
+# gained an eighth.
+_HOPELESS = 0.8
 # Whether a quick search finds a safe set for a plant.
 _Certifies = Callable[[LinearPlant], bool]
 

@@ -24,7 +24,7 @@ _CHANGES, _TRIES_PER_ENTRY = (0.15, 0.08), 25
 _POINTS_LOG2 = 13
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
 # over no more steps than the second number.
-_LEFT_OVER, _MOST_STEPS = 1e-9, 4000
+_LEFT_OVER, _MOST_STEPS = 1e-7, 4000
 # Digits of a tolerated factor: a search takes the same steps on every processor.
 _DIGITS = 9
 
@@ -132,5 +132,7 @@ def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool
 
 def _reach(rows: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     """Returns the largest support over ellipsoids, shape (l, n, n), of rows, shape (..., n)."""
-    squares = [((rows @ shape) * rows).sum(axis=-1) for shape in shapes]
-    return np.sqrt(np.maximum(np.max(squares, axis=0), 0.0))
+    n = rows.shape[-1]
+    products = (rows[..., :, None] * rows[..., None, :]).reshape(*rows.shape[:-1], n * n)
+    squares = products @ shapes.reshape(-1, n * n).T
+    return np.sqrt(np.maximum(squares.max(axis=-1), 0.0))
