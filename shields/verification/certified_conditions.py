@@ -149,7 +149,8 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
     if not certificate.keeps_ellipsoid and certificate.polytope is not None:
-        for i, row in enumerate(certificate.polytope.rows):
+        rows = certificate.polytope.rows
+        for i, row in enumerate(rows if rows.shape[1] == plant.n else ()):  # "polytope: shapes" refuses others
             yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", 1 - quadratic(rational(row), L))
         return
     BK, (D, s) = multiply(B, K), certificate.disturbances()

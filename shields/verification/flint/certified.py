@@ -114,7 +114,8 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
     if certificate.polytope is not None and not certificate.keeps_ellipsoid:
-        for i, row in enumerate(certificate.polytope.rows):
+        rows = certificate.polytope.rows
+        for i, row in enumerate(rows if rows.shape[1] == plant.n else ()):  # "polytope: shapes" refuses others
             yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", 1 - form(matrix(row), L))
         return
     for j, row in enumerate(plant.box_rows):

@@ -72,6 +72,8 @@ def test_what_is_changed_is_refused_by_both_engines():
     }
     for name, each in changed.items():
         assert not both(each, plant), name
+    third = np.pad(polytope.rows, ((0, 0), (0, 1)))
+    assert not both(replace(certificate, polytope=replace(polytope, rows=third)), plant)
     # Claims that are not there to be proved.
     shares = np.array([0.9, 0.05, 0.05])
     claimed = tuple(replace(each, shares=shares, inputs=np.array([0.5])) for each in certificate.proofs)
