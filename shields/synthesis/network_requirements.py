@@ -328,9 +328,15 @@ class BoundarySearch(Search):
     start: Certificate
 
     def __call__(self, report: Callable[[int], object] = lambda count: None) -> dict[float, Answer]:
-        """Returns the answers for the ages that bisection asks, after doubling where no age is known to have none."""
+        """Returns the answers for the ages that bisection asks, after doubling where no age is known to have none.
+
+        Before doubling it asks for a certificate that needs no samples, as stable plants may have.
+        """
         answers: dict[float, Answer] = {}
         low, high, best = int(self.ages[0]), self.ages[-1] if len(self.ages) > 1 else inf, self.start
+        if high == inf and (certificate := nearby_certificate(self.plant, None, best)) is not None:
+            report(len(self.ages))
+            return {inf: Answer(certificate)}
         while high - low > 1 and low < MAX_AGE:
             age = min(2 * low + 1, MAX_AGE) if high == inf else (low + int(high)) // 2
             certificate = nearby_certificate(self.plant, _contract(age, self.quantization_step), best)

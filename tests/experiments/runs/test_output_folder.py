@@ -101,7 +101,7 @@ def test_finished_parts_of_a_study_are_kept(tmp_path):
     settings = StudySettings(out=tmp_path)
     claim_folder("study", settings)
     finished("compare", CompareSettings(out=tmp_path / "CartPole-v0"))
-    with pytest.raises(OtherResultsError, match="channel_episodes 100, now 3"):
+    with pytest.raises(OtherResultsError, match="channel_episodes 25, now 3"):
         claim_folder("study", replace(settings, channel_episodes=3))
 
 

@@ -139,8 +139,10 @@ def test_plant_without_a_continuous_model_cannot_be_resampled():
     plant = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, disturbance_bound=0.0)
     with pytest.raises(ValueError, match="from_statespace"):
         requirements(plant, sampling_periods=[0.5])
-    points = requirements(lambda dt: replace(plant, dt=dt), sampling_periods=[0.5, 1.0]).points
-    assert [point.network.sampling_period for point in points] == [0.5, 1.0]
+    found = requirements(lambda dt: replace(plant, dt=dt), sampling_periods=[0.5, 1.0])
+    assert [point.network.sampling_period for point in found.points] == [0.5, 1.0]
+    # A stable plant that is disturbed so little needs no samples.
+    assert [largest.certified for largest in found.largest_ages] == [np.inf, np.inf]
 
 
 @pytest.mark.parametrize("wrong", [{"losses": []}, {"delays": [1, 1]}, {"losses": [-1]}, {"disturbances": [0.0]}])
