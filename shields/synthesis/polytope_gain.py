@@ -104,7 +104,7 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
 
 
 def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool = True) -> float:
-    """Returns the factor that all radii may grow by until a gain keeps no polytope in the box; 0.0 if it keeps none.
+    """Returns the factor that all radii may grow by until a gain keeps no polytope in the box; 0.0 if it is too slow.
 
     From x = 0 errors and disturbances take c x at most as far as the sum of their supports, step by step, by what the
     closed loop makes of the row c. Where that stays below 1 for the box and the input limits, the states that stay in
