@@ -137,13 +137,12 @@ def synthesize(
     report = progress or (lambda line: None)
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if safe_set == "ellipsoid":
-        known = [each for each in known if each.keeps_ellipsoid]
-    certificate = _largest_certificate(plant, contract, report, known, polytope=safe_set != "ellipsoid")
+        known = [_without_polytope(each) for each in known if each.keeps_ellipsoid]
+    largest, *others = _certificates(plant, contract, report, known, polytope=safe_set != "ellipsoid")
     if safe_set == "ellipsoid":
-        return certificate
-    found = (with_largest_polytope if search_gain else with_polytope)(certificate, plant, report)
-    others = [with_polytope(each, plant, report) for each in known if each is not certificate]
-    return max([found, *others], key=_polytope_share)
+        return largest
+    found = (with_largest_polytope if search_gain else with_polytope)(largest, plant, report)
+    return max([found, *(with_polytope(each, plant, report) for each in others)], key=_polytope_share)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -205,6 +204,13 @@ def with_largest_polytope(
     except (ArithmeticError, ValueError, CertificateError):  # a gain whose numbers are out of reach of float64
         pass
     return own
+
+
+def _without_polytope(certificate: Certificate) -> Certificate:
+    """Returns a certificate that keeps an ellipsoid with that alone."""
+    of_polytopes = ("polytope_share_of_box", "no_polytope")
+    kept = {name: value for name, value in certificate.provenance.items() if name not in of_polytopes}
+    return replace(certificate, polytope=None, provenance=kept)
 
 
 def _polytope_share(certificate: Certificate) -> float:
@@ -392,40 +398,48 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
         return False
 
 
-def _largest_certificate(
+def _certificates(
     plant: LinearPlant,
     contract: ChannelContract | None,
     progress: Progress,
     known: Sequence[Certificate],
     *,
     polytope: bool,
-) -> Certificate:
-    """Returns the verified certificate of the largest ellipsoid found, or the largest of known ones.
+) -> list[Certificate]:
+    """Returns the verified certificate that is found and known ones, that of the largest ellipsoid first.
 
-    Where there is none and `polytope` says so, one of a polytope alone.
+    Those of a polytope alone come last; where there is no other and `polytope` says so, one is sought.
     """
 
-    def volume(certificate: Certificate) -> float:
-        return float(np.linalg.slogdet(certificate.L)[1])
+    def size(certificate: Certificate) -> tuple[bool, float]:
+        return certificate.keeps_ellipsoid, float(np.linalg.slogdet(certificate.L)[1])
 
     try:
-        return max([*known, _found_certificate(plant, contract, progress)], key=volume)
+        known = [_found_certificate(plant, contract, progress), *known]
     except Infeasible as infeasible:
-        if known:
-            return max(known, key=volume)
-        was_sought = "share_of_radii" in infeasible.details
-        if was_sought and (certificate := _with_closer_limits(plant, contract)) is not None:
-            return certificate
-        if polytope and (was_sought or infeasible.binding == "B"):
-            progress("no ellipsoid: seeking the gain whose polytope bears most")
-            if (certificate := _polytope_alone(plant, contract, progress)) is not None:
-                return certificate
-            sought = infeasibility(design_problem(plant, contract)[0], polytope=True) if was_sought else infeasible
-            polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
-            infeasible = sought if polytope else infeasible
-        if was_sought or infeasible.binding == "E1":
-            raise _with_hints(infeasible, plant, contract, progress, polytope) from infeasible
-        raise
+        if not known:
+            known = [_second_search(infeasible, plant, contract, progress, polytope)]
+    return sorted(known, key=size, reverse=True)
+
+
+def _second_search(
+    infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None, progress: Progress, polytope: bool
+) -> Certificate:
+    """Returns a verified certificate that is found in other ways where the search for an ellipsoid found none.
+
+    Raises:
+        Infeasible: If there is none; with the bounds that would be feasible.
+    """
+    was_sought = "share_of_radii" in infeasible.details
+    certificate = _with_closer_limits(plant, contract) if was_sought else None
+    if certificate is None and polytope and (was_sought or infeasible.binding == "B"):
+        progress("no ellipsoid: seeking the gain whose polytope bears most")
+        certificate = _polytope_alone(plant, contract, progress)
+    if certificate is not None:
+        return certificate
+    if was_sought or infeasible.binding == "E1":
+        raise _with_hints(infeasible, plant, contract, progress, polytope) from infeasible
+    raise infeasible
 
 
 def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -450,7 +464,7 @@ def _polytope_alone(
     """
     try:
         problem, _ = design_problem(plant, contract)
-        start = max_margin_gain(problem, problem.covering_error_shape, searches=1)
+        start = max_margin_gain(problem, problem.covering_error_shape)
         gain = start and most_tolerant_gain(problem, start)
         if gain is None or gain.margin < SUFFICIENT_MARGIN:
             return None
@@ -564,6 +578,10 @@ def _with_hints(
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
     try:
+        if polytope and "share_of_radii" in infeasible.details:
+            sought = infeasibility(design_problem(plant, contract)[0], polytope=True)
+            polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
+            infeasible = sought if polytope else infeasible
         return with_feasible_bounds(infeasible, plant, contract, progress, polytope=polytope)
     except KeyboardInterrupt as interrupt:
         raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt

@@ -145,7 +145,7 @@ class Requirement:
 
     @property
     def share(self) -> float:
-        """Share of the safe box that the certified set keeps, 0 without a certificate.
+        """Share of the safe box that the ellipsoid in the certified set fills, 0 without a certificate.
 
         Where the box has too many corners to know its volume, the share of its largest ellipsoid.
         """

@@ -100,7 +100,7 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
 
     options = {"maxfev": _TRIES_PER_ENTRY * start.K.size}
     found = minimize(loss, start.K.ravel(), method="Nelder-Mead", callback=stop, options=options)
-    return TolerantGain(found.x.reshape(start.K.shape), -found.fun)
+    return TolerantGain(found.x.reshape(start.K.shape), float(-found.fun))
 
 
 def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool = True) -> float:

@@ -32,7 +32,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
     fits = fits and all(proof.inputs is None or len(proof.inputs) == plant.m for proof in certificate.proofs)
     fits = fits and (updates is None or updates.gains.shape[1:] == (plant.n, plant.p))
-    conditions = [flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits)]
+    fits = fits and (certificate.polytope is None or certificate.polytope.dim == plant.n)
+    conditions = [flag("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)]
     if not fits:
         return conditions
     conditions += _multiplier_conditions(certificate)
@@ -149,8 +150,7 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
     if not certificate.keeps_ellipsoid and certificate.polytope is not None:
-        rows = certificate.polytope.rows
-        for i, row in enumerate(rows if rows.shape[1] == plant.n else ()):  # "polytope: shapes" refuses others
+        for i, row in enumerate(certificate.polytope.rows):
             yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", 1 - quadratic(rational(row), L))
         return
     BK, (D, s) = multiply(B, K), certificate.disturbances()

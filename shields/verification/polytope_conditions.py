@@ -35,7 +35,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     """
     rows, box = polytope.rows, plant.box_rows
     images = len(rows) + plant.m + len(box) * (plant.between_samples or 0)
-    fits = rows.shape[1] == plant.n and polytope.multipliers.shape == (images, len(rows))
+    fits = polytope.multipliers.shape == (images, len(rows))
     yield flag("polytope: shapes", fits)
     if not fits:
         return

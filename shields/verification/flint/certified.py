@@ -31,7 +31,7 @@ from shields.verification.flint.polytope import polytope_conditions
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks a certificate of method "certified"; what cannot be stated after something failed is left out."""
     fits = _fits(certificate, plant)
-    yield is_so("shapes: L (n, n), K (m, n), one input multiplier per input", fits)
+    yield is_so("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)
     if not fits:
         return
     ranges = list(_range_conditions(certificate))
@@ -55,6 +55,8 @@ def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
         shapes.append((proof.Sigma, (n, n)))
         if proof.shares is not None and proof.inputs is not None:
             shapes += [(proof.shares, (3,)), (proof.inputs, (m,))]
+    if certificate.polytope is not None:
+        shapes.append((certificate.polytope.rows, (len(certificate.polytope.rows), n)))
     if updates is None:
         count = 1
     else:
@@ -114,8 +116,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
     if certificate.polytope is not None and not certificate.keeps_ellipsoid:
-        rows = certificate.polytope.rows
-        for i, row in enumerate(rows if rows.shape[1] == plant.n else ()):  # "polytope: shapes" refuses others
+        for i, row in enumerate(certificate.polytope.rows):
             yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", 1 - form(matrix(row), L))
         return
     for j, row in enumerate(plant.box_rows):

@@ -29,7 +29,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     """Checks (P) and (PU) without the code of the first engine; what cannot be stated is left out."""
     r, (k, n) = len(polytope.rows), plant.box_rows.shape
     images = r + plant.m + k * (plant.between_samples or 0)
-    fits = polytope.rows.shape == (r, n) and polytope.multipliers.shape == (images, r)
+    fits = polytope.multipliers.shape == (images, r)
     yield is_so("polytope: shapes", fits)
     if not fits:
         return

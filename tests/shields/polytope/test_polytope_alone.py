@@ -72,12 +72,30 @@ def test_what_is_changed_is_refused_by_both_engines():
     }
     for name, each in changed.items():
         assert not both(each, plant), name
-    third = np.pad(polytope.rows, ((0, 0), (0, 1)))
-    assert not both(replace(certificate, polytope=replace(polytope, rows=third)), plant)
     # Claims that are not there to be proved.
     shares = np.array([0.9, 0.05, 0.05])
     claimed = tuple(replace(each, shares=shares, inputs=np.array([0.5])) for each in certificate.proofs)
     assert not both(replace(certificate, proofs=claimed), plant)
+
+
+@pytest.mark.parametrize("changes", [{}, {"factor": 1.1, "between_samples": 4}, {"factor": 0.8, "between_samples": 4}])
+def test_a_polytope_of_another_dimension_is_refused_by_both_engines(changes):
+    certificate, plant = found(**changes)
+    for wrong in (certificate.polytope.rows[:, :1], np.pad(certificate.polytope.rows, ((0, 0), (0, 1)))):
+        assert not both(replace(certificate, polytope=replace(certificate.polytope, rows=wrong)), plant)
+
+
+def test_a_candidate_never_makes_the_result_smaller_and_an_ellipsoid_comes_without_a_polytope():
+    whole, plant = found(factor=0.8)
+    assert whole.keeps_ellipsoid
+    smaller = certify_polytope(plant, np.array([[-12.66, -0.034]]), AGE)
+    same = certify_polytope(plant, whole.K, AGE)
+    assert smaller.provenance["polytope_share_of_box"] < whole.provenance["polytope_share_of_box"]
+    for candidate in (smaller, same, whole):
+        assert synthesize(plant, contract=AGE, candidates=[candidate]) == whole
+    ellipsoid = synthesize(plant, contract=AGE, safe_set="ellipsoid", candidates=[whole])
+    assert ellipsoid.polytope is None
+    assert ellipsoid == synthesize(plant, contract=AGE, safe_set="ellipsoid")
 
 
 def test_an_ellipsoid_without_multipliers_needs_a_polytope():
