@@ -20,6 +20,8 @@ _INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 # The search begins with changes of a gain's entries by these shares of an input limit over a half-width of the box, in
 # turn, and tries at most so many gains per entry in each.
 _CHANGES, _TRIES_PER_ENTRY = (0.15, 0.08), 25
+# Where it is asked often whether there is a gain at all.
+_FEW_TRIES_PER_ENTRY = 8
 # It counts so many points of the box.
 _POINTS_LOG2 = 13
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
@@ -88,7 +90,7 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
     Args:
         problem: The scaled design problem.
         start: The gain that keeps an ellipsoid for the largest radii.
-        enough: The search ends once the radii may grow by this factor.
+        enough: The search ends once the radii may grow by this factor; one that has such an end is a short one.
     """
 
     def loss(entries: np.ndarray) -> float:
@@ -98,7 +100,7 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
         if -intermediate_result.fun >= enough:
             raise StopIteration
 
-    options = {"maxfev": _TRIES_PER_ENTRY * start.K.size}
+    options = {"maxfev": (_TRIES_PER_ENTRY if enough == np.inf else _FEW_TRIES_PER_ENTRY) * start.K.size}
     found = minimize(loss, start.K.ravel(), method="Nelder-Mead", callback=stop, options=options)
     return TolerantGain(found.x.reshape(start.K.shape), float(-found.fun))
 
