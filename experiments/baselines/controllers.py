@@ -1,7 +1,8 @@
 """Controllers that nobody has to train, for vector environments: linear ones, regulators, and no or random inputs.
 
 The regulators are linear-quadratic, with a governor of its references, and model predictive. All three minimize the
-same cost of the task's error, whose weights are tuned for each by itself.
+same cost of the task's error, whose weights are tuned for each by itself. Where the box counts between samples, it does
+for governor and predictions, too.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
 from ncs_gym.plants.lqr import lqr_gain
+from shields.runtime.polytope_step import grid_test
 
 # Its types are not declared.
 _clarabel: Any = clarabel
@@ -161,17 +163,19 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
     moved[:n, :n] = plant.A
     pushed = np.vstack([plant.B, np.eye(plant.m)[: own.shape[1] - n]])
     loop, drive = moved + pushed @ own, pushed @ of_target
-    limits = np.vstack([np.pad(plant.box_rows, ((0, 0), (0, own.shape[1] - n))), own / plant.u_max[:, None]])
-    direct = np.concatenate([np.zeros((len(plant.box_rows), 1)), of_target / plant.u_max[:, None]])
-    allowed = np.concatenate([np.full(len(plant.box_rows), 1.0 - margin), np.ones(plant.m)])
-    rows, slopes = [limits[len(plant.box_rows) :]], [direct[len(plant.box_rows) :]]
+    (k, grid), beyond = (len(plant.box_rows), grid_test(plant)), ((0, 0), (0, own.shape[1] - n))
+    between = np.pad(grid.moved, beyond) + grid.effect @ own
+    limits = np.vstack([np.pad(plant.box_rows, beyond), between, own / plant.u_max[:, None]])
+    direct = np.concatenate([np.zeros((k, 1)), grid.effect @ of_target, of_target / plant.u_max[:, None]])
+    allowed = np.concatenate([np.full(k + len(grid.moved), 1.0 - margin), np.ones(plant.m)])
+    rows, slopes = [limits[k:]], [direct[k:]]
     power, response = loop, drive
     for _ in range(GOVERNED_STEPS):
         rows.append(limits @ power)
         slopes.append(limits @ response + direct)
         power, response = loop @ power, loop @ response + drive
     free, slope = np.vstack(rows), np.vstack(slopes)[:, 0]
-    bound = np.concatenate([np.ones(plant.m), np.tile(allowed, GOVERNED_STEPS)])
+    bound = np.concatenate([allowed[k:], np.tile(allowed, GOVERNED_STEPS)])
     felt = np.abs(slope) > _LEAST_WEIGHT * np.abs(slope).max()
     free, slope, bound = free[felt], slope[felt], bound[felt]
 
@@ -197,18 +201,20 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     plant, problem, steps = env.plant, regulator_problem(env, weights), PREDICTED_STEPS
     A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
     to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
-    rows = np.pad(plant.box_rows, ((0, 0), (0, len(A) - plant.n)))
+    beyond, grid = ((0, 0), (0, len(A) - plant.n)), grid_test(plant)
+    rows, between = np.pad(plant.box_rows, beyond), np.pad(grid.moved, beyond)
     free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
     for k in range(steps):  # z_k = free z_0 + forced u
         now = np.eye(steps * m)[k * m : (k + 1) * m]
         costs.append((E @ free, E @ forced + D @ now))
+        limits.append((between @ free, between @ forced + grid.effect @ now))
         free, forced = A @ free, A @ forced + B @ now
         limits.append((rows @ free, rows @ forced))
     costs.append((to_go @ free, to_go @ forced))
     drift, effect = (np.concatenate(each) for each in zip(*costs, strict=True))
     moved, felt = (np.concatenate(each) for each in zip(*limits, strict=True))
     # Variables are the inputs, and by how much each step leaves the box.
-    leaving, nothing = np.repeat(np.eye(steps), len(rows), axis=0), np.zeros((steps * m, steps))
+    leaving, nothing = np.repeat(np.eye(steps), len(rows) + len(between), axis=0), np.zeros((steps * m, steps))
     P = csc_matrix(block_diag(2.0 * np.triu(effect.T @ effect), np.zeros((steps, steps))))
     inequalities = bmat(
         [

@@ -15,7 +15,7 @@ from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.program import PlanProgram
 from shields.runtime.one_step import OneStepTest
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.polytope_step import PolytopeTest, grid_test
 from shields.runtime.safety_filter import SafetyFilter
 from shields.verification import require_valid
 
@@ -82,7 +82,8 @@ class PredictiveFilter:
         min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  |u_i| <= u_max,
                                       |c_j x_i| <= 1 - t_ij (0 < i < N),  |x_N|_M <= 1 - t_N,
 
-    or |g x_N| <= 1 - t_N(g) for the rows g of the certificate's polytope, if it has one.
+    or |g x_N| <= 1 - t_N(g) for the rows g of the certificate's polytope, if it has one. Where the box counts between
+    samples, its limits hold at these times, too, tightened as at the worse of the two samples.
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
@@ -131,8 +132,10 @@ class PredictiveFilter:
         self._all_limits[:-1, : self._limits.shape[1]] = self._limits
         self._all_limits[-1, : len(self._end_limits)] = self._end_limits
         self._weighting = self._root if polytope is None else self._root[:0]
-        grid = self._prediction.grid
-        self._between = np.ones((horizon, 0 if grid is None else grid.free.shape[1]))
+        self._grid = grid_test(plant)
+        ends = np.vstack([np.full((1, self._limits.shape[1]), 1.0 - margin), self._limits, self._limits[-1:]])
+        times = len(self._grid.moved) // len(plant.box_rows)
+        self._between = np.tile(np.minimum(ends[:-1], ends[1:]), times)
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
@@ -152,14 +155,15 @@ class PredictiveFilter:
 
     def _followed_by_gain(self, estimates: np.ndarray, proposed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns where a proposed input and then u = K x are a plan, (N,), and these inputs, (N, horizon - 1, m)."""
-        plant, plans = self._plant, []
-        states = estimates @ plant.A.T + proposed @ plant.B.T
+        plant, states, inputs, plans = self._plant, estimates, proposed, []
         fine = np.ones(len(states), np.bool_)
-        for limits in self._limits:
+        for between, limits in zip(self._between, [*self._limits, np.full(len(plant.box_rows), np.inf)], strict=True):
+            fine &= (np.abs(self._grid.values(states, inputs)) <= between).all(axis=1)
+            states = states @ plant.A.T + inputs @ plant.B.T
             fine &= (np.abs(states @ plant.box_rows.T) <= limits).all(axis=1)
-            plans.append(self._gained(states))
-            states = states @ plant.A.T + plans[-1] @ plant.B.T
-        return fine & (self._levels(states) <= self._end_limits).all(axis=-1), np.stack(plans, axis=1)
+            inputs = self._gained(states)
+            plans.append(inputs)
+        return fine & (self._levels(states) <= self._end_limits).all(axis=-1), np.stack(plans[:-1], axis=1)
 
     def _solved(self, estimate: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns the inputs of the best plan, shape (horizon, m); None if the solver finds none."""
@@ -174,6 +178,8 @@ class PredictiveFilter:
         plan = np.clip(plan, -plant.u_max, plant.u_max)
         centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
         inside = (np.abs(centers[:-1] @ plant.box_rows.T) <= self._limits + TOLERANCE).all()
+        begun = np.vstack([estimate, centers[:-1]])
+        inside &= (np.abs(self._grid.values(begun, plan)) <= self._between + TOLERANCE).all()
         return plan if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
 
     def _levels(self, states: np.ndarray) -> np.ndarray:

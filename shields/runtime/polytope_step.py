@@ -321,6 +321,10 @@ class GridTest(NamedTuple):
     disturbed: np.ndarray
     at_samples: np.ndarray
 
+    def values(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Returns the rows at states x_hat, shape (N, n), and inputs, (N, m): shape (N, g), without any disturbance."""
+        return states @ self.moved.T + inputs @ self.effect.T
+
 
 @np.errstate(all="ignore")  # what is not finite leaves no room
 def grid_test(plant: LinearPlant) -> GridTest:

@@ -1,5 +1,7 @@
 """Linear controllers by name: what they do to the plants they are made for."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -86,16 +88,21 @@ def test_actions_of_every_controller_fit_every_environment(name, env_id):
     assert np.abs(actions).max() <= 1.0
 
 
-def nominal(env, name, weights, steps=150):
-    """Largest |c_j x| on the way from rest to the outermost target, without disturbance, and the inputs applied."""
+def nominal(env, name, weights, steps=150, times=1):
+    """Largest |c_j x| on the way from rest to the outermost target, without disturbance, and the inputs applied.
+
+    Looked at that many times per step.
+    """
     policy, plant = controller(name, env, np.zeros((1, 2)), 0, weights), env.plant
+    part = plant if times == 1 else replace(plant, between_samples=None).resampled(plant.dt / times)
     x, applied, reached = np.zeros(plant.n), [np.zeros(plant.m)], 0.0
     targets = np.full(1 + env.task.preview, env.task.reach)
     for _ in range(steps):
         observed = np.concatenate([x, targets, applied[-1] if env.task.change_price else []])
         applied.append(plant.u_max * policy(observed[None], {"estimate": x[None]})[0])
-        x = plant.A @ x + plant.B @ applied[-1]
-        reached = max(reached, float(np.abs(plant.box_rows @ x).max()))
+        for _ in range(times):
+            x = part.A @ x + part.B @ applied[-1]
+            reached = max(reached, float(np.abs(plant.box_rows @ x).max()))
     return reached, np.array(applied)
 
 
@@ -109,6 +116,20 @@ def test_governor_and_mpc_keep_limits_and_margins_that_the_regulator_leaves(env_
     assert kept <= 1.0 + 1e-6
     assert with_margin <= 0.8 + 1e-6
     assert with_margin < free
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name", "limit"),
+    [("ncs_gym/BatchReactor-v0", "governor:20", 0.8), ("ncs_gym/BatchReactor-v0", "mpc", 1.0)],
+)
+def test_governor_and_mpc_keep_the_limits_between_samples_where_they_count(env_id, name, limit):
+    weights = RegulatorWeights(1e-6, 0.0)
+    at_samples, always = (
+        nominal(ncs_env(gym.make(env_id, between_samples=points)), name, weights, 60, times=20)[0]
+        for points in (None, 4)
+    )
+    assert at_samples > limit + 1e-3
+    assert always <= limit + 1e-6
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/CSTR-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"])

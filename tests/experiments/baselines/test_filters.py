@@ -193,6 +193,26 @@ def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificat
     assert 0 < changed < len(proposals)
 
 
+def test_predictive_filter_keeps_the_box_between_samples_where_it_counts_there(loaded):
+    part, rng = loaded.resampled(loaded.dt / 20), np.random.default_rng(1)
+    proposals = loaded.u_max * np.sign(np.repeat(rng.standard_normal(60), 10))[:, None]
+
+    def largest(plant, **settings):
+        """Largest |c_j x|, looked at 20 times per step, where the model is the truth."""
+        predictive, state, reached = PredictiveFilter(certificate_of(plant), plant, **settings), np.zeros(2), 0.0
+        for k, proposed in enumerate(proposals):
+            u = predictive(state[None], proposed[None], np.array([k == 0]))[0]
+            for _ in range(20):
+                state = part.A @ state + part.B @ u
+                reached = max(reached, np.abs(loaded.box_rows @ state).max())
+        return reached
+
+    on_grid = replace(loaded, between_samples=8)
+    assert largest(loaded) > 1.01
+    assert 0.95 < largest(on_grid) <= 1.0
+    assert 0.75 < largest(on_grid, margin=0.2) <= 0.8
+
+
 def test_predictive_filter_applies_the_rest_of_its_plan_and_then_the_gain(certificate, loaded):
     predictive = PredictiveFilter(certificate, loaded, horizon=3)
     inside, outside, zero = np.zeros((1, 2)), 5.0 * loaded.half_widths[None], np.zeros((1, 1))
