@@ -1,5 +1,5 @@
-"""From evaluation episodes to confidence intervals, summaries of arms, and tables.
+"""From evaluation episodes to confidence intervals and summaries of arms.
 
-Summaries are queries of the long table that `episodes` makes of results. These two modules need the extra "train", the
-others do not: `ncs attack` runs without it.
+Summaries are queries of the long table that `episodes` makes of results, which needs the extra "train"; `statistics`
+does not: `ncs attack` runs without it.
 """

@@ -19,11 +19,11 @@ from experiments.analysis.episodes import (
     training_table,
 )
 from experiments.analysis.statistics import gaussian_sentences, gaussian_summary
-from experiments.analysis.tables import decimals_of, scenario_text, summary_text
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
+from experiments.report.text_tables import decimals_of, scenario_text, summary_text
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment import (
     certificate_line,

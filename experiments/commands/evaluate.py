@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary, episodes_table
-from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
+from experiments.report.text_tables import summary_text
 from experiments.runs.experiment import certificate_of
 from experiments.runs.loops import registered_env, with_channel
 from experiments.runs.output_folder import require_place

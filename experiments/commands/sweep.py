@@ -10,11 +10,11 @@ import pandas as pd
 
 from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summaries, episodes_table, parquet
-from experiments.analysis.tables import sweep_table
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.html import sweep_report
+from experiments.report.text_tables import sweep_table
 from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
 from experiments.runs.loops import loop_config

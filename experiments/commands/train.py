@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from experiments.analysis.episodes import arm_summary, episodes_table
-from experiments.analysis.tables import summary_text
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
+from experiments.report.text_tables import summary_text
 from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
-from experiments.runs.going_on import forget_checkpoint, going_on
 from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.resume import forget_checkpoint, resumed
 from experiments.runs.training_run import RunResult
 from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
@@ -30,7 +30,7 @@ def train(settings: TrainSettings) -> None:
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         run = run_of_arm(settings, loop, certificate, settings.arm, 0)
-        run = going_on(settings.out, run, anew=settings.force)
+        run = resumed(settings.out, run, anew=settings.force)
         if run.start is not None:
             print(f"the training in {settings.out} goes on after {run.start.steps:,} steps", flush=True)
         results = results_of([run], settings.out, settings)

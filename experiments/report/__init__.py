@@ -1,1 +1,1 @@
-"""The pages of comparisons, sweeps and studies: templates, and what is inserted into them."""
+"""The results as a reader sees them: tables on a terminal, and pages with their templates."""

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from agents.agent_file import AgentError
 from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
-from experiments.analysis.tables import summary_text
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
+from experiments.report.text_tables import summary_text
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import _agent_of

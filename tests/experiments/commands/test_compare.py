@@ -9,8 +9,8 @@ from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
-from experiments.analysis.tables import summary_text
 from experiments.commands.compare import _findings, _training_runs
+from experiments.report.text_tables import summary_text
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.training_run import RunResult

@@ -20,7 +20,7 @@ from shields.atomic_write import write_atomically
 _START = "start"
 
 
-def going_on(folder: Path, run: TrainingRun, *, anew: bool) -> TrainingRun:
+def resumed(folder: Path, run: TrainingRun, *, anew: bool) -> TrainingRun:
     """Returns a run that goes on from the longest training in a folder, which is kept in `start` there.
 
     Args:

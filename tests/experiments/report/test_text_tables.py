@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 
 from experiments.analysis.episodes import episodes_table
-from experiments.analysis.tables import scenario_text, summary_text, sweep_table
 from experiments.commands.compare import _findings
 from experiments.report.html import _decimal, _interval
+from experiments.report.text_tables import scenario_text, summary_text, sweep_table
 from experiments.study.summary import study_summary
 from experiments.study.tables import comparisons_table, evaluation_table, margins_table, prices_table
 from tests.experiments.results import run, summary_of
