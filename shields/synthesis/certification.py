@@ -30,7 +30,7 @@ from shields.synthesis.invariant_polytope import (
 )
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
-from shields.synthesis.polytope_gain import gains_of_larger_polytopes, most_tolerant_gain
+from shields.synthesis.polytope_gain import ellipsoid_margin, gains_of_larger_polytopes, most_tolerant_gain
 from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
@@ -437,7 +437,7 @@ def _second_search(
         certificate = _polytope_alone(plant, contract, progress)
     if certificate is not None:
         return certificate
-    if was_sought or infeasible.binding == "E1":
+    if was_sought or infeasible.binding in ("B", "E1"):
         raise _with_hints(infeasible, plant, contract, progress, polytope) from infeasible
     raise infeasible
 
@@ -578,10 +578,10 @@ def _with_hints(
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
     try:
-        if polytope and "share_of_radii" in infeasible.details:
+        if polytope and infeasible.binding != "E1":
             sought = infeasibility(design_problem(plant, contract)[0], polytope=True)
             polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
-            infeasible = sought if polytope else infeasible
+            infeasible = sought if polytope and infeasible.binding != "B" else infeasible
         return with_feasible_bounds(infeasible, plant, contract, progress, polytope=polytope)
     except KeyboardInterrupt as interrupt:
         raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt
@@ -610,7 +610,7 @@ def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> C
     of all ages by one.
     """
     gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-    scale = 1.0 if gain is None else max(gain.margin, 1.0)
+    scale = 1.0 if gain is None else max(ellipsoid_margin(problem, gain), 1.0)
     return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,27 @@ INFLATION = 1.0 + 1e-9
 # Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
 # verification uses the error set itself.
 _SMALLEST_AXIS_RATIO = 0.01
+# What stands for nothing or less that the bound between samples leaves of a limit.
+_NOTHING_LEFT = 1e-9
 # A box that is longer in one direction than in another by more, each state in units of its own limit, is refused.
 _FLATTEST = 1e7
+
+
+class ScaledGrid(NamedTuple):
+    """The g rows |state z + input u| + disturbed <= 1 of the box at times between samples; none without a grid.
+
+    They are divided by what the bound between these times and the rounding of actions leave (docs/shield_proof.md,
+    "Between the samples").
+
+    Attributes:
+        state: Rows on scaled states, shape (g, n).
+        input: Rows on scaled inputs, shape (g, m).
+        disturbed: Supports of the disturbance that has come by then, shape (g,).
+    """
+
+    state: np.ndarray
+    input: np.ndarray
+    disturbed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,6 +61,7 @@ class DesignProblem:
         C: Rows of the safe box in scaled coordinates, shape (k, n).
         D_u: Shape of the disturbance set with the rounding of actions (docs/shield_proof.md), scaled, (n, n).
         error_shapes: Shapes of the error sets for which K x_hat must be safe, scaled, (k, n, n).
+        grid: What the box says at times between samples. The semidefinite programs know nothing of it.
         transform: The transformation T, shape (n, n).
         u_max: Input limits in physical units, shape (m,).
         rounding: Multiplier s of D_u.
@@ -51,6 +72,7 @@ class DesignProblem:
     C: np.ndarray
     D_u: np.ndarray
     error_shapes: np.ndarray
+    grid: ScaledGrid
     transform: np.ndarray
     u_max: np.ndarray
     rounding: float
@@ -126,7 +148,7 @@ def design_problem(
         box_rows: Rows of a box inside the plant's in which the set is sought, shape (k, n); the plant's own by default.
 
     Raises:
-        Infeasible: If the plant has no error set or its safe box is unbounded.
+        Infeasible: If the plant has no error set, its safe box is unbounded, or far too wide for times between samples.
     """
     free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
     if free:
@@ -184,7 +206,24 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box_rows: np.ndarray) 
         C=box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
         error_shapes=inverse @ error_shapes @ inverse.T,
+        grid=_scaled_grid(plant, T),
         transform=T,
         u_max=plant.u_max,
         rounding=s,
     )
+
+
+def _scaled_grid(plant: LinearPlant, transform: np.ndarray) -> ScaledGrid:
+    """Returns the plant's rows between samples in scaled coordinates z = T^-1 x and u / u_max."""
+    try:
+        if plant.grid_rows is None:
+            return ScaledGrid(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0))
+    except OverflowError as error:
+        too_long = "(B) the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
+        raise Infeasible(too_long, "B", 1.0) from error
+    state, pushed, remainder = plant.grid_rows
+    pushed = pushed * plant.u_max
+    left = np.maximum(1.0 - remainder - float(ACTION_ROUNDING) * np.abs(pushed).sum(axis=-1), _NOTHING_LEFT)  # (N, k)
+    rho = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, plant.disturbance.shape_matrix, plant.box_rows))
+    rows, inputs = state @ transform / left[..., None], pushed / left[..., None]
+    return ScaledGrid(rows.reshape(-1, plant.n), inputs.reshape(-1, plant.m), (rho / left).ravel())

@@ -14,7 +14,7 @@ from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.polytope_gain import most_tolerant_gain, polytope_margin
+from shields.synthesis.polytope_gain import ellipsoid_margin, most_tolerant_gain, polytope_margin
 
 # What may be declared of the uncertainties. The largest feasible value of each is sought down to this fraction of the
 # given one, and to this ratio.
@@ -99,7 +99,7 @@ def with_feasible_bounds(
         if age is None:
             useless.append("max_age")
         else:
-            hints.append(f"max_age = {age} is the largest that works")
+            hints.append(f"max_age = {age} or less")
             details["max_age"] = age
     for name in _BOUNDS:
         if _is_declared(plant, name):
@@ -116,22 +116,23 @@ def with_feasible_bounds(
         if factor is None:
             useless_limits.append(change.what)
         else:
-            hints.append(f"{factor:.3g} times {change.what} is the smallest that works")
+            hints.append(f"{factor:.3g} times {change.what} or more")
             details[f"{change.name}_factor"] = factor
-    if useless:
-        hints.append(f"none is found with a smaller {' or '.join(useless)}")
+    searcher = "it" if "quick search" in str(infeasible) else "a quick search"
+    found = [f"of single changes {searcher} finds these enough: {'; '.join(hints)}"] if hints else []
+    vain = [f"with a smaller {' or '.join(useless)}"] if useless else []
     if useless_limits:
-        hints.append(f"none is found with {' or '.join(useless_limits)} up to {_WIDENINGS[-1]:.0e} times as large")
-    together = ""
+        vain.append(f"with {' or '.join(useless_limits)} up to {_WIDENINGS[-1]:.0e} times as large")
+    if vain:
+        found.append(f"{searcher} finds none {', nor '.join(vain)}")
     if len(details) == len(infeasible.details):
         progress("no certificate: searching for two changes that have one")
         if (pair := _smallest_pair(plant, certifies)) is not None:
             (first, second), factor = pair
-            together = f"; the smallest pair of changes: {first.what} and {second.what}, {factor:.3g} times each"
+            found.append(f"the smallest pair of changes: {first.what} and {second.what}, {factor:.3g} times each")
             details |= {"pair_factor": factor}
-    changed = f"; each changed alone: {'; '.join(hints)}{together}" if hints else together
     asked = "" if contract is None else f" (asked: max_age = {contract.max_age})"
-    text = f"{infeasible}{_limits_exceeded(plant)}{changed}{asked}"
+    text = "; ".join([f"{infeasible}{_limits_exceeded(plant)}", *found]) + asked
     return Infeasible(text, infeasible.binding, infeasible.shortfall, details)
 
 
@@ -155,10 +156,10 @@ def _is_declared(plant: LinearPlant, name: str) -> bool:
 def _hint(plant: LinearPlant, name: str, factor: float) -> str:
     """Returns the largest feasible value of a bound in words, given its fraction of the declared one."""
     if name == "remainder":
-        return f"{factor:.3g} times the given remainder is the largest that works (shrink the box or the input limits)"
+        return f"{factor:.3g} times the given remainder or less (shrink the box or the input limits)"
     largest = f"gamma = {factor * plant.gamma:.3g}" if name == "gamma" else f"{factor:.3g} times the given {name}"
     given = f" (given: {plant.gamma:g})" if name == "gamma" else ""
-    return f"{largest} is the largest that works{given}"
+    return f"{largest} or less{given}"
 
 
 def _figure(plant: LinearPlant, name: str, factor: float) -> dict[str, float]:
@@ -186,7 +187,7 @@ def _widenings(plant: LinearPlant) -> list[_Change]:
 
     None of a plant with a remainder, which belongs to its box and input limits.
     """
-    if plant.remainder is not None or plant.between_samples is not None:
+    if plant.remainder is not None:
         return []
 
     def rows(chosen: slice) -> Callable[[LinearPlant, float], LinearPlant]:
@@ -306,9 +307,12 @@ def _margin(problem: DesignProblem, *, polytope: bool, input_limits: bool = True
         enough: A factor beyond which no larger one is sought.
     """
     gain = max_margin_gain(problem, problem.covering_error_shape, input_limits=input_limits)
-    if gain is None or not polytope or gain.margin >= enough:
-        return 0.0 if gain is None else gain.margin
-    at_hand = max(gain.margin, polytope_margin(problem, gain.K, input_limits=input_limits))
+    if gain is None:
+        return 0.0
+    of_ellipsoid = ellipsoid_margin(problem, gain, input_limits=input_limits)
+    if not polytope or of_ellipsoid >= enough:
+        return of_ellipsoid
+    at_hand = max(of_ellipsoid, polytope_margin(problem, gain.K, input_limits=input_limits))
     if not input_limits or at_hand < _HOPELESS:
         return at_hand
     return max(at_hand, most_tolerant_gain(problem, gain, enough).margin)

@@ -23,7 +23,7 @@ from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.linear_feedback import linear_feedback_tolerance
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.polytope_gain import most_tolerant_gain
+from shields.synthesis.polytope_gain import ellipsoid_margin, most_tolerant_gain
 
 # Ages that one search goes through, each from the certificate of the last; other processes have the others.
 _AGES_PER_SEARCH = 6
@@ -306,7 +306,8 @@ class Search:
         """Returns nearly the largest factor on all radii for which a certificate verifies; at least 1."""
         problem, _ = design_problem(self.plant, _contract(age, self.quantization_step))
         gain = max_margin_gain(problem, problem.covering_error_shape)
-        margin = 0.0 if gain is None else max(gain.margin, most_tolerant_gain(problem, gain).margin)
+        of_polytope = 0.0 if gain is None else most_tolerant_gain(problem, gain).margin
+        margin = 0.0 if gain is None else max(ellipsoid_margin(problem, gain), of_polytope)
         for share in _FACTOR_STEPS:
             factor = float(f"{share * margin:.3g}")
             if factor <= 1.0:

@@ -105,12 +105,24 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
     return TolerantGain(found.x.reshape(start.K.shape), float(-found.fun))
 
 
+def ellipsoid_margin(problem: DesignProblem, gain: MaxMarginGain, *, input_limits: bool = True) -> float:
+    """Returns the factor that all radii may grow by until a gain keeps no ellipsoid in the box.
+
+    Where the box counts between samples, which the search for the gain knows nothing of, at most what it bears with a
+    polytope.
+    """
+    if not len(problem.grid.disturbed):
+        return gain.margin
+    return min(gain.margin, polytope_margin(problem, gain.K, input_limits=input_limits) or gain.margin)
+
+
 def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool = True) -> float:
     """Returns the factor that all radii may grow by until a gain keeps no polytope in the box; 0.0 if it is too slow.
 
     From x = 0 errors and disturbances take c x at most as far as the sum of their supports, step by step, by what the
-    closed loop makes of the row c. Where that stays below 1 for the box and the input limits, the states that stay in
-    them for ever are a set around 0 (Kolmanovsky and Gilbert 1998, docs/bibliography.md).
+    closed loop makes of the row c. Where that stays below 1 for the box, at times between samples too if it counts
+    there, and for the input limits, the states that stay in them for ever are a set around 0 (Kolmanovsky and Gilbert
+    1998, docs/bibliography.md).
 
     Args:
         problem: The scaled design problem.
@@ -125,10 +137,11 @@ def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool
     powers = np.eye(problem.n)[None]
     while len(powers) < steps + problem.n:
         powers = np.concatenate([powers, powers @ (powers[-1] @ closed_loop)])
-    inputs = K if input_limits else K[:0]
-    rows = np.concatenate([problem.C, inputs]) @ powers  # (steps, rows, n)
+    inputs, (state, pushed, disturbed) = K if input_limits else K[:0], problem.grid
+    rows = np.concatenate([problem.C, inputs, state + pushed @ K]) @ powers  # (steps, rows, n)
     used = (_reach(rows @ (problem.B @ K), problem.error_shapes) + _reach(rows, problem.D_u[None])).sum(axis=0)
-    used[len(problem.C) :] += _reach(inputs, problem.error_shapes)
+    used[len(problem.C) :] += _reach(np.concatenate([inputs, pushed @ K]), problem.error_shapes)
+    used[len(used) - len(disturbed) :] += disturbed
     return float(exact.rounded(1.0 / max(float(used.max()), 1e-300), _DIGITS))
 
 

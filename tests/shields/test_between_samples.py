@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Channel, LinearPlant, Packet, truck_trailer
+from ncs_gym import Channel, ChannelContract, LinearPlant, Packet, truck_trailer
 from ncs_gym.network import downlink_protocol
 from shields import Certificate, CertificateError, Infeasible, SafeLoop, SafetyFilter, SafetyShield, synthesize, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
@@ -20,6 +20,7 @@ from shields.runtime.one_step import OneStepTest
 from shields.runtime.polytope_step import grid_test
 from shields.runtime.starts import starts_known
 from shields.synthesis.certification import with_polytope
+from shields.synthesis.network_requirements import with_radii
 from tests.certificates import certificate_of
 
 IDS = {"TruckTrailerCruise": 8, "BatchReactor": 4}
@@ -263,6 +264,24 @@ def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_cert
     synthesize(plant)
     with pytest.raises(Infeasible, match="between"):
         synthesize(replace(plant, between_samples=2))
+
+
+def test_quick_search_for_feasible_bounds_knows_the_times_between_samples():
+    motor = [[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]
+    bounds = {"disturbance_bound": [0.0, 0.48], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
+    limits, contract = {"box": [0.2, 4.0], "u_max": 12.0}, ChannelContract(2)
+    plain, plant = (
+        LinearPlant.from_statespace(motor, dt=0.01, **limits, **bounds, between_samples=points) for points in (None, 4)
+    )
+    synthesize(plain, contract=contract)
+    with pytest.raises(Infeasible, match="of single changes it finds these enough") as caught:
+        synthesize(plant, contract=contract)
+    share, wider = caught.value.details["share_of_radii"], caught.value.details["box_factor"]
+    assert 0.8 < share < 1.0 < wider
+    synthesize(with_radii(plant, disturbance=0.97 * share, noise=0.97 * share), contract=contract)
+    synthesize(replace(plant, box=plant.box_rows / (1.03 * wider)), contract=contract)
+    with pytest.raises(Infeasible):
+        synthesize(with_radii(plant, disturbance=1.05 * share, noise=1.05 * share), contract=contract)
 
 
 @pytest.mark.parametrize("horizon", [1, 4])

@@ -152,5 +152,5 @@ def test_remainder_that_the_box_cannot_bear_is_named():
         initial_bound=0.001,
         remainder=Remainder(Ellipsoid([[0.25]]), True, "an example"),
     )
-    with pytest.raises(Infeasible, match=r"times the given remainder is the largest that works \(shrink the box"):
+    with pytest.raises(Infeasible, match=r"times the given remainder or less \(shrink the box"):
         synthesize(plant, contract=ChannelContract(0))
