@@ -43,7 +43,7 @@ from agents.hyperparams import complete_hyperparams
 from ncs_gym import Ellipsoid, LinearPlant
 from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
 from shields.runtime.backup_plans.plan_check import Tightening
-from shields.runtime.backup_plans.planner import Planner
+from shields.runtime.backup_plans.plan_search import Planner
 
 # Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
 CASES = {

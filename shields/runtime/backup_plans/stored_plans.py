@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.validation import as_numbers
-from shields.runtime.backup_plans.planner import Planner, Plans
+from shields.runtime.backup_plans.plan_search import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
 from shields.runtime.polytope_step import PolytopeTest

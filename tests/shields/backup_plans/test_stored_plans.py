@@ -5,10 +5,10 @@ import pytest
 
 from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.runtime.backup_plans.planner import Plans
+from shields.runtime.backup_plans.plan_search import Plans
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
-from tests.shields.lookahead.adversary import box_ellipsoid, case
+from tests.shields.backup_plans.adversary import box_ellipsoid, case
 
 COUNT = 6
 

@@ -11,8 +11,8 @@ from shields.runtime.backup_plans import plan_check as plan_test
 from shields.runtime.backup_plans.plan_check import tightenings
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
 from tests.certificates import certificate_of
-from tests.shields.lookahead.adversary import CASES, OUTSIDE, WeakestPoint, attack, box_ellipsoid, case, extremal_env
-from tests.shields.lookahead.test_planner import FAILURES, break_solver
+from tests.shields.backup_plans.adversary import CASES, OUTSIDE, WeakestPoint, attack, box_ellipsoid, case, extremal_env
+from tests.shields.backup_plans.test_plan_search import FAILURES, break_solver
 
 POLICIES = ("random", "outwards", "constant")
 MOST_TRIED = "cruise", "cart-pole", "batch reactor"
