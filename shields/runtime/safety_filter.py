@@ -104,7 +104,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     @cached_property
     def projection_margin(self) -> float:
-        """The slack a projected input needs: the margin, and what rounding the action to float32 can move x+."""
+        """The test margin a projected input needs: MARGIN, and what rounding the action to float32 can move x+."""
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
 
     def decide(
@@ -149,8 +149,8 @@ class SafetyFilter(ReadOnlyArrays):
         pairs = zip(proposed.tolist(), self.test.limits, strict=True)
         if alone is None or not all([-limit <= u <= limit for u, limit in pairs]):
             return None
-        slack, margin = alone.slack(proposed)
-        if slack >= MARGIN:
+        test_margin, margin = alone.margins(proposed)
+        if test_margin >= MARGIN:
             return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
         if self.lookahead is not None:
             plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
@@ -160,8 +160,8 @@ class SafetyFilter(ReadOnlyArrays):
         if self.mode != "project" or self.plant.m > 1:
             return None
         closest = self._expressible(np.array([alone.closest(proposed.item(), self.projection_margin)]))
-        slack, margin = alone.slack(closest)
-        if not slack >= MARGIN:  # neither NaN
+        test_margin, margin = alone.margins(closest)
+        if not test_margin >= MARGIN:  # neither NaN
             return None
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
@@ -178,8 +178,8 @@ class SafetyFilter(ReadOnlyArrays):
             stored: In mode "lookahead" the `plan` of the last decisions, shape (horizon, m, N); None for none.
         """
         sets = self.test.reachable(estimates, errors)
-        slack, margin = sets.slack(proposed)
-        judged = sets.smallest_slack() if self.mode == "boundary" else slack
+        test_margin, margin = sets.margins(proposed)
+        judged = sets.smallest_test_margin() if self.mode == "boundary" else test_margin
         within: np.ndarray = np.abs(proposed) <= self.plant.u_max[:, None]
         valid: np.ndarray = within[0] if len(within) == 1 else np.all(within, axis=0)
         passed = (judged >= MARGIN) & valid
@@ -280,7 +280,7 @@ class SafetyFilter(ReadOnlyArrays):
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:
         """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""
         x_hat, u = _as_column(_as_array(estimate), self.plant.n), _as_column(_as_array(u), self.plant.m)
-        return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).slack(u)[1].item()
+        return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).margins(u)[1].item()
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
@@ -304,8 +304,8 @@ class SafetyFilter(ReadOnlyArrays):
         if some.size:
             sets = sets.some(some)
             closest = self._expressible(sets.closest(decided.input[:, some], self.projection_margin))
-            slack, margin = sets.slack(closest)
-            found = slack >= MARGIN
+            test_margin, margin = sets.margins(closest)
+            found = test_margin >= MARGIN
             some = some[found]
             decided.input[:, some], decided.margin[some] = closest[:, found], margin[found]
             decided.passed[some], decided.reason[some] = True, PROJECTED
@@ -320,9 +320,9 @@ class SafetyFilter(ReadOnlyArrays):
             gained = np.where(exists, gained, 0.0)
             differs, valid = (gained != proposed).any(axis=0), valid[some]
             applied = np.where(valid, proposed, gained) if self.mode == "monitor" else gained
-            slack, margin = sets.slack(applied)
+            test_margin, margin = sets.margins(applied)
             decided.input[:, some], decided.margin[some] = applied, margin
-            decided.intervened[some], decided.passed[some] = differs, slack >= MARGIN
+            decided.intervened[some], decided.passed[some] = differs, test_margin >= MARGIN
             unsafe = (applied != gained).any(axis=0)
             decided.fallback[some] = exists & ~unsafe
             reason = np.where(unsafe, UNSAFE, FALLBACK)

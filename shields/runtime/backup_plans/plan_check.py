@@ -70,13 +70,13 @@ class PlanTest:
         return self._table.some(numbers)
 
     @np.errstate(all="ignore")  # what is not finite is not certified
-    def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
+    def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
         """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
         size = np.abs(estimates)
-        rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
-        box = tightening.room - rounding - self._margin
+        rounding = (size @ self._row_rounding).reshape(tightening.row_limits.shape)
+        row_limits = tightening.row_limits - rounding - self._margin
         radius = tightening.radius - size @ self._end_rounding  # far below zero for estimates that are too far out
-        return box, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
+        return row_limits, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
     def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns row c_j, shape (N, r, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast."""
@@ -96,9 +96,9 @@ class PlanTest:
         if len(plans) > block:
             parts = [slice(start, start + block) for start in range(0, len(plans), block)]
             return np.concatenate([self.certified(estimates[e], tightening.some(e), plans[e]) for e in parts])
-        room, radius = self.room(estimates, tightening)
+        row_limits, radius = self.limits_at(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
-        within = np.abs(values) <= room.transpose(1, 2, 0)[..., None]
+        within = np.abs(values) <= row_limits.transpose(1, 2, 0)[..., None]
         inside = np.all(within[:, : len(self.prediction.plant.box_rows)], axis=1)
         kept = np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
         if not self.prediction.ends:
@@ -205,21 +205,21 @@ class PlanGrid:
         self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
         self._arriving = test.disturbed
 
-    def room(self, shapes: np.ndarray) -> np.ndarray:
+    def row_limits(self, shapes: np.ndarray) -> np.ndarray:
         """Returns 1 - rho_i less the rounding that does not depend on the estimate, (E, N, g), of shapes (E, n, n)."""
         rounding = self._rounding[:, None]
         reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
         return 1.0 - reach * (1.0 + rounding) - rounding * self._pushed
 
-    def keeps(self, estimates: np.ndarray, room: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
+    def keeps(self, estimates: np.ndarray, row_limits: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
         """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P).
 
-        For shapes see `PlanTest`; `room` is what the method of that name returns for the error shape of each.
+        For shapes see `PlanTest`; `row_limits` are what the method of that name returns for the error shape of each.
         """
         steps, g, n = self.free.shape
         count, number = plans.shape[:2]
         rounding = np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T
-        left = room - rounding.reshape(count, steps, g)
+        left = row_limits - rounding.reshape(count, steps, g)
         values = (self.forced.reshape(steps * g, -1) @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         values += (self.free.reshape(-1, n) @ estimates.T)[..., None]
         inside = np.abs(values.reshape(steps, g, count, number)) <= left.transpose(1, 2, 0)[..., None] - margin
@@ -254,8 +254,8 @@ class EndTest(OneStepTest):
         for i in range(steps):
             root = self.root @ prediction.free[i - 1] if i else self.root
             reach = size @ prediction.size_free[i - 1] if i else size
-            room = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
-            parts.append(root @ plant.disturbance.shape_matrix @ root.T + room * np.eye(n))
+            rounding = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
+            parts.append(root @ plant.disturbance.shape_matrix @ root.T + rounding * np.eye(n))
         widths = np.sqrt([np.trace(part) for part in parts])
         widths = np.maximum(widths, SMALLEST_MULTIPLIER * widths.max())
         D = sum(part * (widths.sum() / width) for part, width in zip(parts, widths, strict=True))
@@ -267,16 +267,16 @@ class Tightening(NamedTuple):
     """What errors and disturbances leave of the box and of S or P, for E error shapes.
 
     Attributes:
-        room: 1 - rho_j(row) less the rounding that does not depend on the estimate, shape (E, N, r) for the rows of the
-            `Prediction`; NaN for an unusable shape.
+        row_limits: 1 - rho_j(row) less the rounding that does not depend on the estimate, shape (E, N, r) for the rows
+            of the `Prediction`; NaN for an unusable shape.
         weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
             |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
             for an unusable shape.
-        between: `PlanGrid.room`, shape (E, N, g); g is 0 where the box counts at samples alone.
+        between: `PlanGrid.row_limits`, shape (E, N, g); g is 0 where the box counts at samples alone.
     """
 
-    room: np.ndarray
+    row_limits: np.ndarray
     weighting: np.ndarray
     radius: np.ndarray
     between: np.ndarray
@@ -286,7 +286,7 @@ class Tightening(NamedTuple):
         return Tightening(*(part[chosen] for part in self))
 
 
-@np.errstate(all="ignore")  # what overflows leaves no room
+@np.errstate(all="ignore")  # what overflows passes no test
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 
@@ -302,7 +302,7 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
     grid = prediction.grid
-    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
+    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.row_limits(symmetric)
     nothing = np.empty((0, *shapes.shape[1:]))
     if not prediction.ends:
         usable = judged_shapes(shapes, nothing)[1] & np.isfinite(reach).all(axis=(1, 2))

@@ -163,11 +163,11 @@ class Planner:
         The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
         as every shorter length besides. Of its plan the shortest part that is certified counts.
         """
-        limits, (box, radius) = self._plant.u_max, self.test.room(estimates, tightening)
+        limits, (row_limits, radius) = self._plant.u_max, self.test.limits_at(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
         for e, u in enumerate(proposed):
             last = tightening.weighting[e, -1], float(radius[e, -1])
-            found = self._program.solve(estimates[e], box[e], *last, tightening.between[e], u)
+            found = self._program.solve(estimates[e], row_limits[e], *last, tightening.between[e], u)
             if found is not None:
                 tried[e] = expressible(found, limits)
                 if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():
@@ -232,7 +232,7 @@ class PlanProgram:
     def solve(
         self,
         estimate: np.ndarray,
-        room: np.ndarray,
+        row_limits: np.ndarray,
         weighting: np.ndarray,
         radius: float,
         between: np.ndarray,
@@ -242,7 +242,7 @@ class PlanProgram:
 
         Args:
             estimate: x_hat, shape (n,).
-            room: Largest |row c_j| for j = 1..N, shape (N, r).
+            row_limits: Largest |row c_j| for j = 1..N, shape (N, r).
             weighting: T G of the last step, shape (n, n), or (0, n) for an end in P.
             radius: Largest |T G c_j| of the last step.
             between: Largest values of the rows of the grid in every step, shape (N, g).
@@ -253,7 +253,7 @@ class PlanProgram:
         """
         centers = self._free @ estimate
         moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
-        left = [room[:-1, : len(self._C)].ravel(), room[-1, : len(self._G)], between.ravel()]
+        left = [row_limits[:-1, : len(self._C)].ravel(), row_limits[-1, : len(self._G)], between.ravel()]
         drift, allowed = np.concatenate(moved), np.concatenate(left) - self._margin
         ones = np.ones(2 * self._length * self._m)
         cone = np.concatenate([[radius - self._end_margin], weighting @ centers[-1]])[: self._cone]

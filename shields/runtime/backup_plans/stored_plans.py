@@ -76,8 +76,8 @@ class Lookahead:
         some = some[changed | left]
         if some.size:
             decided.intervened[some] = (decided.input[:, some] != proposed[:, some]).any(axis=0)
-            slack, decided.margin[some] = sets.some(some).slack(decided.input[:, some])
-            decided.passed[some] = (slack >= self._margin) | (decided.reason[some] == PLANNED)
+            test_margin, decided.margin[some] = sets.some(some).margins(decided.input[:, some])
+            decided.passed[some] = (test_margin >= self._margin) | (decided.reason[some] == PLANNED)
 
     def _plan(
         self,

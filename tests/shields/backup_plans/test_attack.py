@@ -60,13 +60,13 @@ def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):
 def without_tightening(prediction, shapes):
     """Box rows as if states were known and nothing disturbed them."""
     known = tightenings(prediction, shapes)
-    return known._replace(room=np.ones_like(known.room))
+    return known._replace(row_limits=np.ones_like(known.row_limits))
 
 
 def without_a_step_of_disturbance(prediction, shapes):
     """The last step's disturbance is left out of every row."""
     known, plant = tightenings(prediction, shapes), prediction.plant
-    return known._replace(room=known.room + plant.disturbance.support(prediction.rows))
+    return known._replace(row_limits=known.row_limits + plant.disturbance.support(prediction.rows))
 
 
 @pytest.mark.parametrize("mutation", [without_tightening, without_a_step_of_disturbance])
