@@ -78,7 +78,7 @@ class PolytopeTest:
         self.shift = float((np.abs(self.effect) @ plant.u_max).max())
         D = plant.disturbance.shape_matrix
         extent = float(self.own_columns @ np.sqrt(np.diag(D)))
-        disturbed = supports(self.root, D[None], self.rounding * extent**2)[:, 0]
+        disturbed = supports(self.root, D, self.rounding * extent**2)
         self.disturbed = read_only(np.concatenate([disturbed, grid.disturbed]))
 
     @np.errstate(all="ignore")  # what overflows passes no test, what underflows does not count
@@ -87,9 +87,9 @@ class PolytopeTest:
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
         spread, own_spread = half_widths @ self.columns, half_widths @ self.own_columns
-        reach = supports(self.moved, symmetric, self.rounding * spread**2) + self.disturbed[:, None]
+        reach = supports(self.moved, symmetric, self.rounding * spread[:, None] ** 2).T + self.disturbed[:, None]
         row_limits = 1.0 - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
-        own = supports(self.root, symmetric, self.rounding * own_spread**2)
+        own = supports(self.root, symmetric, self.rounding * own_spread[:, None] ** 2).T
         usable &= np.isfinite(row_limits).all(axis=0) & np.isfinite(own).all(axis=0)
         unusable = np.where(usable, 0.0, np.nan)
         return PredictedErrors(
@@ -335,7 +335,7 @@ def grid_test(plant: LinearPlant) -> GridTest:
         return GridTest(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0), rows)
     D, rounding = plant.disturbance.shape_matrix, 8.0 * plant.n * float(np.finfo(float).eps)
     left = (1.0 - grid.remainder) / _OUTWARD
-    rho = supports(rows, D[None], rounding * (np.abs(rows) @ np.sqrt(np.diag(D)))[:, None] ** 2)[:, 0]
+    rho = supports(rows, D, rounding * (np.abs(rows) @ np.sqrt(np.diag(D))) ** 2)
     at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
     count = len(grid.state) - 1
     return GridTest(
@@ -347,12 +347,9 @@ def grid_test(plant: LinearPlant) -> GridTest:
 
 
 def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
-    """Returns upper bounds of sqrt(g S g') for rows g, (r, n), and shapes S, (k, n, n): shape (r, k).
+    """Returns upper bounds of sqrt(g S g'), shape (..., r), for rows g, (..., r, n), and shapes S, (..., n, n).
 
-    Args:
-        rows: g, shape (r, n).
-        shapes: S, shape (k, n, n).
-        rounding: What computing g S g' is off by at most, for all rows, shape (k,) or a number, or shape (r, 1).
+    Computing g S g' is off by at most the rounding.
     """
-    squares = ((rows @ shapes) * rows).sum(axis=-1).T
+    squares = ((rows @ shapes) * rows).sum(axis=-1)
     return np.sqrt(np.maximum(squares, 0.0) + rounding)

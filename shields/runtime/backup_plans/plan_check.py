@@ -13,7 +13,7 @@ import numpy as np
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
 from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
-from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test
+from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test, supports
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -114,8 +114,7 @@ class PlanTest:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
         rows, extents = self.prediction.rows[: len(self.prediction.plant.box_rows)], np.sqrt(np.diag(error_shape))
         rounding = float(self.prediction.rounding[0])
-        size = np.abs(rows) @ extents
-        reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
+        reach = supports(rows, error_shape, rounding * (np.abs(rows) @ extents) ** 2)
         reach = reach + np.abs(rows @ estimate) + rounding * (np.abs(rows) @ np.abs(estimate))
         return bool((reach <= 1.0 - self._margin).all())
 
@@ -326,6 +325,5 @@ def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding:
         rounding: Relative to products of absolute values, shape (N, 1).
     """
     extents = np.sqrt(np.abs(np.diagonal(shapes, axis1=1, axis2=2)))
-    squares = ((rows @ shapes[:, None]) * rows).sum(axis=-1)
     size = (sizes @ extents[:, None, :, None])[..., 0]
-    return np.sqrt(np.maximum(squares, 0.0) + rounding * size**2)
+    return supports(rows, shapes[:, None], rounding * size**2)
