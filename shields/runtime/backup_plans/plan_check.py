@@ -228,6 +228,8 @@ class PlanGrid:
 class EndTest(OneStepTest):
     """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
 
+    Of its methods `predicted` alone is asked; what the others need is left out.
+
     E(Q_0) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to sqrt(tr Q_i)
     makes the trace smallest, also together with the estimation error that `predicted` adds.
 
@@ -240,12 +242,10 @@ class EndTest(OneStepTest):
     def __init__(self, first: OneStepTest, prediction: Prediction, index: int) -> None:
         plant, steps = first.plant, index + 1
         n, m = plant.n, plant.m
-        self.plant, self.single, self.limits = plant, first.single, first.limits
-        self.root, self.own_columns = first.root, first.own_columns
+        self.plant, self.root, self.own_columns = plant, first.root, first.own_columns
         size = np.abs(self.root)
         self.rounding = float((16.0 * (n + m) * (steps + 2) + 4.0 * n * n) * np.finfo(float).eps)
         self.moved = read_only(self.root @ prediction.free[index])
-        self.effect = read_only(self.root @ prediction.forced[index])
         self.columns = read_only(np.linalg.norm(size @ prediction.size_free[index], axis=0))
         self.pushed = float(np.linalg.norm(size @ prediction.size_forced[index]))
         extents = np.sqrt(np.diag(plant.disturbance.shape_matrix))
