@@ -54,7 +54,6 @@ class OneStepTest:
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest norm of |G| |B| |u| within the limits.
         shift: Largest norm of G B u within the limits, to which the rounding of an action is relative.
-        single: Shapes of a single estimate and input, (n,) and (m,).
         limits: Entries of u_max.
 
     Raises:
@@ -63,7 +62,7 @@ class OneStepTest:
 
     def __init__(self, L: np.ndarray, plant: LinearPlant) -> None:
         self.plant = plant
-        self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
+        self.limits = plant.u_max.tolist()
         self.root = read_only(certified_root(L))
         self.moved = read_only(self.root @ plant.A)
         self.effect = read_only(self.root @ plant.B)

@@ -56,14 +56,13 @@ class PolytopeTest:
         columns, own_columns: Largest entries of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest |G| |B| |u| within the limits.
         shift: Largest |G B u| within the limits, to which the rounding of an action is relative.
-        single: Shapes of a single estimate and input, (n,) and (m,).
         limits: Entries of u_max.
     """
 
     @np.errstate(all="ignore")  # what is not finite passes no test
     def __init__(self, polytope: Polytope | None, plant: LinearPlant) -> None:
         self.plant = plant
-        self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
+        self.limits = plant.u_max.tolist()
         grid = grid_test(plant)
         self.root = np.empty((0, plant.n)) if polytope is None else polytope.rows
         self.moved = read_only(np.concatenate([self.root @ plant.A, grid.moved]))

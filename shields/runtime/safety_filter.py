@@ -103,6 +103,11 @@ class SafetyFilter(ReadOnlyArrays):
             raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
 
     @cached_property
+    def _single(self) -> tuple[tuple[int], tuple[int]]:
+        """Shapes of a single estimate and input."""
+        return (self.plant.n,), (self.plant.m,)
+
+    @cached_property
     def projection_margin(self) -> float:
         """The test margin a projected input needs: MARGIN, and what rounding the action to float32 can move x+."""
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
@@ -120,7 +125,7 @@ class SafetyFilter(ReadOnlyArrays):
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
-        if (x_hat.shape, proposed.shape) != self.test.single:
+        if (x_hat.shape, proposed.shape) != self._single:
             self._tell_of_shapes(estimate, input_proposed)
         return self.decide_knowing(x_hat, self.errors_of(error_shape), proposed, stored)
 
@@ -128,7 +133,7 @@ class SafetyFilter(ReadOnlyArrays):
         self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any = ()
     ) -> Decision:
         """Returns what `decide` does, given what `errors_of` returns for the error shape."""
-        if (estimate.shape, proposed.shape) == self.test.single and self.mode != "boundary":
+        if (estimate.shape, proposed.shape) == self._single and self.mode != "boundary":
             try:
                 decision = self._decide_single(estimate, errors, proposed)
             except FloatingPointError:  # underflow, where numpy is told to raise
@@ -215,7 +220,7 @@ class SafetyFilter(ReadOnlyArrays):
         Raises:
             ValueError: If an argument does not consist of numbers of these shapes.
         """
-        (n,), (m,) = self.test.single
+        (n,), (m,) = self._single
         numbers = {"estimates": estimates, "error_shapes": error_shapes, "proposals": proposals}
         arrays = {name: _as_array(value) for name, value in numbers.items()}
         count = len(arrays["estimates"]) if arrays["estimates"].ndim == 2 else 0
@@ -240,7 +245,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
         """Warns the caller of `decide` of what is no single estimate or input; what is decided then is K x_hat."""
-        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self.test.single, strict=True):
+        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self._single, strict=True):
             if (array := _as_array(value)).shape != (size,):
                 got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"
                 warnings.warn(
