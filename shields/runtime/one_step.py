@@ -137,7 +137,7 @@ class OneStepTest:
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
 
-        Of estimates of shape (n, N), or of one of shape (n,).
+        For estimates of shape (n, N), or a single one, (n,).
         """
         level = norms(self.root.dot(estimates)) + errors.own[0]
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
@@ -183,7 +183,7 @@ class ReachableSets(NamedTuple):
 
     def smallest_test_margin(self) -> np.ndarray:
         """Returns that of the worst input within the limits, shape (N,): a vertex, since the norm is convex."""
-        vertices = np.array(list(product(*((-limit, limit) for limit in self.test.plant.u_max.tolist())))).T
+        vertices = np.array(list(product(*((-limit, limit) for limit in self.test.limits)))).T
         pieces = max(1, vertices.shape[1] * len(self.radius) // LARGEST_BLOCK)
         worst = self.radius
         for some in np.array_split(vertices, pieces, axis=1):
@@ -271,9 +271,9 @@ class PredictedErrors(NamedTuple):
 
 
 def judged_shapes(shapes: np.ndarray, certified_shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the symmetric parts of error shapes, (k, n, n), the identity where one is unusable; and which are usable.
+    """Returns error shapes made symmetric, which are usable, and which lie inside a certified error set.
 
-    The third result is which lie inside a certified error set; both have shape (k,).
+    Shapes are (k, n, n), (k,) and (k,). The identity stands for an unusable one.
     """
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     usable = _are_shapes(symmetric)

@@ -254,7 +254,7 @@ class SetsOnGrid(NamedTuple):
         """Returns inputs within the limits, shape (m, N), near given ones with this test margin.
 
         A single input is in two intervals, and the closest point of one to the closest of the other is that of both.
-        Of several inputs projections alternate: what comes out need not be the closest, and is tested by who asks.
+        Of several inputs projections alternate: the result need not be the closest, nor pass, and the caller tests it.
         """
         for _ in range(1 if len(inputs) == 1 else ALTERNATIONS):
             inputs = self.grid.closest(self.first.closest(inputs, margin), margin)

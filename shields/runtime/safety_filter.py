@@ -244,7 +244,7 @@ class SafetyFilter(ReadOnlyArrays):
         )
 
     def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
-        """Warns the caller of `decide` of what is no single estimate or input; what is decided then is K x_hat."""
+        """Warns the caller of `decide` that estimate or input is not a single one, for which it decides K x_hat."""
         for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self._single, strict=True):
             if (array := _as_array(value)).shape != (size,):
                 got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"

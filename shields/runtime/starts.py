@@ -48,7 +48,7 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
     Args:
         certificate: Gives its polytope, or S = E(L).
         initial: An ellipsoid E(X), inside S exactly if L - X >= 0; or a single state, shape (n,), inside S exactly if
-            [1, x'; x, L] >= 0. Inside a polytope they are exactly if they are between all its pairs of faces.
+            [1, x'; x, L] >= 0. Either is inside a polytope exactly if it is between all its pairs of faces.
     """
     if certificate.polytope is not None:
         return _between(certificate.polytope.rows, initial)

@@ -71,7 +71,7 @@ class PlanTest:
 
     @np.errstate(all="ignore")  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
+        """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN if unknown."""
         size = np.abs(estimates)
         rounding = (size @ self._row_rounding).reshape(tightening.row_limits.shape)
         row_limits = tightening.row_limits - rounding - self._margin
@@ -134,14 +134,14 @@ class Prediction:
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
             its others. Those of the box are closer where it counts between samples, too (`GridTest`).
-        grid: What is asked between samples then; None where only these count.
+        grid: What is asked between samples; None where the box counts at samples alone.
         free: A^j, shape (N, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_free: |A|^j, shape (N, n, n).
         size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
-        ends: The test of section "One step" for what is reached at j: c_j + E(Sigma_pred,j) lies in S; N of them. None
-            where plans end in P, of which the rows decide.
+        ends: N tests, of section "One step", whether c_j + E(Sigma_pred,j) lies in S; none where plans end in P, whose
+            rows decide.
     """
 
     def __init__(self, first: OneStepTest | PolytopeTest, steps: int) -> None:

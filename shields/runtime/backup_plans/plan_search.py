@@ -111,7 +111,7 @@ class Planner:
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
         """Returns proposals followed by either loop, (E, 2, N, m), limited after the prediction: one product for all.
 
-        Of a single estimate, shape (n,), and proposal, (m,), without the first axis.
+        A single estimate, shape (n,), and proposal, (m,), give plans without the first axis.
         """
         inputs = np.concatenate([estimates, proposed], axis=-1) @ self._loops
         plans = expressible(inputs.reshape(*inputs.shape[:-1], 2, self.horizon, -1), self._plant.u_max)
@@ -148,7 +148,7 @@ class Planner:
         return plans
 
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
-        """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the first."""
+        """Returns the certified plan, of P of shape (E, P, N, m), that begins closest, and of equal ones the first."""
         certified = self.test.certified(estimates, tightening, plans)
         any_length = certified.any(axis=-1)
         lengths = np.where(any_length, certified.argmax(axis=-1) + 1, 0)
@@ -158,10 +158,10 @@ class Planner:
         return Plans(plans[rows, best], lengths[rows, best], distances[rows, best])
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
-        """Returns what of the program's plans is certified, as inputs that can be applied.
+        """Returns the shortest certified parts of the program's plans, as inputs that can be applied.
 
         The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
-        as every shorter length besides. Of its plan the shortest part that is certified counts.
+        as every shorter length besides.
         """
         limits, (row_limits, radius) = self._plant.u_max, self.test.limits_at(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
