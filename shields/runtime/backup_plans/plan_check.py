@@ -44,7 +44,7 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        sizes = np.abs(prediction.rows) @ prediction.size_free
+        sizes = np.abs(prediction.rows) @ prediction.sizes[1:]
         self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
@@ -135,9 +135,8 @@ class Prediction:
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
             its others. Those of the box are closer where it counts between samples, too (`GridTest`).
         grid: What is asked between samples; None where the box counts at samples alone.
-        free: A^j, shape (N, n, n).
+        powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
-        size_free: |A|^j, shape (N, n, n).
         size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
         ends: N tests, of section "One step", whether c_j + E(Sigma_pred,j) lies in S; none where plans end in P, whose
@@ -154,7 +153,7 @@ class Prediction:
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
             sizes.append(np.abs(plant.A) @ sizes[-1])
-        self.free, self.size_free = read_only(np.array(powers[1:])), read_only(np.array(sizes[1:]))
+        self.powers, self.sizes = read_only(np.array(powers)), read_only(np.array(sizes))
         effects = np.array([power @ plant.B for power in powers[:-1]])
         forced = np.zeros((steps, n, steps, m))
         for j in range(steps):
@@ -165,8 +164,8 @@ class Prediction:
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = () if isinstance(first, PolytopeTest) else tuple(EndTest(first, self, j) for j in range(steps))
         self.grid = None if plant.grid_rows is None else PlanGrid(self, test)
-        self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
-        self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
+        self._free = self.powers[1:].reshape(steps * n, n)
+        self._forced = self.forced.reshape(steps * n, steps * m)
 
     def centers(self, estimates: np.ndarray, plans: np.ndarray) -> np.ndarray:
         """Returns c_1..c_N, shape (N, n, E, P), of P plans for each of E estimates; for shapes see `PlanTest`."""
@@ -190,17 +189,17 @@ class PlanGrid:
 
     def __init__(self, prediction: Prediction, test: GridTest) -> None:
         steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
-        self._shape, self._rounding = prediction.plant.disturbance.shape_matrix, prediction.rounding
-        begun, size = np.eye(n)[None], np.abs(test.moved)
-        self.free = read_only(test.moved @ np.concatenate([begun, prediction.free[:-1]]))
-        self._size = read_only(size @ np.concatenate([begun, prediction.size_free[:-1]]))
+        size, self._rounding = np.abs(test.moved), prediction.rounding
+        self.free = read_only(test.moved @ prediction.powers[:-1])
+        self._size = read_only(size @ prediction.sizes[:-1])
         forced = test.moved @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
         for i in range(steps):
             forced[i, :, i * m : (i + 1) * m] += test.effect
         self.forced = read_only(forced)
         pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
         self._pushed = read_only(pushed + np.abs(test.effect) @ prediction.plant.u_max)
-        own = _supports(self.free, self._size, self._shape[None], self._rounding[:, None])[0]
+        D = prediction.plant.disturbance.shape_matrix
+        own = _supports(self.free, self._size, D[None], self._rounding[:, None])[0]
         self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
         self._arriving = test.disturbed
 
@@ -245,14 +244,13 @@ class EndTest(OneStepTest):
         self.plant, self.root, self.own_columns = plant, first.root, first.own_columns
         size = np.abs(self.root)
         self.rounding = float((16.0 * (n + m) * (steps + 2) + 4.0 * n * n) * np.finfo(float).eps)
-        self.moved = read_only(self.root @ prediction.free[index])
-        self.columns = read_only(np.linalg.norm(size @ prediction.size_free[index], axis=0))
+        self.moved = read_only(self.root @ prediction.powers[steps])
+        self.columns = read_only(np.linalg.norm(size @ prediction.sizes[steps], axis=0))
         self.pushed = float(np.linalg.norm(size @ prediction.size_forced[index]))
         extents = np.sqrt(np.diag(plant.disturbance.shape_matrix))
         parts = []
         for i in range(steps):
-            root = self.root @ prediction.free[i - 1] if i else self.root
-            reach = size @ prediction.size_free[i - 1] if i else size
+            root, reach = self.root @ prediction.powers[i], size @ prediction.sizes[i]
             rounding = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
             parts.append(root @ plant.disturbance.shape_matrix @ root.T + rounding * np.eye(n))
         widths = np.sqrt([np.trace(part) for part in parts])
@@ -293,12 +291,10 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     computed b'Sb is off by at most a relative rounding of (|b|'s)^2, the powers in b included. Shapes are (E, n, n).
     """
     plant, rounding = prediction.plant, prediction.rounding[:, None]
-    rows, sizes = prediction.rows @ prediction.free, np.abs(prediction.rows) @ prediction.size_free
-    earlier = np.concatenate([prediction.rows[None], rows[:-1]])
-    earlier_sizes = np.concatenate([np.abs(prediction.rows)[None], sizes[:-1]])
-    disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape_matrix[None], rounding)[0], axis=0)
+    rows, sizes = prediction.rows @ prediction.powers, np.abs(prediction.rows) @ prediction.sizes
+    added = _supports(rows[:-1], sizes[:-1], plant.disturbance.shape_matrix[None], rounding)[0]
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
-    reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
+    reach = (_supports(rows[1:], sizes[1:], symmetric, rounding) + np.cumsum(added, axis=0)) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
     grid = prediction.grid
     between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.row_limits(symmetric)

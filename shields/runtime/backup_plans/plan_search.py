@@ -190,7 +190,7 @@ class PlanProgram:
         self._m, self._length = plant.m, length
         self._limits, self._weights = plant.u_max, (plant.u_max / plant.u_max.max()) ** 2
         scale = np.tile(plant.u_max, length)
-        self._free = prediction.free
+        self._free = prediction.powers[1:]
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
         self._C = prediction.rows[: len(plant.box_rows)]
