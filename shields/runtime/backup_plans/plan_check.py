@@ -104,7 +104,7 @@ class PlanTest:
         if not self.prediction.ends:
             kept &= np.all(within, axis=1)
         kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
-        if self.prediction.grid is not None:
+        if tightening.between.size:
             kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
         allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
         return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
@@ -134,7 +134,7 @@ class Prediction:
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
             its others. Those of the box are closer where it counts between samples, too (`GridTest`).
-        grid: What is asked between samples; None where the box counts at samples alone.
+        grid: What is asked between samples.
         powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
@@ -163,7 +163,7 @@ class Prediction:
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = () if isinstance(first, PolytopeTest) else tuple(EndTest(first, self, j) for j in range(steps))
-        self.grid = None if plant.grid_rows is None else PlanGrid(self, test)
+        self.grid = PlanGrid(self, test)
         self._free = self.powers[1:].reshape(steps * n, n)
         self._forced = self.forced.reshape(steps * n, steps * m)
 
@@ -177,6 +177,8 @@ class Prediction:
 
 class PlanGrid:
     """The rows of the grid in every step of a plan, i = 0..N-1: |row (A_tau c_i + B_tau u_i)| + rho_i <= 1.
+
+    There are none, g = 0, where the box counts at samples alone.
 
     Args:
         prediction: Of the plant, without its grid.
@@ -270,7 +272,7 @@ class Tightening(NamedTuple):
             |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
             for an unusable shape.
-        between: `PlanGrid.row_limits`, shape (E, N, g); g is 0 where the box counts at samples alone.
+        between: `PlanGrid.row_limits`, shape (E, N, g).
     """
 
     row_limits: np.ndarray
@@ -296,8 +298,7 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     reach = (_supports(rows[1:], sizes[1:], symmetric, rounding) + np.cumsum(added, axis=0)) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
-    grid = prediction.grid
-    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.row_limits(symmetric)
+    between = prediction.grid.row_limits(symmetric)
     nothing = np.empty((0, *shapes.shape[1:]))
     if not prediction.ends:
         usable = judged_shapes(shapes, nothing)[1] & np.isfinite(reach).all(axis=(1, 2))

@@ -194,11 +194,10 @@ class PlanProgram:
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
         self._C = prediction.rows[: len(plant.box_rows)]
-        self._G, grid = prediction.rows[:0] if prediction.ends else prediction.rows, prediction.grid
-        rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end])
-        self._between = np.empty((0, plant.n)) if grid is None else grid.free.reshape(-1, plant.n)
-        if grid is not None:
-            rows = np.concatenate([rows, (grid.forced * scale).reshape(-1, len(scale))])
+        self._G = prediction.rows[:0] if prediction.ends else prediction.rows
+        self._between = prediction.grid.free.reshape(-1, plant.n)
+        between = (prediction.grid.forced * scale).reshape(-1, len(scale))
+        rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end, between])
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
         root = prediction.ends[-1].root if prediction.ends else np.empty((0, plant.n))
