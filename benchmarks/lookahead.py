@@ -43,7 +43,7 @@ from agents.hyperparams import complete_hyperparams
 from ncs_gym import Ellipsoid, LinearPlant
 from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
 from shields.runtime.backup_plans.plan_check import Tightening
-from shields.runtime.backup_plans.planner import Planner
+from shields.runtime.backup_plans.plan_search import Planner
 
 # Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
 CASES = {
@@ -78,7 +78,7 @@ class PlainProgram:
         plant, steps = shield.plant, shield.horizon
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
-        self.room, self.weighting, self.radius = (
+        self.row_limits, self.weighting, self.radius = (
             cp.Parameter((steps, len(self.plans.prediction.rows))),
             cp.Parameter((plant.n, plant.n)),
             cp.Parameter(),
@@ -88,20 +88,20 @@ class PlainProgram:
         constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.u_max, (steps, 1))]
         constraints += [self.c[1:] == self.c[:-1] @ plant.A.T + self.u @ plant.B.T]
         rows, count = self.plans.prediction.rows, len(plant.box_rows)
-        constraints += [cp.abs(self.c[1:-1] @ plant.box_rows.T) <= self.room[:-1, :count]] if steps > 1 else []
+        constraints += [cp.abs(self.c[1:-1] @ plant.box_rows.T) <= self.row_limits[:-1, :count]] if steps > 1 else []
         if self.plans.prediction.ends:
             constraints += [self.weighted == self.weighting @ self.c[-1], cp.norm(self.weighted) <= self.radius]
         else:
-            constraints += [cp.abs(rows @ self.c[-1]) <= self.room[-1]]
+            constraints += [cp.abs(rows @ self.c[-1]) <= self.row_limits[-1]]
         self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u[0] - self.proposed)), constraints)
 
     def solve(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> bool:
         known = self.plans.tightenings_of(shape[None])
-        room, radius = self.plans.room(estimate[None], known)
+        row_limits, radius = self.plans.limits_at(estimate[None], known)
         if not (np.isfinite(radius[0, -1]) and radius[0, -1] > 0.0):
             return False
         self.start.value, self.proposed.value = estimate, proposed
-        self.room.value, self.radius.value = room[0], radius[0, -1]
+        self.row_limits.value, self.radius.value = row_limits[0], radius[0, -1]
         if self.plans.prediction.ends:
             self.weighting.value = known.weighting[0, -1]
         return solved(self.problem)

@@ -151,9 +151,9 @@ def projection_jacobians(
             if np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
                 ball = effect, effect.T @ center
         if rows_of is not None:
-            test, room = rows_of.test, rows_of.room[:, e] - rows_of.rounding[e] - shield.projection_margin
+            test, limit = rows_of.test, rows_of.row_limits[:, e] - rows_of.rounding[e] - shield.projection_margin
             center = np.abs(test.moved @ estimates[e] + test.effect @ u)
-            active = np.vstack([active, test.effect[center >= room - ATTAINED * np.maximum(room, 1e-3)]])
+            active = np.vstack([active, test.effect[center >= limit - ATTAINED * np.maximum(limit, 1e-3)]])
         free = np.eye(len(limits))
         if len(active):
             free = null_space(active / np.linalg.norm(active, axis=1, keepdims=True), rcond=1e-9)

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from ncs_gym import LinearPlant, NCSVectorEnv
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
-from shields.runtime.backup_plans.program import PlanProgram
+from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.one_step import OneStepTest
 from shields.runtime.polytope_step import PolytopeTest, grid_test
 from shields.runtime.safety_filter import SafetyFilter

@@ -76,7 +76,7 @@ class Asking:
         """How far inside S the proposed inputs keep the next state, shape (N,): `Decision.margin`."""
         known, given = self._inner.known, self._shield.filter
         sets = given.test.reachable(np.array(known.estimate, order="C"), given.errors_of_many(known.error_shape))
-        return sets.slack(self._inner.plant.u_max[:, None] * self.proposed.T)[1]
+        return sets.margins(self._inner.plant.u_max[:, None] * self.proposed.T)[1]
 
 
 # Says in which of N loops a sample is asked for, shape (N,).

@@ -26,8 +26,8 @@ class Decision(NamedTuple):
         fallback: Whether it is K x_hat, so that x+ is in S if x is and Sigma_k lies inside the certificate's Sigma.
         margin: 1 - h - |A x_hat + B u|_M at the input to apply, where h is the farthest that error and disturbance
             move x+, measured by |.|_M. Positive only if the test is met; the test is sharper and admits some inputs
-            for which this is slightly negative. With a polytope it is the least slack of the test over the rows. NaN
-            without a usable estimate.
+            for which this is slightly negative. With a polytope it is the least that is left of a row. NaN without a
+            usable estimate.
         reason: "safe" (passed as proposed), "projected", "fallback" (u = K x_hat), "unsafe" (applied as proposed by
             "monitor"), or "invalid" (what was proposed is no input within the limits, or estimate or error shape is
             unusable: u = K x_hat, zero without a usable estimate, in "monitor" what was proposed if it is an input).

@@ -49,9 +49,9 @@ class MonitorState(NamedTuple):
         inside: Whether x in S is proved, up to what broke; in mode "lookahead" also if x is proved in the box and the
             inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
-        wait: Behind a downlink, number of steps until x in S is proved now, if `inside` stays true: that is about the
-            time at which the next input takes effect. Where the box counts between samples, too, also after a step
-            that nothing proved, or that began where nothing did, wherever it led. 0 otherwise.
+        wait: Number of steps until x in S is proved at present, if `inside` stays true. Behind a downlink `inside` is
+            about the time at which the next input takes effect; where the box counts between samples, too, a step
+            whose way is not proved has to be followed by one whose way is. 0 otherwise.
     """
 
     broken: Any
@@ -82,7 +82,7 @@ class GuaranteeMonitor:
     S is the certificate's safe set: its polytope, or its ellipsoid if it has none.
 
     In mode "lookahead" it is whether x is in the box now and stays there: "in S, or in the box with a certified tail
-    stored". Whoever hands the store from decision to decision drops it where the input applied is another one.
+    stored". The caller keeps the store from decision to decision, and drops it where another input is applied.
 
     An alarm of the innovation monitor, an input other than the decided one, a step that is not one step and an estimate
     so far out that rounding counts break the error bound for the rest of the episode. The others are recoverable: a
@@ -101,17 +101,16 @@ class GuaranteeMonitor:
     """
 
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
+        plant, certificate = safety_filter.plant, safety_filter.certificate
         self._input_delay = 0 if downlink is None else downlink.input_delay
-        self._on_grid = safety_filter.plant.grid_rows is not None
+        self._on_grid = plant.grid_rows is not None
         self._is_promised = downlink is None or downlink.contract is not None
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
-        self._reach = SIMULATED_REACH * safety_filter.plant.half_widths / (2.0 if self._input_delay else 1.0)
-        certificate = safety_filter.certificate
+        self._reach = SIMULATED_REACH * plant.half_widths / (2.0 if self._input_delay else 1.0)
         self._has_error_set = certificate.Sigma is not None
         # Of the newest sample at present, while the contract of the certificate holds.
         self._largest_age = np.inf if certificate.contract is None else certificate.contract.max_age - self._input_delay
-        plant = safety_filter.plant
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
         self._under_way = inputs_under_way(plant) if self._is_local else 0

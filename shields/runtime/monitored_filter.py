@@ -24,8 +24,8 @@ class MonitoredFilter:
 
     Args:
         safety_filter: Makes the decisions.
-        downlink: How commands are sent; None for an ideal downlink. What is observed then belongs to the time at which
-            the next input takes effect.
+        downlink: How commands are sent, and then what is observed belongs to the time at which the next input takes
+            effect; None for an ideal downlink.
 
     Attributes:
         filter: The same.
@@ -34,7 +34,7 @@ class MonitoredFilter:
         decided: Entries of the input decided last, [physical units].
     """
 
-    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None) -> None:
         self.filter = safety_filter
         self.input_delay = 0 if downlink is None else downlink.input_delay
         self._monitor = GuaranteeMonitor(safety_filter, downlink)

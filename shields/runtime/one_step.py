@@ -54,7 +54,6 @@ class OneStepTest:
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest norm of |G| |B| |u| within the limits.
         shift: Largest norm of G B u within the limits, to which the rounding of an action is relative.
-        single: Shapes of a single estimate and input, (n,) and (m,).
         limits: Entries of u_max.
 
     Raises:
@@ -63,7 +62,7 @@ class OneStepTest:
 
     def __init__(self, L: np.ndarray, plant: LinearPlant) -> None:
         self.plant = plant
-        self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
+        self.limits = plant.u_max.tolist()
         self.root = read_only(certified_root(L))
         self.moved = read_only(self.root @ plant.A)
         self.effect = read_only(self.root @ plant.B)
@@ -111,7 +110,7 @@ class OneStepTest:
             radius=radius + unusable,
             half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
             own=(np.sqrt(np.maximum(own, 0.0)) + unusable)[None],
-            room=np.empty((0, len(shapes))),
+            row_limits=np.empty((0, len(shapes))),
             certified=inside & usable,
             shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
         )
@@ -138,7 +137,7 @@ class OneStepTest:
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
 
-        Of estimates of shape (n, N), or of one of shape (n,).
+        For estimates of shape (n, N), or a single one, (n,).
         """
         level = norms(self.root.dot(estimates)) + errors.own[0]
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
@@ -152,6 +151,12 @@ class OneStepTest:
 
 class ReachableSets(NamedTuple):
     """Where next states lie: in {A x_hat + B u} + E(Sigma_pred), for each of N environments.
+
+    Errors, disturbance and rounding are taken off the limits first. What is left for A x_hat + B u is the `radius`, of
+    rows the `row_limits`; what an input leaves of that is its margin, which is negative where it asks for more. The
+    test margin, radius - |T G (A x_hat + B u)|, decides: x+ is in S unless it is negative. The reported margin,
+    1 - h - |A x_hat + B u|_M less rounding (`Decision.margin`), is at most that. Of rows both are the least
+    row limit - |g (A x_hat + B u)|.
 
     Attributes:
         test: What holds for all of them.
@@ -170,19 +175,15 @@ class ReachableSets(NamedTuple):
         offset, weighting, radius = (array.take(chosen, axis=-1) for array in self[1:])
         return ReachableSets(self.test, offset, weighting, radius)
 
-    def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
-
-        The slack is radius - |T G (A x_hat + B u)|: x+ is in S unless it is negative. The margin is
-        1 - h - |A x_hat + B u|_M less rounding, which is at most the slack.
-        """
+    def margins(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns test and reported margins of inputs u, shape (m, N); shape (N,), NaN where nothing is known."""
         effect = self.test.effect  # with a single input, products without the sums are the same and faster
         center = self.offset + (effect * inputs if len(inputs) == 1 else effect @ inputs)
         return self.radius - norms((self.weighting * center).sum(axis=1)), self.radius - norms(center)
 
-    def smallest_slack(self) -> np.ndarray:
-        """Returns the slack of the worst input within the limits, shape (N,): a vertex, since the norm is convex."""
-        vertices = np.array(list(product(*((-limit, limit) for limit in self.test.plant.u_max.tolist())))).T
+    def smallest_test_margin(self) -> np.ndarray:
+        """Returns that of the worst input within the limits, shape (N,): a vertex, since the norm is convex."""
+        vertices = np.array(list(product(*((-limit, limit) for limit in self.test.limits)))).T
         pieces = max(1, vertices.shape[1] * len(self.radius) // LARGEST_BLOCK)
         worst = self.radius
         for some in np.array_split(vertices, pieces, axis=1):
@@ -192,7 +193,7 @@ class ReachableSets(NamedTuple):
         return worst
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the inputs within the limits, (m, N), closest to given ones with a slack of `margin`, else NaN."""
+        """Returns the inputs within the limits, (m, N), closest to given ones with this test margin, else NaN."""
         effect = (self.weighting[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
         offset = (self.weighting * self.offset).sum(axis=1)
         return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
@@ -213,8 +214,8 @@ class ReachableSet(NamedTuple):
     weighting: np.ndarray
     radius: float
 
-    def slack(self, u: np.ndarray) -> tuple[float, float]:
-        """Returns slack and margin of an input u, shape (m,)."""
+    def margins(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns test and reported margin of an input u, shape (m,)."""
         center = self.offset + self.test.effect.dot(u)
         weighted = self.weighting.dot(center)
         return self.radius - float(weighted.dot(weighted)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
@@ -230,13 +231,13 @@ class PredictedErrors(NamedTuple):
     """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
 
     The norm of S is weighted, a polytope and the grid between samples are judged row by row; what a test does not need
-    has no entries. Radius, half_widths, own and room are NaN for an unusable shape.
+    has no entries. Radius, half_widths, own and row_limits are NaN for an unusable shape.
 
     Attributes:
         weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
-        room: 1 - sqrt(g A Sigma_k A' g') - sqrt(g D g') less the rounding that does not depend on the estimate, for
-            rows g, shape (r, k).
-        radius: 1 - h less that rounding; of a polytope the least room, shape (k,).
+        row_limits: 1 - sqrt(g A Sigma_k A' g') - sqrt(g D g') less the rounding that does not depend on the estimate,
+            for rows g, shape (r, k).
+        radius: 1 - h less that rounding; of a polytope the least row limit, shape (k,).
         half_widths: Largest error of each state, shape (n, k).
         own: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope sqrt(g Sigma_k
             g'), shape (r, k).
@@ -245,7 +246,7 @@ class PredictedErrors(NamedTuple):
     """
 
     weighting: np.ndarray
-    room: np.ndarray
+    row_limits: np.ndarray
     radius: Any
     half_widths: np.ndarray
     own: np.ndarray
@@ -270,9 +271,9 @@ class PredictedErrors(NamedTuple):
 
 
 def judged_shapes(shapes: np.ndarray, certified_shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the symmetric parts of error shapes, (k, n, n), the identity where one is unusable; and which are usable.
+    """Returns error shapes made symmetric, which are usable, and which lie inside a certified error set.
 
-    The third result is which lie inside a certified error set; both have shape (k,).
+    Shapes are (k, n, n), (k,) and (k,). The identity stands for an unusable one.
     """
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     usable = _are_shapes(symmetric)
@@ -332,7 +333,7 @@ def certified_root(L: np.ndarray) -> np.ndarray:
 
 
 def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
-    """Raises unless float64 computes K x_hat on S, or the polytope, more accurately than the conditions make room for.
+    """Raises unless float64 computes K x_hat on S, or the polytope, more accurately than the conditions allow for.
 
     D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
 

@@ -56,14 +56,13 @@ class PolytopeTest:
         columns, own_columns: Largest entries of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest |G| |B| |u| within the limits.
         shift: Largest |G B u| within the limits, to which the rounding of an action is relative.
-        single: Shapes of a single estimate and input, (n,) and (m,).
         limits: Entries of u_max.
     """
 
-    @np.errstate(all="ignore")  # what is not finite leaves no room
+    @np.errstate(all="ignore")  # what is not finite passes no test
     def __init__(self, polytope: Polytope | None, plant: LinearPlant) -> None:
         self.plant = plant
-        self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
+        self.limits = plant.u_max.tolist()
         grid = grid_test(plant)
         self.root = np.empty((0, plant.n)) if polytope is None else polytope.rows
         self.moved = read_only(np.concatenate([self.root @ plant.A, grid.moved]))
@@ -78,24 +77,24 @@ class PolytopeTest:
         self.shift = float((np.abs(self.effect) @ plant.u_max).max())
         D = plant.disturbance.shape_matrix
         extent = float(self.own_columns @ np.sqrt(np.diag(D)))
-        disturbed = supports(self.root, D[None], self.rounding * extent**2)[:, 0]
+        disturbed = supports(self.root, D, self.rounding * extent**2)
         self.disturbed = read_only(np.concatenate([disturbed, grid.disturbed]))
 
-    @np.errstate(all="ignore")  # what overflows leaves no room, what underflows does not count
+    @np.errstate(all="ignore")  # what overflows passes no test, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
         """Returns what the test and the guarantee need of error shapes; see `OneStepTest.predicted`."""
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
         spread, own_spread = half_widths @ self.columns, half_widths @ self.own_columns
-        reach = supports(self.moved, symmetric, self.rounding * spread**2) + self.disturbed[:, None]
-        room = 1.0 - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
-        own = supports(self.root, symmetric, self.rounding * own_spread**2)
-        usable &= np.isfinite(room).all(axis=0) & np.isfinite(own).all(axis=0)
+        reach = supports(self.moved, symmetric, self.rounding * spread[:, None] ** 2).T + self.disturbed[:, None]
+        row_limits = 1.0 - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
+        own = supports(self.root, symmetric, self.rounding * own_spread[:, None] ** 2).T
+        usable &= np.isfinite(row_limits).all(axis=0) & np.isfinite(own).all(axis=0)
         unusable = np.where(usable, 0.0, np.nan)
         return PredictedErrors(
             weighting=np.empty((0, 0, len(shapes))),
-            room=np.ascontiguousarray(room + unusable),
-            radius=room.min(axis=0) + unusable,
+            row_limits=np.ascontiguousarray(row_limits + unusable),
+            radius=row_limits.min(axis=0) + unusable,
             half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
             own=np.ascontiguousarray(own + unusable),
             certified=inside & usable,
@@ -106,14 +105,14 @@ class PolytopeTest:
         """Returns the `PolytopeSets` of next states that N estimates allow, shape (n, N)."""
         reach = self.columns @ np.abs(estimates)
         rounding = np.where(reach < FARTHEST, self.rounding * reach, np.nan)  # what is too far out is unknown
-        return PolytopeSets(self, estimates, errors.room, rounding, errors.radius - rounding)
+        return PolytopeSets(self, estimates, errors.row_limits, rounding, errors.radius - rounding)
 
     def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> Any:
         """Returns the `PolytopeSet` of one estimate, shape (n,), and one error shape; None if nothing passes."""
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         if not errors.radius - rounding >= SMALLEST_RADIUS:  # neither NaN
             return None
-        return PolytopeSet(self, estimate, self.moved.dot(estimate), errors.room - rounding)
+        return PolytopeSet(self, estimate, self.moved.dot(estimate), errors.row_limits - rounding)
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
@@ -130,7 +129,7 @@ class PolytopeTest:
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.moved[first:].dot(estimate)
         values = values if u is None else values + self.effect[first:].dot(u)
-        return bool((np.abs(values) <= errors.room[first:] - rounding - margin).all())
+        return bool((np.abs(values) <= errors.row_limits[first:] - rounding - margin).all())
 
 
 class PolytopeSets(NamedTuple):
@@ -139,14 +138,14 @@ class PolytopeSets(NamedTuple):
     Attributes:
         test: What holds for all of them.
         estimates: x_hat, shape (n, N).
-        room: Largest |g (A x_hat + B u)| that passes, shape (r, N), before
-        rounding: what it loses by rounding, shape (N,); NaN if nothing is known.
-        radius: The least room left, shape (N,).
+        row_limits: Largest |g (A x_hat + B u)| that passes, shape (r, N), before
+        rounding: what they lose by rounding, shape (N,); NaN if nothing is known.
+        radius: The least row limit left, shape (N,).
     """
 
     test: PolytopeTest
     estimates: np.ndarray
-    room: np.ndarray
+    row_limits: np.ndarray
     rounding: np.ndarray
     radius: np.ndarray
 
@@ -154,27 +153,27 @@ class PolytopeSets(NamedTuple):
         """Returns those of some environments, given by their indices."""
         return PolytopeSets(self.test, *(array.take(chosen, axis=-1) for array in self[1:]))
 
-    def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what `ReachableSets.slack` does, twice: the least room - |g (A x_hat + B u)| over the rows, (N,)."""
+    def margins(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what `ReachableSets.margins` does."""
         joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
         block = max(1, BLOCK // len(self.test.moved))
         for start in range(0, len(least), block):
             part = slice(start, start + block)
             center = self.test.joint @ joint[:, part]
             np.abs(center, out=center)
-            np.subtract(self.room[:, part], center, out=center)
+            np.subtract(self.row_limits[:, part], center, out=center)
             least[part] = center.min(axis=0)
-        slack = least - self.rounding
-        return slack, slack.copy()
+        least -= self.rounding
+        return least, least.copy()
 
-    def smallest_slack(self) -> np.ndarray:
-        """Returns the slack of the worst input within the limits, shape (N,)."""
+    def smallest_test_margin(self) -> np.ndarray:
+        """Returns that of the worst input within the limits, shape (N,)."""
         worst = np.abs(self.test.effect) @ self.test.plant.u_max
         center = np.abs(self.test.moved @ self.estimates)
-        return (self.room - center - worst[:, None]).min(axis=0) - self.rounding
+        return (self.row_limits - center - worst[:, None]).min(axis=0) - self.rounding
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the closest inputs with a slack of `margin`, as `ReachableSets.closest` does."""
+        """Returns what `ReachableSets.closest` does."""
         limits, count = self.test.plant.u_max, inputs.shape[1]
         block = max(1, BLOCK // (len(self.test.moved) * len(limits)))
         if len(limits) > 1 and count > block:
@@ -182,8 +181,8 @@ class PolytopeSets(NamedTuple):
             return np.hstack([self.some(part).closest(inputs[:, part], margin) for part in parts])
         rows = np.concatenate([self.test.effect, np.eye(len(limits))])
         offset = np.concatenate([self.test.moved @ self.estimates, np.zeros(inputs.shape)])
-        room = np.concatenate([self.room - self.rounding - margin, np.repeat(limits[:, None], count, axis=1)])
-        return closest_between(inputs, offset, rows[..., None], room)
+        bounds = np.concatenate([self.row_limits - self.rounding - margin, np.repeat(limits[:, None], count, axis=1)])
+        return closest_between(inputs, offset, rows[..., None], bounds)
 
 
 class EllipsoidOnGrid(OneStepTest):
@@ -203,9 +202,9 @@ class EllipsoidOnGrid(OneStepTest):
         self.shift = max(self.shift, self.grid.shift)
 
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
-        """Returns what `OneStepTest.predicted` does, and what is left of the grid's rows as `room`."""
-        room = self.grid.predicted(shapes, certified_shapes[:0]).room
-        return super().predicted(shapes, certified_shapes)._replace(room=room)
+        """Returns what `OneStepTest.predicted` does, and the row limits of the grid."""
+        row_limits = self.grid.predicted(shapes, certified_shapes[:0]).row_limits
+        return super().predicted(shapes, certified_shapes)._replace(row_limits=row_limits)
 
     def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> Any:
         """Returns the `SetsOnGrid` of next states and of states until then."""
@@ -243,19 +242,19 @@ class SetsOnGrid(NamedTuple):
         """Returns those of some environments, given by their indices."""
         return SetsOnGrid(self.first.some(chosen), self.grid.some(chosen))
 
-    def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the smaller slack and margin of inputs u, shape (m, N); each has shape (N,)."""
-        return tuple(map(np.minimum, self.first.slack(inputs), self.grid.slack(inputs)))  # pyright: ignore
+    def margins(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the smaller test and reported margins of inputs u, shape (m, N); each has shape (N,)."""
+        return tuple(map(np.minimum, self.first.margins(inputs), self.grid.margins(inputs)))  # pyright: ignore
 
-    def smallest_slack(self) -> np.ndarray:
-        """Returns the slack of the worst input within the limits, shape (N,)."""
-        return np.minimum(self.first.smallest_slack(), self.grid.smallest_slack())
+    def smallest_test_margin(self) -> np.ndarray:
+        """Returns that of the worst input within the limits, shape (N,)."""
+        return np.minimum(self.first.smallest_test_margin(), self.grid.smallest_test_margin())
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns inputs within the limits, shape (m, N), near given ones with a slack of `margin`.
+        """Returns inputs within the limits, shape (m, N), near given ones with this test margin.
 
         A single input is in two intervals, and the closest point of one to the closest of the other is that of both.
-        Of several inputs projections alternate: what comes out need not be the closest, and is tested by who asks.
+        Of several inputs projections alternate: the result need not be the closest, nor pass, and the caller tests it.
         """
         for _ in range(1 if len(inputs) == 1 else ALTERNATIONS):
             inputs = self.grid.closest(self.first.closest(inputs, margin), margin)
@@ -268,9 +267,9 @@ class SetOnGrid(NamedTuple):
     first: ReachableSet
     grid: PolytopeSet
 
-    def slack(self, u: np.ndarray) -> tuple[float, float]:
-        """Returns the smaller slack and margin of an input u, shape (m,)."""
-        return tuple(map(min, self.first.slack(u), self.grid.slack(u)))  # pyright: ignore
+    def margins(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns the smaller test and reported margin of an input u, shape (m,)."""
+        return tuple(map(min, self.first.margins(u), self.grid.margins(u)))  # pyright: ignore
 
     def closest(self, u: float, margin: float) -> float:
         """Returns what `SetsOnGrid.closest` does for plants with a single input."""
@@ -284,22 +283,23 @@ class PolytopeSet(NamedTuple):
         test: What holds for all environments.
         estimate: x_hat, shape (n,).
         offset: G A x_hat, shape (r,).
-        room: Largest |g (A x_hat + B u)| that passes, shape (r,).
+        row_limits: Largest |g (A x_hat + B u)| that passes, shape (r,).
     """
 
     test: PolytopeTest
     estimate: np.ndarray
     offset: np.ndarray
-    room: np.ndarray
+    row_limits: np.ndarray
 
-    def slack(self, u: np.ndarray) -> tuple[float, float]:
-        """Returns slack and margin of an input u, shape (m,)."""
-        slack = float((self.room - np.abs(self.offset + self.test.effect.dot(u))).min())
-        return slack, slack
+    def margins(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns test and reported margin of an input u, shape (m,)."""
+        margin = float((self.row_limits - np.abs(self.offset + self.test.effect.dot(u))).min())
+        return margin, margin
 
     def closest(self, u: float, margin: float) -> float:
         """Returns what `PolytopeSets.closest` does for plants with a single input."""
-        sets = PolytopeSets(self.test, self.estimate[:, None], self.room[:, None], np.zeros(1), self.room[:1])
+        limits = self.row_limits[:, None]
+        sets = PolytopeSets(self.test, self.estimate[:, None], limits, np.zeros(1), limits[0])
         return float(sets.closest(np.array([[u]]), margin)[0, 0])
 
 
@@ -326,7 +326,7 @@ class GridTest(NamedTuple):
         return states @ self.moved.T + inputs @ self.effect.T
 
 
-@np.errstate(all="ignore")  # what is not finite leaves no room
+@np.errstate(all="ignore")  # what is not finite passes no test
 def grid_test(plant: LinearPlant) -> GridTest:
     """Returns the test of a plant's grid."""
     rows, grid = plant.box_rows, plant.grid_rows
@@ -334,7 +334,7 @@ def grid_test(plant: LinearPlant) -> GridTest:
         return GridTest(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0), rows)
     D, rounding = plant.disturbance.shape_matrix, 8.0 * plant.n * float(np.finfo(float).eps)
     left = (1.0 - grid.remainder) / _OUTWARD
-    rho = supports(rows, D[None], rounding * (np.abs(rows) @ np.sqrt(np.diag(D)))[:, None] ** 2)[:, 0]
+    rho = supports(rows, D, rounding * (np.abs(rows) @ np.sqrt(np.diag(D))) ** 2)
     at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
     count = len(grid.state) - 1
     return GridTest(
@@ -346,12 +346,9 @@ def grid_test(plant: LinearPlant) -> GridTest:
 
 
 def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
-    """Returns upper bounds of sqrt(g S g') for rows g, (r, n), and shapes S, (k, n, n): shape (r, k).
+    """Returns upper bounds of sqrt(g S g'), shape (..., r), for rows g, (..., r, n), and shapes S, (..., n, n).
 
-    Args:
-        rows: g, shape (r, n).
-        shapes: S, shape (k, n, n).
-        rounding: What computing g S g' is off by at most, for all rows, shape (k,) or a number, or shape (r, 1).
+    Computing g S g' is off by at most the rounding.
     """
-    squares = ((rows @ shapes) * rows).sum(axis=-1).T
+    squares = ((rows @ shapes) * rows).sum(axis=-1)
     return np.sqrt(np.maximum(squares, 0.0) + rounding)

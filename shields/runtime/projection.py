@@ -164,8 +164,8 @@ def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @np.errstate(all="ignore")  # what is not finite is not admissible
-def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Returns argmin |u - wanted| over |offset + effect u| <= room, row by row; NaN where there is none.
+def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns argmin |u - wanted| over |offset + effect u| <= limits, row by row; NaN where there is none.
 
     One input is an interval. Otherwise the closest point of a polytope lies on a face that the wanted one is beyond:
     on the plane of each of these the problem is the same with one input less.
@@ -174,7 +174,7 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
         wanted: Shape (m, N).
         offset: Shape (r, N).
         effect: Shape (r, m, N), or (r, m, 1) for the same in all; every direction has some row.
-        room: Shape (r, N); nothing is admissible where one is negative or NaN.
+        limits: Shape (r, N); nothing is admissible where one is negative or NaN.
 
     Returns:
         Shape (m, N).
@@ -182,22 +182,22 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     if len(wanted) == 1:
         inverse = 1.0 / effect[:, 0]
         flat = np.isinf(inverse)
-        middle, half = offset * -inverse, room * np.abs(inverse)
+        middle, half = offset * -inverse, limits * np.abs(inverse)
         low, high = middle - half, middle + half
         if np.count_nonzero(flat):  # rows that no input moves
-            low = np.where(flat, np.where(np.abs(offset) <= room, -np.inf, np.inf), low)
+            low = np.where(flat, np.where(np.abs(offset) <= limits, -np.inf, np.inf), low)
             high = np.where(flat, np.inf, high)
         low, high = low.max(axis=0), high.min(axis=0)
         return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
     values = offset + _changes(effect, wanted)
-    beyond = ~(np.abs(values) <= room)
+    beyond = ~(np.abs(values) <= limits)
     closest = np.where(beyond.any(axis=0), np.nan, wanted)
-    row, problem = np.nonzero(beyond & (room >= 0.0))
+    row, problem = np.nonzero(beyond & (limits >= 0.0))
     if not row.size:
         return closest
     shared = effect.shape[2] == 1
     normals, start = effect[row, :, 0 if shared else problem].T, wanted[:, problem]
-    face = np.sign(values[row, problem]) * room[row, problem]
+    face = np.sign(values[row, problem]) * limits[row, problem]
     foot = start + normals * ((face - values[row, problem]) / (normals * normals).sum(axis=0))
     usable = np.isfinite(foot).all(axis=0)
     row, problem = row[usable], problem[usable]
@@ -207,7 +207,7 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
         plane = (np.stack([-normals[1], normals[0]]) / np.hypot(*normals))[:, None]
     else:
         plane = np.linalg.svd(normals.T[:, None])[2][:, 1:].transpose(2, 1, 0)
-    left = room[:, problem]
+    left = limits[:, problem]
     left[row, np.arange(len(row))] = np.inf  # the face itself
     here = effect if shared else effect[:, :, problem]
     within = np.stack([_changes(here, direction) for direction in plane.swapaxes(0, 1)], axis=1)

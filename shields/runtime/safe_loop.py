@@ -122,7 +122,7 @@ class SafeLoop:
             once an echo contradicts what was decided, nothing is proved. None if there are no echoes: then what is
             said holds if everything that is decided is applied.
         on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
-            "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" for who reads `guaranteed`.
+            "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" if you read `guaranteed`.
             When one is raised, the call has come to its end: go on with `decide`.
 
     Attributes:
@@ -205,8 +205,8 @@ class SafeLoop:
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None, *, known: bool = True) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
-        It is a claim: that the error of x_hat0 lies in `plant.initial_error`. Who does not know that, because the
-        controller was restarted while the plant moved, says `known=False`. Then x_hat0 is a guess to decide from, and
+        It is a claim: that the error of x_hat0 lies in `plant.initial_error`. If you do not know that, because the
+        controller was restarted while the plant moved, say `known=False`. Then x_hat0 is a guess to decide from, and
         nothing is proved until the samples of this episode alone prove where the state is (docs/deployment.md).
 
         Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.

@@ -103,8 +103,13 @@ class SafetyFilter(ReadOnlyArrays):
             raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
 
     @cached_property
+    def _single(self) -> tuple[tuple[int], tuple[int]]:
+        """Shapes of a single estimate and input."""
+        return (self.plant.n,), (self.plant.m,)
+
+    @cached_property
     def projection_margin(self) -> float:
-        """The slack a projected input needs: the margin, and what rounding the action to float32 can move x+."""
+        """The test margin a projected input needs: MARGIN, and what rounding the action to float32 can move x+."""
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
 
     def decide(
@@ -120,7 +125,7 @@ class SafetyFilter(ReadOnlyArrays):
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
-        if (x_hat.shape, proposed.shape) != self.test.single:
+        if (x_hat.shape, proposed.shape) != self._single:
             self._tell_of_shapes(estimate, input_proposed)
         return self.decide_knowing(x_hat, self.errors_of(error_shape), proposed, stored)
 
@@ -128,7 +133,7 @@ class SafetyFilter(ReadOnlyArrays):
         self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any = ()
     ) -> Decision:
         """Returns what `decide` does, given what `errors_of` returns for the error shape."""
-        if (estimate.shape, proposed.shape) == self.test.single and self.mode != "boundary":
+        if (estimate.shape, proposed.shape) == self._single and self.mode != "boundary":
             try:
                 decision = self._decide_single(estimate, errors, proposed)
             except FloatingPointError:  # underflow, where numpy is told to raise
@@ -149,8 +154,8 @@ class SafetyFilter(ReadOnlyArrays):
         pairs = zip(proposed.tolist(), self.test.limits, strict=True)
         if alone is None or not all([-limit <= u <= limit for u, limit in pairs]):
             return None
-        slack, margin = alone.slack(proposed)
-        if slack >= MARGIN:
+        test_margin, margin = alone.margins(proposed)
+        if test_margin >= MARGIN:
             return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
         if self.lookahead is not None:
             plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
@@ -160,8 +165,8 @@ class SafetyFilter(ReadOnlyArrays):
         if self.mode != "project" or self.plant.m > 1:
             return None
         closest = self._expressible(np.array([alone.closest(proposed.item(), self.projection_margin)]))
-        slack, margin = alone.slack(closest)
-        if not slack >= MARGIN:  # neither NaN
+        test_margin, margin = alone.margins(closest)
+        if not test_margin >= MARGIN:  # neither NaN
             return None
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
@@ -178,8 +183,8 @@ class SafetyFilter(ReadOnlyArrays):
             stored: In mode "lookahead" the `plan` of the last decisions, shape (horizon, m, N); None for none.
         """
         sets = self.test.reachable(estimates, errors)
-        slack, margin = sets.slack(proposed)
-        judged = sets.smallest_slack() if self.mode == "boundary" else slack
+        test_margin, margin = sets.margins(proposed)
+        judged = sets.smallest_test_margin() if self.mode == "boundary" else test_margin
         within: np.ndarray = np.abs(proposed) <= self.plant.u_max[:, None]
         valid: np.ndarray = within[0] if len(within) == 1 else np.all(within, axis=0)
         passed = (judged >= MARGIN) & valid
@@ -215,7 +220,7 @@ class SafetyFilter(ReadOnlyArrays):
         Raises:
             ValueError: If an argument does not consist of numbers of these shapes.
         """
-        (n,), (m,) = self.test.single
+        (n,), (m,) = self._single
         numbers = {"estimates": estimates, "error_shapes": error_shapes, "proposals": proposals}
         arrays = {name: _as_array(value) for name, value in numbers.items()}
         count = len(arrays["estimates"]) if arrays["estimates"].ndim == 2 else 0
@@ -239,8 +244,8 @@ class SafetyFilter(ReadOnlyArrays):
         )
 
     def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
-        """Warns the caller of `decide` of what is no single estimate or input; what is decided then is K x_hat."""
-        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self.test.single, strict=True):
+        """Warns the caller of `decide` that estimate or input is not a single one, for which it decides K x_hat."""
+        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self._single, strict=True):
             if (array := _as_array(value)).shape != (size,):
                 got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"
                 warnings.warn(
@@ -280,7 +285,7 @@ class SafetyFilter(ReadOnlyArrays):
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:
         """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""
         x_hat, u = _as_column(_as_array(estimate), self.plant.n), _as_column(_as_array(u), self.plant.m)
-        return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).slack(u)[1].item()
+        return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).margins(u)[1].item()
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
@@ -304,8 +309,8 @@ class SafetyFilter(ReadOnlyArrays):
         if some.size:
             sets = sets.some(some)
             closest = self._expressible(sets.closest(decided.input[:, some], self.projection_margin))
-            slack, margin = sets.slack(closest)
-            found = slack >= MARGIN
+            test_margin, margin = sets.margins(closest)
+            found = test_margin >= MARGIN
             some = some[found]
             decided.input[:, some], decided.margin[some] = closest[:, found], margin[found]
             decided.passed[some], decided.reason[some] = True, PROJECTED
@@ -320,9 +325,9 @@ class SafetyFilter(ReadOnlyArrays):
             gained = np.where(exists, gained, 0.0)
             differs, valid = (gained != proposed).any(axis=0), valid[some]
             applied = np.where(valid, proposed, gained) if self.mode == "monitor" else gained
-            slack, margin = sets.slack(applied)
+            test_margin, margin = sets.margins(applied)
             decided.input[:, some], decided.margin[some] = applied, margin
-            decided.intervened[some], decided.passed[some] = differs, slack >= MARGIN
+            decided.intervened[some], decided.passed[some] = differs, test_margin >= MARGIN
             unsafe = (applied != gained).any(axis=0)
             decided.fallback[some] = exists & ~unsafe
             reason = np.where(unsafe, UNSAFE, FALLBACK)

@@ -48,7 +48,7 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
     Args:
         certificate: Gives its polytope, or S = E(L).
         initial: An ellipsoid E(X), inside S exactly if L - X >= 0; or a single state, shape (n,), inside S exactly if
-            [1, x'; x, L] >= 0. Inside a polytope they are exactly if they are between all its pairs of faces.
+            [1, x'; x, L] >= 0. Either is inside a polytope exactly if it is between all its pairs of faces.
     """
     if certificate.polytope is not None:
         return _between(certificate.polytope.rows, initial)
@@ -83,10 +83,10 @@ def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
 def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
     """Returns whether |g x| <= 1 for all rows g, shape (r, n), and one state; None where rounding could decide it."""
     products, sizes = np.abs(bounds @ state), np.abs(bounds) @ np.abs(state)
-    room = (len(state) + 2) * float(np.finfo(float).eps) * sizes + float(np.finfo(float).tiny)
-    if (products + room <= 1.0).all():
+    rounding = (len(state) + 2) * float(np.finfo(float).eps) * sizes + float(np.finfo(float).tiny)
+    if (products + rounding <= 1.0).all():
         return True
-    return False if (products - room > 1.0).any() else None
+    return False if (products - rounding > 1.0).any() else None
 
 
 def starts_known(
@@ -156,7 +156,7 @@ def _in_box(safety_filter: SafetyFilter, center: np.ndarray, errors: PredictedEr
 
 
 def _moved(plant: LinearPlant, center: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns center and shape one step later under no input, with room for the rounding of both."""
+    """Returns center and shape one step later under no input, enlarged by the rounding of both."""
     size = np.abs(plant.A)
     carried = enlarged_by_rounding(plant.A @ shape @ plant.A.T, size @ np.sqrt(np.maximum(shape.diagonal(), 0.0)))
     rounding = CENTER_ROUNDING * plant.n * (size @ np.abs(center))

@@ -271,7 +271,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         """Returns the margins of no input in some environments, shape (len(chosen),)."""
         with np.errstate(all="ignore"):
             sets = self._filter.test.reachable(self._report.estimate[:, chosen], self._report.errors.of(chosen))
-            return sets.slack(np.zeros((self._filter.plant.m, len(chosen))))[1]
+            return sets.margins(np.zeros((self._filter.plant.m, len(chosen))))[1]
 
     def _read_clock(self) -> Clock:
         inner = self._inner

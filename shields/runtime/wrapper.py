@@ -175,7 +175,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         on_unproved: What reset and step do, once per episode and reason, where x in S is not proved: "warn" with a
-            `GuaranteeLostWarning`, "raise" a `GuaranteeLostError` after the step, "ignore" for who reads the infos.
+            `GuaranteeLostWarning`, "raise" a `GuaranteeLostError` after the step, "ignore" if you read the infos.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -304,7 +304,7 @@ def certificate_for(
     """
     key = plant.fingerprint, contract, safe_set
     if key not in _synthesized:
-        from shields.synthesis import synthesize  # imported here: who has a certificate needs no solver
+        from shields.synthesis import synthesize  # imported here: with a certificate given no solver is needed
 
         _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
     return _synthesized[key]

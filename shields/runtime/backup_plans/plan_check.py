@@ -13,7 +13,7 @@ import numpy as np
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
 from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
-from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test
+from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test, supports
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -44,7 +44,7 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        sizes = np.abs(prediction.rows) @ prediction.size_free
+        sizes = np.abs(prediction.rows) @ prediction.sizes[1:]
         self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
@@ -70,13 +70,13 @@ class PlanTest:
         return self._table.some(numbers)
 
     @np.errstate(all="ignore")  # what is not finite is not certified
-    def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
+    def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN if unknown."""
         size = np.abs(estimates)
-        rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
-        box = tightening.room - rounding - self._margin
+        rounding = (size @ self._row_rounding).reshape(tightening.row_limits.shape)
+        row_limits = tightening.row_limits - rounding - self._margin
         radius = tightening.radius - size @ self._end_rounding  # far below zero for estimates that are too far out
-        return box, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
+        return row_limits, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
     def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns row c_j, shape (N, r, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast."""
@@ -96,15 +96,15 @@ class PlanTest:
         if len(plans) > block:
             parts = [slice(start, start + block) for start in range(0, len(plans), block)]
             return np.concatenate([self.certified(estimates[e], tightening.some(e), plans[e]) for e in parts])
-        room, radius = self.room(estimates, tightening)
+        row_limits, radius = self.limits_at(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
-        within = np.abs(values) <= room.transpose(1, 2, 0)[..., None]
+        within = np.abs(values) <= row_limits.transpose(1, 2, 0)[..., None]
         inside = np.all(within[:, : len(self.prediction.plant.box_rows)], axis=1)
         kept = np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
         if not self.prediction.ends:
             kept &= np.all(within, axis=1)
         kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
-        if self.prediction.grid is not None:
+        if tightening.between.size:
             kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
         allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
         return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
@@ -114,8 +114,7 @@ class PlanTest:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
         rows, extents = self.prediction.rows[: len(self.prediction.plant.box_rows)], np.sqrt(np.diag(error_shape))
         rounding = float(self.prediction.rounding[0])
-        size = np.abs(rows) @ extents
-        reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
+        reach = supports(rows, error_shape, rounding * (np.abs(rows) @ extents) ** 2)
         reach = reach + np.abs(rows @ estimate) + rounding * (np.abs(rows) @ np.abs(estimate))
         return bool((reach <= 1.0 - self._margin).all())
 
@@ -135,14 +134,13 @@ class Prediction:
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
             its others. Those of the box are closer where it counts between samples, too (`GridTest`).
-        grid: What is asked between samples then; None where only these count.
-        free: A^j, shape (N, n, n).
+        grid: What is asked between samples.
+        powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
-        size_free: |A|^j, shape (N, n, n).
         size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
-        ends: The test of section "One step" for what is reached at j: c_j + E(Sigma_pred,j) lies in S; N of them. None
-            where plans end in P, of which the rows decide.
+        ends: N tests, of section "One step", whether c_j + E(Sigma_pred,j) lies in S; none where plans end in P, whose
+            rows decide.
     """
 
     def __init__(self, first: OneStepTest | PolytopeTest, steps: int) -> None:
@@ -155,7 +153,7 @@ class Prediction:
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
             sizes.append(np.abs(plant.A) @ sizes[-1])
-        self.free, self.size_free = read_only(np.array(powers[1:])), read_only(np.array(sizes[1:]))
+        self.powers, self.sizes = read_only(np.array(powers)), read_only(np.array(sizes))
         effects = np.array([power @ plant.B for power in powers[:-1]])
         forced = np.zeros((steps, n, steps, m))
         for j in range(steps):
@@ -165,9 +163,9 @@ class Prediction:
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = () if isinstance(first, PolytopeTest) else tuple(EndTest(first, self, j) for j in range(steps))
-        self.grid = None if plant.grid_rows is None else PlanGrid(self, test)
-        self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
-        self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
+        self.grid = PlanGrid(self, test)
+        self._free = self.powers[1:].reshape(steps * n, n)
+        self._forced = self.forced.reshape(steps * n, steps * m)
 
     def centers(self, estimates: np.ndarray, plans: np.ndarray) -> np.ndarray:
         """Returns c_1..c_N, shape (N, n, E, P), of P plans for each of E estimates; for shapes see `PlanTest`."""
@@ -180,6 +178,8 @@ class Prediction:
 class PlanGrid:
     """The rows of the grid in every step of a plan, i = 0..N-1: |row (A_tau c_i + B_tau u_i)| + rho_i <= 1.
 
+    There are none, g = 0, where the box counts at samples alone.
+
     Args:
         prediction: Of the plant, without its grid.
         test: Rows of one step.
@@ -191,35 +191,35 @@ class PlanGrid:
 
     def __init__(self, prediction: Prediction, test: GridTest) -> None:
         steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
-        self._shape, self._rounding = prediction.plant.disturbance.shape_matrix, prediction.rounding
-        begun, size = np.eye(n)[None], np.abs(test.moved)
-        self.free = read_only(test.moved @ np.concatenate([begun, prediction.free[:-1]]))
-        self._size = read_only(size @ np.concatenate([begun, prediction.size_free[:-1]]))
+        size, self._rounding = np.abs(test.moved), prediction.rounding
+        self.free = read_only(test.moved @ prediction.powers[:-1])
+        self._size = read_only(size @ prediction.sizes[:-1])
         forced = test.moved @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
         for i in range(steps):
             forced[i, :, i * m : (i + 1) * m] += test.effect
         self.forced = read_only(forced)
         pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
         self._pushed = read_only(pushed + np.abs(test.effect) @ prediction.plant.u_max)
-        own = _supports(self.free, self._size, self._shape[None], self._rounding[:, None])[0]
+        D = prediction.plant.disturbance.shape_matrix
+        own = _supports(self.free, self._size, D[None], self._rounding[:, None])[0]
         self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
         self._arriving = test.disturbed
 
-    def room(self, shapes: np.ndarray) -> np.ndarray:
+    def row_limits(self, shapes: np.ndarray) -> np.ndarray:
         """Returns 1 - rho_i less the rounding that does not depend on the estimate, (E, N, g), of shapes (E, n, n)."""
         rounding = self._rounding[:, None]
         reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
         return 1.0 - reach * (1.0 + rounding) - rounding * self._pushed
 
-    def keeps(self, estimates: np.ndarray, room: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
+    def keeps(self, estimates: np.ndarray, row_limits: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
         """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P).
 
-        For shapes see `PlanTest`; `room` is what the method of that name returns for the error shape of each.
+        For shapes see `PlanTest`; `row_limits` are what the method of that name returns for the error shape of each.
         """
         steps, g, n = self.free.shape
         count, number = plans.shape[:2]
         rounding = np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T
-        left = room - rounding.reshape(count, steps, g)
+        left = row_limits - rounding.reshape(count, steps, g)
         values = (self.forced.reshape(steps * g, -1) @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         values += (self.free.reshape(-1, n) @ estimates.T)[..., None]
         inside = np.abs(values.reshape(steps, g, count, number)) <= left.transpose(1, 2, 0)[..., None] - margin
@@ -228,6 +228,8 @@ class PlanGrid:
 
 class EndTest(OneStepTest):
     """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
+
+    Of its methods `predicted` alone is asked; what the others need is left out.
 
     E(Q_0) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to sqrt(tr Q_i)
     makes the trace smallest, also together with the estimation error that `predicted` adds.
@@ -241,21 +243,18 @@ class EndTest(OneStepTest):
     def __init__(self, first: OneStepTest, prediction: Prediction, index: int) -> None:
         plant, steps = first.plant, index + 1
         n, m = plant.n, plant.m
-        self.plant, self.single, self.limits = plant, first.single, first.limits
-        self.root, self.own_columns = first.root, first.own_columns
+        self.plant, self.root, self.own_columns = plant, first.root, first.own_columns
         size = np.abs(self.root)
         self.rounding = float((16.0 * (n + m) * (steps + 2) + 4.0 * n * n) * np.finfo(float).eps)
-        self.moved = read_only(self.root @ prediction.free[index])
-        self.effect = read_only(self.root @ prediction.forced[index])
-        self.columns = read_only(np.linalg.norm(size @ prediction.size_free[index], axis=0))
+        self.moved = read_only(self.root @ prediction.powers[steps])
+        self.columns = read_only(np.linalg.norm(size @ prediction.sizes[steps], axis=0))
         self.pushed = float(np.linalg.norm(size @ prediction.size_forced[index]))
         extents = np.sqrt(np.diag(plant.disturbance.shape_matrix))
         parts = []
         for i in range(steps):
-            root = self.root @ prediction.free[i - 1] if i else self.root
-            reach = size @ prediction.size_free[i - 1] if i else size
-            room = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
-            parts.append(root @ plant.disturbance.shape_matrix @ root.T + room * np.eye(n))
+            root, reach = self.root @ prediction.powers[i], size @ prediction.sizes[i]
+            rounding = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
+            parts.append(root @ plant.disturbance.shape_matrix @ root.T + rounding * np.eye(n))
         widths = np.sqrt([np.trace(part) for part in parts])
         widths = np.maximum(widths, SMALLEST_MULTIPLIER * widths.max())
         D = sum(part * (widths.sum() / width) for part, width in zip(parts, widths, strict=True))
@@ -267,16 +266,16 @@ class Tightening(NamedTuple):
     """What errors and disturbances leave of the box and of S or P, for E error shapes.
 
     Attributes:
-        room: 1 - rho_j(row) less the rounding that does not depend on the estimate, shape (E, N, r) for the rows of the
-            `Prediction`; NaN for an unusable shape.
+        row_limits: 1 - rho_j(row) less the rounding that does not depend on the estimate, shape (E, N, r) for the rows
+            of the `Prediction`; NaN for an unusable shape.
         weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
             |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
             for an unusable shape.
-        between: `PlanGrid.room`, shape (E, N, g); g is 0 where the box counts at samples alone.
+        between: `PlanGrid.row_limits`, shape (E, N, g).
     """
 
-    room: np.ndarray
+    row_limits: np.ndarray
     weighting: np.ndarray
     radius: np.ndarray
     between: np.ndarray
@@ -286,7 +285,7 @@ class Tightening(NamedTuple):
         return Tightening(*(part[chosen] for part in self))
 
 
-@np.errstate(all="ignore")  # what overflows leaves no room
+@np.errstate(all="ignore")  # what overflows passes no test
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 
@@ -294,15 +293,12 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     computed b'Sb is off by at most a relative rounding of (|b|'s)^2, the powers in b included. Shapes are (E, n, n).
     """
     plant, rounding = prediction.plant, prediction.rounding[:, None]
-    rows, sizes = prediction.rows @ prediction.free, np.abs(prediction.rows) @ prediction.size_free
-    earlier = np.concatenate([prediction.rows[None], rows[:-1]])
-    earlier_sizes = np.concatenate([np.abs(prediction.rows)[None], sizes[:-1]])
-    disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape_matrix[None], rounding)[0], axis=0)
+    rows, sizes = prediction.rows @ prediction.powers, np.abs(prediction.rows) @ prediction.sizes
+    added = _supports(rows[:-1], sizes[:-1], plant.disturbance.shape_matrix[None], rounding)[0]
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
-    reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
+    reach = (_supports(rows[1:], sizes[1:], symmetric, rounding) + np.cumsum(added, axis=0)) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
-    grid = prediction.grid
-    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
+    between = prediction.grid.row_limits(symmetric)
     nothing = np.empty((0, *shapes.shape[1:]))
     if not prediction.ends:
         usable = judged_shapes(shapes, nothing)[1] & np.isfinite(reach).all(axis=(1, 2))
@@ -326,6 +322,5 @@ def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding:
         rounding: Relative to products of absolute values, shape (N, 1).
     """
     extents = np.sqrt(np.abs(np.diagonal(shapes, axis1=1, axis2=2)))
-    squares = ((rows @ shapes[:, None]) * rows).sum(axis=-1)
     size = (sizes @ extents[:, None, :, None])[..., 0]
-    return np.sqrt(np.maximum(squares, 0.0) + rounding * size**2)
+    return supports(rows, shapes[:, None], rounding * size**2)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.validation import as_numbers
-from shields.runtime.backup_plans.planner import Planner, Plans
+from shields.runtime.backup_plans.plan_search import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
 from shields.runtime.polytope_step import PolytopeTest
@@ -76,8 +76,8 @@ class Lookahead:
         some = some[changed | left]
         if some.size:
             decided.intervened[some] = (decided.input[:, some] != proposed[:, some]).any(axis=0)
-            slack, decided.margin[some] = sets.some(some).slack(decided.input[:, some])
-            decided.passed[some] = (slack >= self._margin) | (decided.reason[some] == PLANNED)
+            test_margin, decided.margin[some] = sets.some(some).margins(decided.input[:, some])
+            decided.passed[some] = (test_margin >= self._margin) | (decided.reason[some] == PLANNED)
 
     def _plan(
         self,

@@ -152,7 +152,9 @@ def test_lookahead_that_leaves_the_box_is_counted(certificates, monkeypatch):
 
     known = PlanTest.tightenings_of
     monkeypatch.setattr(
-        PlanTest, "tightenings_of", lambda *given: (found := known(*given))._replace(room=np.ones_like(found.room))
+        PlanTest,
+        "tightenings_of",
+        lambda *given: (found := known(*given))._replace(row_limits=np.ones_like(found.row_limits)),
     )
     monte_carlo_batch._shields.cache_clear()
     counts = counts_of(LOOKAHEAD, certificates["CartPole-v0, late"], "CartPole-v0, late")

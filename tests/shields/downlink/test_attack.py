@@ -5,8 +5,8 @@ import pytest
 
 from shields import VectorSafetyShield
 from tests.shields.attacks.test_vector_attack import ExtremalVectorNoise
+from tests.shields.backup_plans.adversary import box_ellipsoid
 from tests.shields.downlink.adversary import PLANTS, POLICIES, Case, attack, edges
-from tests.shields.lookahead.adversary import box_ellipsoid
 
 # 3 downlinks by 3 policies per plant: 9 * 1,112 * 100 = 1.0e6 steps each.
 SLOW_ENVS, SLOW_STEPS = 1112, 100

@@ -45,8 +45,8 @@ from shields.verification.rational_matrix import (
 )
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import ExtremalNoise
+from tests.shields.backup_plans.adversary import box_ellipsoid
 from tests.shields.downlink.adversary import Case, edges
-from tests.shields.lookahead.adversary import box_ellipsoid
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)

@@ -9,13 +9,13 @@ import pytest
 
 from ncs_gym import Channel, Ellipsoid, NCSEnv, NCSVectorEnv, Packet, truck_trailer
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.backup_plans.planner import Planner, Plans
+from shields.runtime.backup_plans.plan_search import Planner, Plans
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.interruptions import interrupt, places
-from tests.shields.lookahead.adversary import box_ellipsoid
-from tests.shields.lookahead.adversary import case as plan_case
+from tests.shields.backup_plans.adversary import box_ellipsoid
+from tests.shields.backup_plans.adversary import case as plan_case
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=1)

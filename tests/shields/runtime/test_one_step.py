@@ -42,15 +42,15 @@ def reachable(test, estimate, shape):
         return test.reachable(estimate[:, None], errors_of(test, shape))
 
 
-def slack_and_margin(sets, u):
+def margins(sets, u):
     """Of one input."""
-    return tuple(each.item() for each in sets.slack(u[:, None]))
+    return tuple(each.item() for each in sets.margins(u[:, None]))
 
 
 def nothing_is_known(test, estimate, shape):
     sets = reachable(test, estimate, shape)
     with np.errstate(all="ignore"):
-        unknown = np.isnan([*slack_and_margin(sets, np.zeros(test.plant.m)), *sets.smallest_slack()])
+        unknown = np.isnan([*margins(sets, np.zeros(test.plant.m)), *sets.smallest_test_margin()])
     return bool(unknown.all())
 
 
@@ -63,18 +63,18 @@ def cases(certificate, plant, rng, count):
         yield estimate, 0.5 * (shape + shape.T), rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random()
 
 
-def test_slack_is_that_of_the_formula(case):
+def test_margin_is_that_of_the_formula(case):
     plant, certificate = case
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 100):
         root, P, h = predicted(certificate, plant, shape)
         c = root @ (plant.A @ estimate + plant.B @ u)
-        slack, margin = slack_and_margin(reachable(test, estimate, shape), u)
+        test_margin, margin = margins(reachable(test, estimate, shape), u)
         if h < 1.0:
             weight = (1 - h) * h * np.linalg.inv(h * np.eye(plant.n) - P)
-            assert slack == pytest.approx(1 - h - np.sqrt(c @ weight @ c), abs=1e-9)
+            assert test_margin == pytest.approx(1 - h - np.sqrt(c @ weight @ c), abs=1e-9)
         assert margin == pytest.approx(1 - h - np.linalg.norm(c), abs=1e-9)
-        assert slack >= margin - 1e-12
+        assert test_margin >= margin - 1e-12
 
 
 def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
@@ -83,7 +83,7 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
     sharper = agree = exactly = 0
     for estimate, shape, u in cases(certificate, plant, rng, 400):
         root, P, h = predicted(certificate, plant, shape)
-        slack, margin = slack_and_margin(reachable(test, estimate, shape), u)
+        test_margin, margin = margins(reachable(test, estimate, shape), u)
         values, axes = np.linalg.eigh(P)
         c = axes.T @ root @ (plant.A @ estimate + plant.B @ u)
         best = np.inf
@@ -97,12 +97,12 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
             best = found.fun
         exact = best <= 1.0
         if margin >= 0.0:
-            assert slack >= 0.0
-        if slack >= 1e-6:
+            assert test_margin >= 0.0
+        if test_margin >= 1e-6:
             assert exact
-        sharper += slack > margin + 1e-6
-        exactly += exact and slack < 0.0
-        agree += exact and slack >= 0.0
+        sharper += test_margin > margin + 1e-6
+        exactly += exact and test_margin < 0.0
+        agree += exact and test_margin >= 0.0
     assert agree > 50
     assert exactly < 0.05 * agree  # little is lost against the exact test
     assert sharper > 50
@@ -130,18 +130,18 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
     assert tight > 0.9
 
 
-def test_smallest_slack_is_that_of_the_worst_input(case, monkeypatch):
+def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
     plant, certificate = case
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(3)
     for estimate, shape, _ in cases(certificate, plant, rng, 30):
         sets = reachable(test, estimate, shape)
         inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.u_max
         corners = np.sign(inputs) * plant.u_max
-        smallest = sets.smallest_slack().item()
-        assert (sets.slack(inputs.T)[0] >= smallest - 1e-12).all()
-        assert sets.slack(corners.T)[0].min() == pytest.approx(smallest, abs=1e-12)
+        smallest = sets.smallest_test_margin().item()
+        assert (sets.margins(inputs.T)[0] >= smallest - 1e-12).all()
+        assert sets.margins(corners.T)[0].min() == pytest.approx(smallest, abs=1e-12)
         monkeypatch.setattr("shields.runtime.one_step.LARGEST_BLOCK", 1)
-        assert sets.smallest_slack().item() == pytest.approx(smallest, abs=1e-12)
+        assert sets.smallest_test_margin().item() == pytest.approx(smallest, abs=1e-12)
         monkeypatch.undo()
 
 
@@ -154,11 +154,11 @@ def test_a_batch_says_of_each_what_a_batch_of_one_does(case):
     chosen = rng.permutation(300)
     with np.errstate(all="ignore"):
         sets = test.reachable(estimates[chosen].T, errors.of(chosen))
-        found = np.array([*sets.slack(inputs[chosen].T), sets.smallest_slack()])
+        found = np.array([*sets.margins(inputs[chosen].T), sets.smallest_test_margin()])
         closest = sets.closest(inputs[chosen].T, 1e-9)
         for k, e in enumerate(chosen.tolist()):
             one = reachable(test, estimates[e], shapes[e])
-            expected = [*slack_and_margin(one, inputs[e]), one.smallest_slack().item()]
+            expected = [*margins(one, inputs[e]), one.smallest_test_margin().item()]
             np.testing.assert_allclose(found[:, k], expected, rtol=1e-12, atol=1e-13)
             np.testing.assert_allclose(closest[:, [k]], one.closest(inputs[e][:, None], 1e-9), rtol=1e-7, atol=1e-9)
     assert np.isnan(found[:, np.isin(chosen, [7, 8, 9])]).all()
@@ -254,10 +254,10 @@ def test_one_state_leaves_nothing_to_be_sharper_about():
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 50):
         *_, h = predicted(certificate, plant, shape)
-        slack, margin = slack_and_margin(reachable(test, estimate, shape), u)
+        test_margin, margin = margins(reachable(test, estimate, shape), u)
         center = abs(plant.A @ estimate + plant.B @ u).item() / np.sqrt(certificate.L.item())
-        assert slack == pytest.approx(margin, abs=1e-12)
-        assert slack == pytest.approx(1.0 - h - center, abs=1e-9)
+        assert test_margin == pytest.approx(margin, abs=1e-12)
+        assert test_margin == pytest.approx(1.0 - h - center, abs=1e-9)
 
 
 def test_bounds_on_rounding_hold_column_by_column():
@@ -272,8 +272,8 @@ def test_bounds_on_rounding_hold_column_by_column():
         assert test.columns[i] == pytest.approx(np.linalg.norm(columns[:, i]))
         assert test.own_columns[i] == pytest.approx(np.linalg.norm(G[:, i]))
     extent = np.linalg.norm(G, axis=0) @ np.sqrt(np.diag(D))
-    room = np.linalg.eigvalsh(test.D - test.root @ D @ test.root.T)
-    np.testing.assert_allclose(room, test.rounding * extent**2, rtol=0.2)
+    rounding = np.linalg.eigvalsh(test.D - test.root @ D @ test.root.T)
+    np.testing.assert_allclose(rounding, test.rounding * extent**2, rtol=0.2)
     # The radius is smaller by what rounding does to the estimate, its error and the input.
     estimate, shape = np.array([1.0, 2.0, -1.0]), 1e-7 * np.diag([1.0, 2.0, 3.0])
     still, certain, test.rounding = copy(test), copy(test), 1e-9  # as if float64 had nine digits
@@ -310,7 +310,7 @@ def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
     shape = low * np.eye(plant.n)
     assert 4e-6 < shield.errors_of(shape).radius < 6e-6
     sets = shield.test.reachable(still, shield.errors_of(shape).batch())
-    np.testing.assert_array_equal([sets.radius, *sets.slack(u[:, None])], 0.0)
+    np.testing.assert_array_equal([sets.radius, *sets.margins(u[:, None])], 0.0)
     assert shield.decide(still[:, 0], shape, u).reason == "fallback"
     assert not shield.decide(still[:, 0], shape, u).passed
     assert shield.decide(still[:, 0], 0.9 * shape, u).passed

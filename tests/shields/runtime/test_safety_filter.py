@@ -96,7 +96,7 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
         sets = shield.test.reachable(estimate[:, None], shield.errors_of(shape).batch())
         near = decision.input + (wanted - decision.input) * rng.uniform(0, 1, (100, 1))
         others = np.vstack([rng.uniform(-1, 1, (400, plant.m)) * plant.u_max, near])
-        admissible = sets.slack(others.T)[0] >= 0.0
+        admissible = sets.margins(others.T)[0] >= 0.0
         distances = np.linalg.norm(others - wanted, axis=1)
         best = distances[admissible].min(initial=np.inf)
         assert np.linalg.norm(decision.input - wanted) <= best + 1e-5
@@ -402,7 +402,7 @@ def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
         passed = shield.decide(np.array([1.6, 0.0]), shape, np.array([middle])).reason == "safe"
         low, high = (middle, high) if passed else (low, middle)
     sets = shield.test.reachable(np.array([[1.6], [0.0]]), shield.errors_of(shape).batch())
-    assert MARGIN * (1 - 1e-6) <= sets.slack(np.array([[low]]))[0].item() <= 2 * MARGIN  # but for its own rounding
+    assert MARGIN * (1 - 1e-6) <= sets.margins(np.array([[low]]))[0].item() <= 2 * MARGIN  # but for its own rounding
     assert MARGIN >= 1e-10
 
 

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 from shields import VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.shields.attacks.test_vector_attack import ExtremalVectorNoise
-from tests.shields.lookahead.adversary import box_ellipsoid, case
+from tests.shields.backup_plans.adversary import box_ellipsoid, case
 
 CASES = [
     ("cruise", "bursts"),

@@ -10,7 +10,7 @@ from ncs_gym import NCSEnv, NCSVectorEnv, Packet
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE, OLD_SAMPLE
 from tests.certificates import certificate_of
-from tests.shields.lookahead.adversary import case
+from tests.shields.backup_plans.adversary import case
 
 NAMES = ("cruise", "cart-pole", "batch reactor")
 CHANNEL = "constant delay"

@@ -74,11 +74,11 @@ def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
     plant, certificate, test = case
     rng = np.random.default_rng(0)
     estimates, shapes, plans = situations(plant, certificate, rng, 12)
-    rooms = test.tightenings_of(shapes).room
-    for x_hat, shape, (plan,), room in zip(estimates, shapes, plans, rooms, strict=True):
+    row_limits = test.tightenings_of(shapes).row_limits
+    for x_hat, shape, (plan,), limits in zip(estimates, shapes, plans, row_limits, strict=True):
         nominal = states(plant, x_hat, plan, np.zeros((STEPS, plant.n)))
         for step in range(STEPS):
-            for row, left in zip(test.prediction.rows, room[step], strict=True):
+            for row, left in zip(test.prediction.rows, limits[step], strict=True):
                 pushed = extreme_run(plant, x_hat, shape, plan, row, step)[step]
                 assert row @ (pushed - nominal[step]) == pytest.approx(1.0 - left, rel=1e-6, abs=1e-9)
 
@@ -212,7 +212,7 @@ def test_an_estimate_alone_is_judged_as_in_a_batch(case):
 def test_indefinite_shapes_leave_no_room(case):
     _, certificate, test = case
     tightening = test.tightenings_of(-certificate.Sigma[None])
-    assert np.isnan(tightening.room).all()
+    assert np.isnan(tightening.row_limits).all()
     assert np.isnan(tightening.radius).all()
 
 

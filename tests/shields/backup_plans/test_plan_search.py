@@ -10,11 +10,11 @@ import pytest
 from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
-from shields.runtime.backup_plans import planner, program
-from shields.runtime.backup_plans.planner import closed_loop
+from shields.runtime.backup_plans import plan_search
+from shields.runtime.backup_plans.plan_search import closed_loop
 from shields.runtime.decisions import REASONS
 from tests.certificates import certificate_of
-from tests.shields.lookahead.adversary import STABLE, UNSTABLE, case
+from tests.shields.backup_plans.adversary import STABLE, UNSTABLE, case
 
 NAMES = ["cruise", "cart-pole", "batch reactor", "n=6 m=2"]
 
@@ -120,7 +120,7 @@ def test_plans_are_what_they_say():
 @pytest.mark.parametrize("name", ["cruise", "batch reactor"])
 def test_an_input_that_passes_todays_test_starts_no_search_and_clears_the_store(name, monkeypatch):
     shield = shield_of(name)
-    monkeypatch.setattr(planner.Planner, "find", None)
+    monkeypatch.setattr(plan_search.Planner, "find", None)
     stored = np.zeros((2, shield.plant.m))
     decision = shield.decide(
         np.zeros(shield.plant.n), 1e-6 * shield.certificate.Sigma, np.zeros(shield.plant.m), stored
@@ -341,7 +341,7 @@ def break_solver(monkeypatch, how, rng):
         SecondOrderConeT=int,
         DefaultSolver=broken_solver(how, rng),
     )
-    monkeypatch.setattr(program, "_clarabel", fake)
+    monkeypatch.setattr(plan_search, "_clarabel", fake)
 
 
 @pytest.mark.parametrize("how", FAILURES)

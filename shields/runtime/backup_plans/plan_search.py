@@ -1,28 +1,37 @@
 """The search for a certified plan whose first input is close to the proposed one.
 
-Candidates that cost no solver come first: a given beginning, and then a gain at the predicted centers, limited or
-saturated. What `program` finds is tried last.
+Candidates come first: a given beginning, and then a gain at the predicted centers, limited or saturated. The solution
+of a convex program is tried last; whatever a solver says about it is not believed.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import clarabel
 import numpy as np
+from scipy.sparse import csc_matrix
 
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.plants.lqr import lqr_gain
+from ncs_gym.validation import read_only
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
-from shields.runtime.backup_plans.program import PlanProgram
 from shields.runtime.one_step import OneStepTest
 from shields.runtime.polytope_step import PolytopeTest
+from shields.verification import ACTION_ROUNDING
 
+# Its types are not declared.
+_clarabel: Any = clarabel
 # A first input this close to the proposed one, in units of the limits, is tried as the proposed one itself.
 AS_PROPOSED = 1e-5
 # Weight of inputs, in units of their limits, against states, in units of the box, in the regulator that brakes, and in
 # the one whose prediction knows no limits: it has to keep them by itself.
 INPUT_WEIGHT, UNLIMITED_INPUT_WEIGHT = 1e-2, 1.0
+# What the program keeps away from the limits of the plan test, in units of the box and of S or P: the solver's
+# precision.
+SOLVER_MARGIN = 1e-7
+MOST_ITERATIONS = 60
 
 
 class Plans(NamedTuple):
@@ -50,7 +59,7 @@ class Plans(NamedTuple):
 
 
 class Planner:
-    """Finds certified plans: candidates first, then the convex program (docs/lookahead.md).
+    """Finds certified plans (docs/lookahead.md).
 
     Its methods take, of E environments, estimates x_hat (E, n), error shapes Sigma_k (E, n, n), proposed inputs within
     the limits (E, m), and plans still stored (E, N, m), NaN beyond their ends.
@@ -102,7 +111,7 @@ class Planner:
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
         """Returns proposals followed by either loop, (E, 2, N, m), limited after the prediction: one product for all.
 
-        Of a single estimate, shape (n,), and proposal, (m,), without the first axis.
+        A single estimate, shape (n,), and proposal, (m,), give plans without the first axis.
         """
         inputs = np.concatenate([estimates, proposed], axis=-1) @ self._loops
         plans = expressible(inputs.reshape(*inputs.shape[:-1], 2, self.horizon, -1), self._plant.u_max)
@@ -139,7 +148,7 @@ class Planner:
         return plans
 
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
-        """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the first."""
+        """Returns the certified plan, of P of shape (E, P, N, m), that begins closest, and of equal ones the first."""
         certified = self.test.certified(estimates, tightening, plans)
         any_length = certified.any(axis=-1)
         lengths = np.where(any_length, certified.argmax(axis=-1) + 1, 0)
@@ -149,21 +158,138 @@ class Planner:
         return Plans(plans[rows, best], lengths[rows, best], distances[rows, best])
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
-        """Returns what of the program's plans is certified, as inputs that can be applied.
+        """Returns the shortest certified parts of the program's plans, as inputs that can be applied.
 
         The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
-        as every shorter length besides. Of its plan the shortest part that is certified counts.
+        as every shorter length besides.
         """
-        limits, (box, radius) = self._plant.u_max, self.test.room(estimates, tightening)
+        limits, (row_limits, radius) = self._plant.u_max, self.test.limits_at(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
         for e, u in enumerate(proposed):
             last = tightening.weighting[e, -1], float(radius[e, -1])
-            data = estimates[e], box[e], *last, tightening.between[e], u
-            if (found := self._program.solve(*data)) is not None:
+            found = self._program.solve(estimates[e], row_limits[e], *last, tightening.between[e], u)
+            if found is not None:
                 tried[e] = expressible(found, limits)
                 if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():
                     tried[e, 0, 0] = u
         return self._best(estimates, tightening, tried, proposed)
+
+
+class PlanProgram:
+    """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows, and one cone for an end in S.
+
+    Variables are the inputs in units of their limits. The solver is set up once, with the pattern of the problem; then
+    vectors and the entries of the cone are updated, so that a solution depends on its own data alone.
+
+    Args:
+        prediction: Of the plant.
+    """
+
+    def __init__(self, prediction: Prediction) -> None:
+        plant, length = prediction.plant, prediction.steps
+        self._m, self._length = plant.m, length
+        self._limits, self._weights = plant.u_max, (plant.u_max / plant.u_max.max()) ** 2
+        scale = np.tile(plant.u_max, length)
+        self._free = prediction.powers[1:]
+        self._end = read_only(prediction.forced[-1] * scale)
+        forced = prediction.forced[:-1] * scale
+        self._C = prediction.rows[: len(plant.box_rows)]
+        self._G = prediction.rows[:0] if prediction.ends else prediction.rows
+        self._between = prediction.grid.free.reshape(-1, plant.n)
+        between = (prediction.grid.forced * scale).reshape(-1, len(scale))
+        rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end, between])
+        self._rows = read_only(np.concatenate([rows, -rows]))
+        self._margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
+        root = prediction.ends[-1].root if prediction.ends else np.empty((0, plant.n))
+        self._cone = len(root) + 1 if len(root) else 0
+        pushed = float(np.linalg.norm(root @ self._end, axis=0).sum())
+        self._end_margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * pushed
+        self._arrange(root)
+        self._solver: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_solver": None}  # set up anew where it is used
+
+    def _arrange(self, root: np.ndarray) -> None:
+        """Fixes where the entries of the matrix are, those of the cone being what changes."""
+        size = self._length * self._m
+        identity = np.eye(size)
+        linear = np.concatenate([self._rows, identity, -identity])
+        row, column = np.nonzero(linear)
+        first = len(linear) + 1  # the row before holds the radius
+        cone_rows, cone_columns = (each.ravel() for each in np.indices((len(root), size)))
+        rows, columns = np.concatenate([row, first + cone_rows]), np.concatenate([column, cone_columns])
+        self._entries = np.concatenate([linear[row, column], -(root @ self._end).ravel()])
+        self._in_cone = slice(len(row), None)
+        shape = len(linear) + self._cone, size
+        numbered = csc_matrix((np.arange(1.0, len(rows) + 1.0), (rows, columns)), shape=shape)
+        self._order = numbered.data.astype(np.intp) - 1
+        numbered.data = self._entries[self._order]
+        self._typical = numbered
+
+    @np.errstate(all="ignore")  # what is not finite has no plan
+    def solve(
+        self,
+        estimate: np.ndarray,
+        row_limits: np.ndarray,
+        weighting: np.ndarray,
+        radius: float,
+        between: np.ndarray,
+        proposed: np.ndarray,
+    ) -> np.ndarray | None:
+        """Returns a plan, shape (N, m) [physical units], of which nothing is known; None if the solver fails.
+
+        Args:
+            estimate: x_hat, shape (n,).
+            row_limits: Largest |row c_j| for j = 1..N, shape (N, r).
+            weighting: T G of the last step, shape (n, n), or (0, n) for an end in P.
+            radius: Largest |T G c_j| of the last step.
+            between: Largest values of the rows of the grid in every step, shape (N, g).
+            proposed: Shape (m,).
+
+        Raises:
+            ValueError: If an argument has another shape: that is no failure of the solver.
+        """
+        centers = self._free @ estimate
+        moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
+        left = [row_limits[:-1, : len(self._C)].ravel(), row_limits[-1, : len(self._G)], between.ravel()]
+        drift, allowed = np.concatenate(moved), np.concatenate(left) - self._margin
+        ones = np.ones(2 * self._length * self._m)
+        cone = np.concatenate([[radius - self._end_margin], weighting @ centers[-1]])[: self._cone]
+        b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
+        q = np.zeros(self._length * self._m)
+        q[: self._m] = -2.0 * self._weights * proposed / self._limits
+        self._entries[self._in_cone] = -(weighting @ self._end).ravel()
+        A = self._entries[self._order]
+        if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
+            return None
+        try:
+            solver, self._solver = self._set_up() if self._solver is None else self._solver, None
+            solver.update(A=A, b=b, q=q)
+            plan = np.array(solver.solve().x, dtype=np.float64)
+            self._solver = solver  # what did not come to its end is not used again
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException:  # whatever a solver does wrong (its panics are no Exceptions): another plan, or none
+            return None
+        usable = plan.shape == (self._length * self._m,) and np.isfinite(plan).all()
+        return plan.reshape(self._length, self._m) * self._limits if usable else None
+
+    def _set_up(self) -> Any:
+        """Returns a solver with the pattern of the problem."""
+        size, settings = self._length * self._m, _clarabel.DefaultSettings()
+        settings.verbose, settings.presolve_enable, settings.max_iter = False, False, MOST_ITERATIONS
+        settings.input_sparse_dropzeros = False
+        # Everything is in units of its limits already.
+        settings.equilibrate_enable = False
+        settings.max_threads = 1
+        P = np.zeros(size)
+        P[: self._m] = 2.0 * self._weights
+        count = len(self._rows) + 2 * size
+        cones = [_clarabel.NonnegativeConeT(count)]
+        cones += [_clarabel.SecondOrderConeT(self._cone)] if self._cone else []
+        b = np.ones(count + self._cone)
+        return _clarabel.DefaultSolver(csc_matrix(np.diag(P)), np.zeros(size), self._typical, b, cones, settings)
 
 
 def regulator(plant: LinearPlant, input_weight: float = INPUT_WEIGHT) -> np.ndarray | None:

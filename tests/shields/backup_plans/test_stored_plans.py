@@ -5,10 +5,10 @@ import pytest
 
 from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.runtime.backup_plans.planner import Plans
+from shields.runtime.backup_plans.plan_search import Plans
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
-from tests.shields.lookahead.adversary import box_ellipsoid, case
+from tests.shields.backup_plans.adversary import box_ellipsoid, case
 
 COUNT = 6
 
@@ -75,9 +75,9 @@ def test_an_estimate_proves_the_box_only_with_room_for_its_error():
     shape = 0.01 * np.eye(plant.n)
     errors = shield.errors_of(shape)
     row = plant.box_rows[0] / (plant.box_rows[0] @ plant.box_rows[0])  # |c_0 x| = 1 on it
-    room = 1.0 - Ellipsoid(shape).support(plant.box_rows[0])
-    assert shield.lookahead.knows_in_box((room - 1e-6) * row, errors)
-    assert not shield.lookahead.knows_in_box((room + 1e-6) * row, errors)
+    left = 1.0 - Ellipsoid(shape).support(plant.box_rows[0])
+    assert shield.lookahead.knows_in_box((left - 1e-6) * row, errors)
+    assert not shield.lookahead.knows_in_box((left + 1e-6) * row, errors)
     indefinite = shield.errors_of(shape + 0.02 * np.eye(plant.n)[::-1])
     assert not shield.lookahead.knows_in_box(0.0 * row, indefinite)
 

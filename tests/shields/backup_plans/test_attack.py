@@ -11,8 +11,8 @@ from shields.runtime.backup_plans import plan_check as plan_test
 from shields.runtime.backup_plans.plan_check import tightenings
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
 from tests.certificates import certificate_of
-from tests.shields.lookahead.adversary import CASES, OUTSIDE, WeakestPoint, attack, box_ellipsoid, case, extremal_env
-from tests.shields.lookahead.test_planner import FAILURES, break_solver
+from tests.shields.backup_plans.adversary import CASES, OUTSIDE, WeakestPoint, attack, box_ellipsoid, case, extremal_env
+from tests.shields.backup_plans.test_plan_search import FAILURES, break_solver
 
 POLICIES = ("random", "outwards", "constant")
 MOST_TRIED = "cruise", "cart-pole", "batch reactor"
@@ -60,13 +60,13 @@ def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):
 def without_tightening(prediction, shapes):
     """Box rows as if states were known and nothing disturbed them."""
     known = tightenings(prediction, shapes)
-    return known._replace(room=np.ones_like(known.room))
+    return known._replace(row_limits=np.ones_like(known.row_limits))
 
 
 def without_a_step_of_disturbance(prediction, shapes):
     """The last step's disturbance is left out of every row."""
     known, plant = tightenings(prediction, shapes), prediction.plant
-    return known._replace(room=known.room + plant.disturbance.support(prediction.rows))
+    return known._replace(row_limits=known.row_limits + plant.disturbance.support(prediction.rows))
 
 
 @pytest.mark.parametrize("mutation", [without_tightening, without_a_step_of_disturbance])
