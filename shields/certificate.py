@@ -352,9 +352,7 @@ class Certificate(ReadOnlyArrays):
             ("contract", contract_text(self.method, self.contract)),
             *provenance_rows(recorded),
         ]
-        return table(
-            "Certificate of a robust control invariant set; shields.verify(certificate, plant) checks it", rows
-        )
+        return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.

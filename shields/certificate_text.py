@@ -8,10 +8,10 @@ from typing import Any
 from ncs_gym import ChannelContract
 from ncs_gym.validation import printable
 
-_WIDTH, _INDENT = 110, 14
+_WIDTH, _INDENT = 80, 14
 METHODS = {
-    "certified": "certified (docs/shield_proof.md)",
-    "paper": "paper (OP and Algorithm 1 of Liu et al. as printed, docs/paper.md)",
+    "certified": "certified",
+    "paper": "paper (OP and Algorithm 1 of Liu et al. as printed)",
 }
 
 
@@ -21,23 +21,23 @@ def size_of(recorded: dict[str, Any]) -> str:
     Args:
         recorded: The provenance of a certificate.
     """
-    unknown = recorded.get("share_of_box_unknown")
+    unknown, polytope_share = recorded.get("share_of_box_unknown"), recorded.get("polytope_share_of_box")
     other = _text(
         recorded.get("share_with_gain_of_ellipsoid"), " ({:.3g} % with the gain of the largest ellipsoid)", 100.0
     )
     polytope = "{:.3g} % of the safe box's volume" + other + "; the ellipsoid "
     shares = (
-        _text(recorded.get("polytope_share_of_box"), polytope, 100.0)
-        + _text(recorded.get("share_of_box"), "{:.4g} % of the safe box's volume", 100.0),
+        _text(polytope_share, polytope, 100.0)
+        + _text(
+            recorded.get("share_of_box"), "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume", 100.0
+        ),
         _text(
             recorded.get("share_of_box_at_rest"),
             "{:.4g} % of the volume of the safe box of the states, with no input under way",
             100.0,
         ),
         f"an unknown share of the safe box ({unknown})" if isinstance(unknown, str) else "",
-        _text(
-            recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the volume of the largest ellipsoid in the box", 100.0
-        ),
+        _text(recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the largest ellipsoid in the box", 100.0),
     )
     return ", ".join(filter(None, shares))
 

@@ -135,5 +135,5 @@ def gaussian_sentences(summary: dict[str, Any]) -> list[str]:
             f"{rounded_up(bound)} for an episode of {summary['steps']:,} steps."
         )
     if bound >= 1.0:
-        sentences.append("A bound of 1 says nothing: it takes a plant with a smaller delta (docs/shield.md).")
+        sentences.append("A bound of 1 says nothing: it takes a plant with a smaller delta.")
     return sentences

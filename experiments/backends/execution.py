@@ -158,8 +158,10 @@ def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[_Loc
         reports, stop = manager.Queue(), manager.Event()
         try:
             yield _LocalWorkers(pool, reports, stop, log_folder)
-        except BaseException:
+        except BaseException as error:
             stop.set()
+            if isinstance(error, KeyboardInterrupt):
+                print("stopping what runs; Ctrl-C again ends it at once", file=sys.stderr, flush=True)
             pool.shutdown(cancel_futures=True)
             raise
 

@@ -47,7 +47,7 @@ _AXES = {
 }
 # What the numbers of a table are.
 _QUANTITIES = {
-    "share": "share of the box [%]",
+    "share": "ellipsoid's share of the box [%]",
     "tolerance": "factor on all radii",
     "yardstick": "factor that a linear controller bears for 15 steps",
 }
@@ -92,7 +92,7 @@ def requirements(settings: RequirementsSettings) -> None:
     for table in tables:
         print(table.text, end="\n\n")
     sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today), _requests_text(found, settings)]
-    sentences += [_cheapest_text(found, settings.keep, None), _cheapest_text(found, settings.keep, today)]
+    sentences += [_cheapest_text(found, settings, None), _cheapest_text(found, settings, today)]
     for sentence in dict.fromkeys(sentences):
         if sentence:
             print(wrapped(sentence))
@@ -360,18 +360,24 @@ def _requests_text(found: Requirements, settings: RequirementsSettings) -> str:
     return f"{text}. Today's line above is that of asking for every sample."
 
 
-def _cheapest_text(found: Requirements, keep: float, bearing: Network | None) -> str:
+def _cheapest_text(found: Requirements, settings: RequirementsSettings, bearing: Network | None) -> str:
+    keep, where = settings.keep, f"--env {settings.env or _DEFAULT_ENV}"
+    if settings.plant is not None:
+        where = f"--plant {settings.plant}"
+    advice = f"`ncs synthesize {where} --max-age 0` says what binds, and what would help."
     cheapest = found.cheapest(keep / 100.0, bearing)
     if cheapest is None:
-        return "" if bearing else "No certificate was found for any of these networks."
+        return "" if bearing else f"No certificate was found for any of these networks. {advice}"
     what = "Cheapest" if bearing is None else "Cheapest that bears the losses and delays of today"
     return f"{what}, with at least {keep:g} % of the largest share: {_description(cheapest)}."
 
 
 def _description(point: Requirement) -> str:
     network = point.network
-    parts = [f"a step of {network.sampling_period:g} s", f"a sample every {_steps(network.send_period)}"]
-    parts.append("any losses" if network.losses is None else f"at most {network.losses} lost in a row")
+    every = "step" if network.send_period == 1 else _steps(network.send_period)
+    parts = [f"a step of {network.sampling_period:g} s", f"a sample every {every}"]
+    losses = f"at most {network.losses} lost in a row" if network.losses else "none lost"
+    parts.append("any losses" if network.losses is None else losses)
     if network.delay or network.jitter:
         latest = network.delay + network.jitter
         parts.append(f"at most {_steps(latest)} late")
@@ -379,9 +385,13 @@ def _description(point: Requirement) -> str:
         parts.append(f"inputs {_steps(network.input_delay)} late")
     if network.quantization_step:
         parts.append(f"rounded to {network.quantization_step:g}")
-    parts.append(f"{network.packets_per_second:.4g} packets/s and {point.bits_per_second:.4g} bits/s")
-    share = "no certificate was found" if point.certificate is None else f"{100.0 * point.share:.3g} % of the box"
-    return f"{', '.join(parts)}: {share}"
+    parts.append(f"{_rate(network.packets_per_second)} packets/s and {_rate(point.bits_per_second)} bits/s")
+    share = f"an ellipsoid of {100.0 * point.share:.3g} % of the box"
+    return f"{', '.join(parts)}: {'no certificate was found' if point.certificate is None else share}"
+
+
+def _rate(number: float) -> str:
+    return f"{number:,.0f}" if number >= 1000.0 else f"{number:.4g}"
 
 
 def _steps(number: int) -> str:

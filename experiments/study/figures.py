@@ -35,7 +35,7 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
     with matplotlib.rc_context(STYLE):
         caption = (
             "Violating episodes under attack and return as trained, better to the upper left. Bars are 95 % intervals "
-            "over runs and episodes. Small numbers are margins in percent."
+            "over runs and episodes. Small numbers are margins in percent; those below 20 are left out."
         )
         figure = CaptionedFigure((4.1 * len(environments), 5.0), caption)
         handles = {}
@@ -43,6 +43,8 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
         for axis, (name, env) in zip(axes, environments.items(), strict=True):
             for arm_name, arm in env["arms"].items():
                 base, _, margin = arm_name.rpartition(":")
+                if margin.isdigit() and int(margin) < 20:  # they lie on one another
+                    continue
                 known = base if margin.isdigit() and not base.startswith("penalized") else arm_name
                 style = ArmStyle.of(arm_name)
                 _draw_point(axis, style, arm["scenarios"], margin if known == base else "")

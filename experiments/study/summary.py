@@ -112,8 +112,9 @@ def _arm(arm: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
 def _evaluated(numbers: dict[str, Any], played: pd.DataFrame) -> dict[str, Any]:
     """Returns rate and return of an arm in a scenario, from a comparison, with intervals over runs and episodes.
 
-    A fixed policy is the same in all runs, so that its episodes are as good as one run each. Where no episode violates
-    or every one does, resampling says nothing, and the interval is the exact one of a single proportion.
+    A fixed policy is the same in all runs, so that its episodes are as good as one run each. Of few violating episodes
+    resampling says little and of none nothing: the interval of the rate reaches as far as the exact one of a single
+    proportion, too.
     """
     violating, returns = _by_run(played, "violating"), _by_run(played, "episode_return")
     if numbers["eval_return_ci95_over"] == "episodes":
@@ -123,13 +124,18 @@ def _evaluated(numbers: dict[str, Any], played: pd.DataFrame) -> dict[str, Any]:
         "episodes": numbers["eval_episodes"],
         "violating": numbers["eval_violating_episodes"],
         "rate": rate,
-        "rate_ci95": exact if rate in (0.0, 1.0) else hierarchical_interval(violating),
+        "rate_ci95": exact if rate in (0.0, 1.0) else outer_interval(hierarchical_interval(violating), exact),
         "rate_by_run": numbers["eval_violation_rate_by_run"],
         "return": numbers["eval_return_mean"],
         "return_ci95": hierarchical_interval(returns),
         "return_by_run": numbers["eval_return_by_run"],
         "overridden": numbers["intervention_rate"],
     }
+
+
+def outer_interval(resampled: list[float] | None, exact: list[float]) -> list[float] | None:
+    """Returns the smallest interval that contains both; None where resampling has none."""
+    return None if resampled is None else [min(resampled[0], exact[0]), max(resampled[1], exact[1])]
 
 
 def _by_run(played: pd.DataFrame, column: str) -> np.ndarray:

@@ -75,7 +75,7 @@ _KINDS = {
     "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
 }
 # Columns of the description: where its texts begin, and where they end.
-_INDENT, _WIDTH = 16, 110
+_INDENT, _WIDTH = 16, 80
 # Fingerprints that registered plants had on various processors (x86) before the last digits of their A and B were the
 # same on all. A certificate or an agent with one of them belongs to the plant of today: what a certificate claims is
 # verified for the numbers of today anyway.
@@ -294,7 +294,8 @@ class LinearPlant(ReadOnlyArrays):
         self._set("between_samples", points)
         if self.continuous_model is None:
             raise ValueError(
-                "between_samples needs a model in continuous time: make the plant by LinearPlant.from_statespace"
+                "between_samples needs a plant that was sampled from a model in continuous time "
+                "(LinearPlant.from_statespace); those with another process inside are not"
             )
         if self.remainder is not None:
             raise ValueError(

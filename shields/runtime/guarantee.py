@@ -265,7 +265,7 @@ class LostGuarantee:
         """
         news, self._news = sorted(self._news), frozenset()
         for code in news:
-            text = f"the state is not proved safe now: {EXPLANATIONS[code]} (docs/shield.md says what the reasons mean)"
+            text = f"the state is not proved safe now: {EXPLANATIONS[code]}"
             if self.on_unproved == "raise":
                 raise GuaranteeLostError(text)
             warnings.warn(text, GuaranteeLostWarning, stacklevel=_levels_to_the_caller())

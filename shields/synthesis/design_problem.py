@@ -152,8 +152,11 @@ def design_problem(
     """
     free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
     if free:
+        without = [name for name, column in zip(plant.state_names, plant.box_rows.T, strict=True) if not column.any()]
+        among = f" (of {', '.join(without)})" if without else ""
         raise Infeasible(
-            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box with generous limits",
+            f"the safe box leaves {free} of {plant.n} directions unbounded{among}: add rows to box with generous "
+            "limits",
             "S",
             free,
         )

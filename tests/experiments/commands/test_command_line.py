@@ -125,7 +125,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert all(name in {line.split("  ")[0] for line in table} for name in ("trusting", "proportional+shielded"))
     assert max(len(line) for line in lines if not line.startswith("files: ")) <= 100
     prose = " ".join(run.stdout.split())
-    assert "% of the volume of the largest ellipsoid in the box)" in prose
+    assert "% of the largest ellipsoid in the box)" in prose
     assert "evaluation episodes; the largest level was" in prose
     assert str(out) in run.stdout
     assert "A smoke run shows that everything runs" in run.stdout

@@ -173,7 +173,7 @@ def test_numbers_that_are_no_grid_are_refused(wrong):
 
 def test_plants_whose_times_between_samples_nobody_knows_are_refused():
     plant = truck_trailer()
-    with pytest.raises(ValueError, match="needs a model in continuous time"):
+    with pytest.raises(ValueError, match="needs a plant that was sampled from a model in continuous time"):
         replace(plant, continuous_model=None, between_samples=8)
     with pytest.raises(ValueError, match="is another one"):
         replace(plant, A=1.001 * plant.A, between_samples=8)
@@ -186,7 +186,7 @@ def test_plants_whose_times_between_samples_nobody_knows_are_refused():
             model, 0.5, box=[2.0, 2.0], u_max=4.0, input_delay=1, between_samples=8, **given_bounds
         )
     discrete = (plant.A, plant.B, np.eye(2), np.zeros((2, 1)), 0.5)
-    with pytest.raises(ValueError, match="needs a model in continuous time"):
+    with pytest.raises(ValueError, match="needs a plant that was sampled from a model in continuous time"):
         LinearPlant.from_statespace(discrete, box=[2.0, 2.0], u_max=4.0, between_samples=8, **given_bounds)
     pendulum = gym.make("ncs_gym/CartPoleNonlinear-v0").unwrapped.plant
     with pytest.raises(ValueError, match="without a remainder"):

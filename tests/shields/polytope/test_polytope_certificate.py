@@ -326,7 +326,7 @@ def small_plant(**changes):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"box": [1.0, np.inf]}, "leaves 1 of 2 directions unbounded: add rows to box with generous limits"),
+        ({"box": [1.0, np.inf]}, r"leaves 1 of 2 directions unbounded \(of x2\): add rows to box with generous limits"),
         (
             {"box": np.array([[1.0, 1.0], [1.0, 1.0 + 1e-8]])},
             r"the safe box is flat, \de\+\d+ times longer in one direction .*: add rows to box that limit the long one",

@@ -57,7 +57,7 @@ def test_shield_warns_once_in_each_episode_of_each_reason(shielded):
             *_, info = shield.step(still(shield))
             assert np.all(info["shield_reason"] == OTHER_STEPS)
 
-    text = f"the state is not proved safe now: {OTHER_STEPS} (docs/shield.md says what the reasons mean)"
+    text = f"the state is not proved safe now: {OTHER_STEPS}"
     assert said(episode) == [(text, __file__)]
     assert said(episode) == [(text, __file__)]
     starts = said(lambda: shield.reset(options={"state": OUTSIDE}))

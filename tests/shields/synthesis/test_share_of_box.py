@@ -74,7 +74,7 @@ def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way
     share = float((certificate.safe_set.gauge(at_rest) <= 1.0).mean())
     assert certificate.provenance["share_of_box_at_rest"] == pytest.approx(share, abs=6e-3)
     assert "share_of_box" not in certificate.provenance
-    assert "of the safe box of the states, with no input under way" in str(certificate)
+    assert "of the safe box of the states, with no input under way" in " ".join(str(certificate).split())
 
 
 def test_plants_without_delay_have_no_input_under_way():
@@ -90,5 +90,5 @@ def test_operating_point_shifts_nothing(certificate, loaded):
 def test_first_line_of_an_experiment_says_both_shares(certificate, loaded):
     line = certificate_line(certificate, verify(certificate, loaded))
     share = np.sqrt(np.linalg.det(certificate.L)) * np.pi / 16.0  # the box is 4 by 4
-    assert f"({100 * share:.4g} % of the safe box's volume, 99.97 % of the volume of the largest" in line
+    assert f"({100 * share:.4g} % of the safe box's volume, 99.97 % of the largest" in line
     assert line.startswith("certificate: 17 conditions hold")
