@@ -155,20 +155,17 @@ def _findings(summary: dict[str, Any]) -> list[str]:
     for name, arm in summary["arms"].items():
         if not arm["shielded"]:
             continue
-        upper = 100.0 * arm["eval_violation_rate_ci95"][1]
         if not arm["train_intervention_rate"] and not arm["intervention_rate"]:
             findings.append(
                 f"{name}: nothing was overridden, so that this arm shows nothing of the shield: train longer."
             )
             continue
-        limit = "may be left in this mode, the box may not" if arm["mode"] == "lookahead" else "ends at 1"
+        leaves = ", which may be left in this mode; the box may not" if arm["mode"] == "lookahead" else ""
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
-        findings += [
-            f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
-            f"episodes; the largest level was {arm['largest_level']:.3f} (the safe set {limit}).",
-            f"{name}: {arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes violating; from these "
-            f"episodes alone at most {upper:.2f} % with 95 % confidence.",
-        ]
+        findings.append(
+            f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes; the "
+            f"true state came to {arm['largest_level']:.3f} times the safe set{leaves}."
+        )
     paired = summary["paired_differences"]
     for name, difference in paired["arms"].items():
         mean, interval = difference["return_mean"], difference["return_ci95"]

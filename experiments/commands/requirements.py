@@ -204,6 +204,8 @@ def _answers(searches: Sequence[Search], settings: RequirementsSettings, store: 
         outcome = "no certificate found" if largest is None else f"certified up to {largest:g}"
         tqdm.write(f"{run.search.title}: {outcome}", file=sys.stderr)
 
+    for search in missing.values():
+        tqdm.write(f"seeking certificates: {search.title}", file=sys.stderr)
     if missing:
         executor = executor_of(settings, len(missing), store.folder / "tensorboard")
         execute([_SearchRun(search) for search in missing.values()], executor, keep)

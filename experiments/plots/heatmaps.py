@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -158,7 +159,7 @@ def _maps(
             label(axis, columns[0] if lowest else "", rows[0] if at % across == 0 else "", title)
         for axis in axes.flat[len(panels) :]:
             axis.set_visible(False)
-        figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=quantity, format=thousands)
+        figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=fill(quantity, 30), format=thousands)
         return figure, named
 
 

@@ -67,7 +67,7 @@ def _overridden(arm: dict[str, Any], key: str = "intervention_rate") -> str:
 
 def _violating(arm: dict[str, Any]) -> str:
     low, high = arm["eval_violation_rate_ci95"]
-    return f"{arm['eval_violating_episodes']:,} [{100 * low:.1f}, {100 * high:.1f} %]"
+    return f"{100 * arm['eval_violation_rate']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _return_text(arm: dict[str, Any]) -> str:

@@ -83,23 +83,20 @@ def prices_table(summary: dict[str, Any]) -> str:
 def margins_table(summary: dict[str, Any]) -> str:
     """Returns the smallest margin of each family without a violating episode, and what it costs.
 
-    That is as trained and under attack, with the return beside that of the arm with a proof, and the return that the
-    margin costs on an ideal channel, where none is needed.
+    That is as trained and under attack. What it costs is said of the margin that is enough under attack, or else of the
+    other: its return less that of the arm with a proof, and what it loses on an ideal channel, where none is needed.
     """
-    rows = [["margin without a violation", "as trained", "return", "attacked", "return", "lost, ideal"]]
+    rows = [["margin without a violation", "as trained", "attacked", "return", "lost, ideal"]]
     for title, env in summary["environments"].items():
         for family, sound in FAMILIES.items():
             known = {name for arm in env["arms"].values() for name in arm["scenarios"]}
             if not members(env, family) or sound not in env["arms"] or not {IDEAL, ATTACKED} <= known:
                 continue
-            cells, lost = [], "-"
-            for scenario in (AS_TRAINED, ATTACKED):
-                chosen = margins_needed(env, family, scenario)
-                cells += ["none", "-"] if chosen is None else [_margin(chosen, family), _beside(env, chosen, sound)]
-                lost = "-" if chosen is None else _lost(env, chosen, family)
-                if scenario == AS_TRAINED:
-                    own = lost
-            rows.append([f"{title} {family}", *cells, own if lost == "-" else lost])
+            needed = [margins_needed(env, family, scenario) for scenario in (AS_TRAINED, ATTACKED)]
+            chosen = needed[1] or needed[0]
+            price = ["-", "-"] if chosen is None else [_beside(env, chosen, sound), _lost(env, chosen, family)]
+            margins = ["none" if each is None else _margin(each, family) for each in needed]
+            rows.append([f"{title} {family}", *margins, *price])
     return text_table(rows)
 
 

@@ -107,4 +107,4 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
 
 
 def _when(points: int | None) -> str:
-    return "at the sampling instants" if points is None else f"at {points} times per step and between them"
+    return "at the sampling instants" if points is None else f"at all times (between_samples={points})"

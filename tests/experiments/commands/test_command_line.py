@@ -126,7 +126,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert max(len(line) for line in lines if not line.startswith("files: ")) <= 100
     prose = " ".join(run.stdout.split())
     assert "% of the largest ellipsoid in the box)" in prose
-    assert "evaluation episodes; the largest level was" in prose
+    assert "evaluation episodes; the true state came to" in prose
     assert str(out) in run.stdout
     assert "A smoke run shows that everything runs" in run.stdout
     assert "step/s" in run.stderr
@@ -278,7 +278,7 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
     arm = json.loads((tmp_path / "e.json").read_text())["arms"]["shield: project"]
     assert (arm["eval_episodes"], arm["eval_violation_steps"], arm["guaranteed_episodes"]) == (5, 0, 5)
     assert ", 5 episodes" in run.stdout
-    assert " 0 [0.0, 52.2 %] " in run.stdout
+    assert " 0.0 % [0.0, 52.2] " in run.stdout
     other = ncs("evaluate", model, "--episodes", "5", "--channel", "loss=0.9", "--out", tmp_path / "f.json")
     assert other.returncode == 0, other.stderr
     worse = json.loads((tmp_path / "f.json").read_text())

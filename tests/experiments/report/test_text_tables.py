@@ -95,15 +95,15 @@ def test_table_has_columns_of_the_training_only_where_something_was_trained():
     assert "training:" in whole
     assert "training:" in summary_text(arms, {"untrained": untrained["shielded"]})
     assert short.splitlines()[0].split() == ["evaluation:"]
-    of_the_arm = r"(?m)^shielded .*?(\d+ \[.*)"
+    of_the_arm = r"(?m)^shielded .*?([\d.]+ % \[.*)"
     assert re.findall(of_the_arm, short) == re.findall(of_the_arm, whole) != []
 
 
 def test_columns_of_a_wide_table_stand_closer_together():
     arm = summary_of({"lookahead": [run("lookahead", returns=(-10.0, -30.0)) for _ in range(2)]})["arms"]["lookahead"]
-    arm |= {"eval_violating_episodes": 19, "eval_violation_rate_ci95": [0.751, 0.999], "train_violation_steps": 123_456}
+    arm |= {"eval_violation_rate": 0.95, "eval_violation_rate_ci95": [0.751, 0.999], "train_violation_steps": 123_456}
     narrow = summary_text({"lookahead": arm}, {})
     wide = summary_text({"lookahead": arm, "proportional+lookahead": arm}, {})
-    assert "  19 [75.1, 99.9 %]  " in narrow
-    assert "19 [75.1, 99.9 %]    " in wide
+    assert "  95.0 % [75.1, 99.9]  " in narrow
+    assert "95.0 % [75.1, 99.9]    " in wide
     assert 90 < max(map(len, wide.splitlines())) <= 100

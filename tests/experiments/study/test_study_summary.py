@@ -7,7 +7,15 @@ from experiments.analysis.episodes import episodes_table
 from experiments.study.channel_switches import SWITCHES
 from experiments.study.figures import study_figures
 from experiments.study.study import quoted
-from experiments.study.summary import PRIMARY, Comparison, difference, margins_needed, members, study_summary
+from experiments.study.summary import (
+    PRIMARY,
+    Comparison,
+    difference,
+    margins_needed,
+    members,
+    outer_interval,
+    study_summary,
+)
 from experiments.study.tables import (
     agents_table,
     comparisons_table,
@@ -108,6 +116,12 @@ def test_arms_have_rates_of_every_run_and_intervals_over_runs(made):
     assert nothing["rate_ci95"][0] == 0.0 < nothing["rate_ci95"][1]  # resampling zeros would say that it is certain
 
 
+def test_interval_of_a_rate_contains_the_exact_one():
+    assert outer_interval([0.0, 0.012], [0.0001, 0.022]) == [0.0, 0.022]
+    assert outer_interval([0.5, 0.7], [0.56, 0.69]) == [0.5, 0.7]
+    assert outer_interval(None, [0.0, 0.1]) is None
+
+
 def test_price_is_that_of_the_best_arm_that_violates_anywhere(made):
     agents, regulators = env_of(made)["prices"]
     assert (agents["second"], agents["mean"]) == ("unshielded", pytest.approx(-9.0))
@@ -121,9 +135,9 @@ def test_margins_are_the_smallest_without_a_violation(made):
     assert list(members(env, "lqr+psf")) == ["lqr+psf", "lqr+psf:10", "lqr+psf:20"]  # a tube is no margin
     assert margins_needed(env, "lqr+psf", "as trained") == "lqr+psf:10"
     assert margins_needed(env, "lqr+psf", "attacked") == "lqr+psf:20"
-    assert row(margins_table(made[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "-0.5", "20", "%", "-1.5", "-2.0"]
+    assert row(margins_table(made[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "20", "%", "-1.5", "-2.0"]
     never = study(**{"lqr+psf:20": (12.0, 0.0, 1.0)})
-    assert row(margins_table(never[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "-0.5", "none", "-", "-1.0"]
+    assert row(margins_table(never[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "none", "-0.5", "-1.0"]
 
 
 def test_tables_fit_a_terminal(made):
