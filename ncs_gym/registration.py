@@ -109,7 +109,8 @@ class Factory:
 
         Args:
             plant: The plant; None for the default one.
-            between_samples: Times per step at which the box counts (`LinearPlant`); None for the plant's own.
+            between_samples: Times per step at which the box counts (`LinearPlant`), 1 for the sampling instants alone;
+                None for the plant's own.
             given: Other arguments of `NCSEnv`; None stands for the default where there is one.
 
         Raises:

@@ -30,7 +30,7 @@ class SynthesizeSettings:
         search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
             takes about as long again, longer for polytopes of many rows, and keeps the polytope alone.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
-            own, mostly the sampling instants alone (docs/shield.md).
+            own; 1 for the sampling instants alone (docs/shield.md).
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.

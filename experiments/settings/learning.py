@@ -89,7 +89,7 @@ class LearningSettings(BackendSettings):
         certificate: Certificate file to use instead of synthesizing one.
         safe_set: What the shield keeps if its certificate is synthesized: the polytope, or the ellipsoid inside it.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
-            own, mostly the sampling instants alone (docs/shield.md).
+            own; 1 for the sampling instants alone (docs/shield.md).
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter and send_period [steps], quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
@@ -257,7 +257,8 @@ class EvaluateSettings:
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
-        between_samples: Times per step at which the safe box counts; by default the plant's own.
+        between_samples: Times per step at which the safe box counts, 1 for the sampling instants; by default the
+            plant's own.
         channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
         smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).

@@ -200,7 +200,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         if plant.between_samples is not None and not isinstance(self._process_given, LinearProcess):
             raise ValueError(
-                "between_samples is about the plant's own equations: beside another process= give a plant without it"
+                "between_samples is about the plant's own equations: beside another process= give a plant with "
+                "between_samples=1"
             )
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")

@@ -76,6 +76,9 @@ _KINDS = {
 }
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
+# Times per step at which the box of a plant made from a model in continuous time counts by default, if what is unknown
+# between them takes at most this share of every limit.
+_POINTS, _MOST_REMAINDER = 4, 0.1
 # Fingerprints that registered plants had on various processors (x86) before the last digits of their A and B were the
 # same on all. A certificate or an agent with one of them belongs to the plant of today: what a certificate claims is
 # verified for the numbers of today anyway.
@@ -162,8 +165,8 @@ class LinearPlant(ReadOnlyArrays):
         continuous_model: [Ac, Bc] of the model x' = Ac x + Bc u in continuous time that A and B were sampled from,
             shape (n, n + m) [1/s]; None if it is unknown.
         between_samples: Number N of times per step, 2 to 64, at which the box counts; with a bound on what is between
-            them it then counts at all times, for environments and certificates (docs/shield_proof.md). None: at the
-            sampling instants alone. Needs a continuous model without remainder and a box that bounds every state.
+            them it then counts at all times, for environments and certificates (docs/shield_proof.md). None, or 1: at
+            the sampling instants alone. Needs a continuous model without remainder and a box that bounds every state.
         error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
@@ -290,8 +293,10 @@ class LinearPlant(ReadOnlyArrays):
             self._set("continuous_model", as_matrix(self.continuous_model, shape, "continuous_model"))
         if self.between_samples is None:
             return
-        points = as_count(self.between_samples, "between_samples", low=2, high=between_samples.MOST_POINTS)
-        self._set("between_samples", points)
+        points = as_count(self.between_samples, "between_samples", low=1, high=between_samples.MOST_POINTS)
+        self._set("between_samples", points if points > 1 else None)
+        if points == 1:
+            return
         if self.continuous_model is None:
             raise ValueError(
                 "between_samples needs a plant that was sampled from a model in continuous time "
@@ -346,19 +351,35 @@ class LinearPlant(ReadOnlyArrays):
             input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
                 estimator knows; box, bounds and names are given for the model's own states.
             settings: Other arguments of `LinearPlant` except A, B and H (`box` and `u_max` at least), or those of
-                `LinearPlant.around`.
+                `LinearPlant.around`. `between_samples` is 4 by default, so that the box counts at all times, for a
+                model in continuous time without input_delay and remainder, if its box bounds every state and what is
+                unknown between these times takes at most a tenth of each limit.
 
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
-        if input_delay and settings.get("between_samples") is not None:
+        if input_delay and settings.get("between_samples") not in (None, 1):
             raise ValueError("between_samples is for plants without input_delay")
         arguments = statespace.sampled_arguments(sys, dt, settings)
         given = {"state_limits", "input_limits"} & set(settings)
         if len(given) == 1:
             raise ValueError(f"{given.pop()} is given alone: give state_limits and input_limits, or box and u_max")
         plant = cls.around(**arguments) if given else cls(**arguments)
-        return plant if input_delay == 0 else plant._delayed(input_delay)
+        if input_delay:
+            return plant._delayed(input_delay)
+        if "between_samples" not in settings and plant._knows_between(_POINTS):
+            plant._set("between_samples", _POINTS)
+        return plant
+
+    def _knows_between(self, points: int) -> bool:
+        """Returns whether the box can count at so many times per step, and what is between them takes little of it."""
+        if self.continuous_model is None or self.remainder is not None or np.linalg.matrix_rank(self.box) < self.n:
+            return False
+        try:
+            grid = between_samples.grid_rows(self.continuous_model, self.box_rows, self.u_max, self.dt, points)
+        except OverflowError:
+            return False
+        return bool((grid.remainder <= _MOST_REMAINDER).all())
 
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.

@@ -165,10 +165,29 @@ def test_file_of_a_plant_keeps_the_setting(tmp_path):
     assert "at all times" not in str(batch_reactor())
 
 
-@pytest.mark.parametrize("wrong", [1, 0, -3, 65, 2.5, True, "8", [8]])
+@pytest.mark.parametrize("wrong", [0, -3, 65, 2.5, True, "8", [8]])
 def test_numbers_that_are_no_grid_are_refused(wrong):
     with pytest.raises(ValueError, match="between_samples must be"):
         replace(truck_trailer(), between_samples=wrong)
+
+
+MOTOR = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])
+BOUNDS = {"disturbance_bound": [0.0, 0.1], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
+
+
+def test_plants_of_a_model_in_continuous_time_count_at_all_times_unless_they_cannot_or_are_told_otherwise():
+    def points(model=MOTOR, dt=0.01, box=(0.2, 4.0), **settings):
+        return LinearPlant.from_statespace(model, dt, box=box, u_max=12.0, **BOUNDS, **settings).between_samples
+
+    assert points() == 4
+    assert points(between_samples=8) == 8
+    assert points(between_samples=1) is None is points(between_samples=None)
+    assert points(dt=0.1) is None  # what is between four times takes more than a tenth of a limit
+    assert points(box=(0.2, 1e9)) is None
+    assert points(box=(0.2, np.inf)) is None
+    assert points(input_delay=1) is None
+    sampled = LinearPlant.from_statespace(MOTOR, 0.01, box=(0.2, 4.0), u_max=12.0, **BOUNDS)
+    assert points((sampled.A, sampled.B, sampled.H, [[0.0]], 0.01), None) is None
 
 
 def test_plants_whose_times_between_samples_nobody_knows_are_refused():
@@ -214,4 +233,5 @@ def test_registered_environments_count_between_samples_if_they_are_told_so(make)
     assert env.plant.fingerprint == own.fingerprint
     assert env.contract == make("ncs_gym/CSTR-v0").unwrapped.contract
     with pytest.raises(ValueError, match="between_samples must be"):
-        make("ncs_gym/CSTR-v0", between_samples=1)
+        make("ncs_gym/CSTR-v0", between_samples=65)
+    assert make("ncs_gym/CSTR-v0", between_samples=1).unwrapped.plant.between_samples is None

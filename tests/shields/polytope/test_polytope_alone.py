@@ -27,7 +27,8 @@ def servo(factor=1.2, **changes):
     """A DC servo whose radii no ellipsoid bears."""
     motor = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])
     bounds = {"disturbance_bound": [0.0, 0.25], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
-    plant = LinearPlant.from_statespace(motor, dt=0.005, box=[0.2, 4.0], u_max=12.0, **bounds | changes)
+    given = {"box": [0.2, 4.0], "u_max": 12.0, "between_samples": None} | bounds | changes
+    plant = LinearPlant.from_statespace(motor, dt=0.005, **given)
     return with_radii(plant, disturbance=factor, noise=factor)
 
 

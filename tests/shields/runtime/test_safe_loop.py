@@ -1,5 +1,6 @@
 """The loop without Gymnasium: the same decisions and proofs as the wrapper's, and the same attacks."""
 
+import re
 import sys
 from contextlib import nullcontext
 
@@ -546,7 +547,8 @@ def text_of(loop):
     """The rows that a loop prints, by name."""
     title, *lines = str(loop).splitlines()
     assert title.startswith("Safe loop")
-    return {line[:14].strip(): line[14:] for line in lines if line[:14].strip()}
+    rows = re.findall(r"(?m)^  (\S+) +(.*(?:\n {14}.*)*)", "\n".join(lines))
+    return {name: " ".join(text.split()) for name, text in rows}
 
 
 def test_printed_loop_says_whether_the_state_is_proved_to_be_safe_and_why_not():

@@ -40,7 +40,7 @@ def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, sta
     certificate = caught.value.certificate
     assert verified(certificate, loaded).valid
     assert certificate.provenance["interrupted_at"].startswith(stage)
-    assert "other sets may be larger" in str(certificate)
+    assert "other sets may be larger" in " ".join(str(certificate).split())
     assert isinstance(caught.value, KeyboardInterrupt)
 
 
