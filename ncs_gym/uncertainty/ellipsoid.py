@@ -124,10 +124,6 @@ class Ellipsoid(ReadOnlyArrays):
         """Returns the trace-smallest ellipsoid of the family P1/nu + P2/(1-nu) around the Minkowski sum."""
         return Ellipsoid(outer_sum(self.shape_matrix, other.shape_matrix, np.eye(self.dim)))
 
-    def sum_contains(self, other: Ellipsoid, point: np.ndarray) -> bool:
-        """Returns whether a point lies in the Minkowski sum of both ellipsoids (see `sum_gauge`)."""
-        return sum_gauge(point, self.shape_matrix, other.shape_matrix) <= 1.0
-
     def farthest_point(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).
 
