@@ -209,6 +209,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
         contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
         self._contract, self._protocol, self._certificate_contract = contracts
+        self._downlink = downlink
+        self._downlink_contract = None if self._protocol is None else self._protocol.contract
         histories = arrival_histories(plant, self._channel, self._certificate_contract)
         self._error_set = histories.recursion.error_set
         if not histories.uses_samples:

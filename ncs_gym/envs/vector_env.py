@@ -121,7 +121,7 @@ class NCSVectorEnv(VectorEnv):
         self._process = PlantSimulation(
             self._plant, single.disturbance, allowed, self.num_envs, noise=single.noise, process=single.process
         )
-        self._protocol = single.downlink_protocol
+        self._downlink, self._protocol = single.downlink, single.downlink_protocol
         self._certificate_contract = single.certificate_contract
         count = self.num_envs
         self._uplinks = uplinks(own[0] or [self._channel] * count, self._channel)
