@@ -185,13 +185,13 @@ class _LocalWorkers:
 
 
 def _execute_here(run: Run, reports: Any, stop: Any, log_folder: Path | None) -> Any:
-    """Executes a run in a worker process; it gives up at its next report after `stop` is set."""
+    """Executes a run in a worker process; it gives up at its next report, perhaps of no steps, after `stop` is set."""
     unreported = 0
 
     def report(steps: int) -> None:
         nonlocal unreported
         unreported += steps
-        if unreported >= _REPORTED_STEPS:
+        if unreported >= _REPORTED_STEPS or not steps:
             if stop.is_set():
                 raise RunStopped(f"{run.name} gave up: another run failed, or the user interrupted")
             reports.put(unreported)
