@@ -185,7 +185,7 @@ class _LocalWorkers:
 
 
 def _execute_here(run: Run, reports: Any, stop: Any, log_folder: Path | None) -> Any:
-    """Executes a run in a worker process; it gives up at its next report, perhaps of no steps, after `stop` is set."""
+    """Executes a run in a worker process; it gives up at its next report (of 0 steps, say) after `stop` is set."""
     unreported = 0
 
     def report(steps: int) -> None:

@@ -122,20 +122,23 @@ class PredictiveFilter:
         self._ends_in_ellipsoid = polytope is None
         self._prediction = Prediction(test, horizon)
         self._program = PlanProgram(self._prediction)
-        self._limits = np.full((horizon - 1, len(plant.box_rows)), 1.0 - margin)
+        at_samples = np.full((horizon + 1, len(plant.box_rows)), 1.0 - margin)
         self._end_limits = np.full(1 if polytope is None else len(polytope.rows), 1.0 - margin)
         if tube:
             reach, end = _tube(certificate, plant, self._end_sizes, horizon)
-            self._limits, self._end_limits = self._limits - reach, self._end_limits - end
-        # As the program takes it: the last row is for ends in P.
+            at_samples, self._end_limits = at_samples - reach, self._end_limits - end
+        self._limits = at_samples[1:-1]
+        # As the program takes it, whose rows of the box are shorter by what a disturbance does between samples; the
+        # last row is for ends in P.
         self._all_limits = np.ones((horizon, max(self._limits.shape[1], len(self._end_limits))))
-        self._all_limits[:-1, : self._limits.shape[1]] = self._limits
+        longer = np.linalg.norm(self._prediction.rows[: len(plant.box_rows)], axis=1)
+        longer = longer / np.linalg.norm(plant.box_rows, axis=1)
+        self._all_limits[:-1, : self._limits.shape[1]] = self._limits * longer
         self._all_limits[-1, : len(self._end_limits)] = self._end_limits
         self._weighting = self._root if polytope is None else self._root[:0]
         self._grid = grid_test(plant)
-        ends = np.vstack([np.full((1, self._limits.shape[1]), 1.0 - margin), self._limits, self._limits[-1:]])
         times = len(self._grid.moved) // len(plant.box_rows)
-        self._between = np.tile(np.minimum(ends[:-1], ends[1:]), times)
+        self._between = np.tile(np.minimum(at_samples[:-1], at_samples[1:]), times)
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
@@ -200,7 +203,7 @@ class PredictiveFilter:
 def _tube(
     certificate: Certificate, plant: LinearPlant, end_sizes: Callable[[np.ndarray], np.ndarray], horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how far true states are off a plan in the rows of the box, shape (horizon - 1, k), and at its end.
+    """Returns how far true states are off a plan in the rows of the box, (horizon + 1, k), and in the set at its end.
 
     `end_sizes` returns how far the states of an ellipsoid of a given shape reach at the end.
     """
@@ -214,7 +217,8 @@ def _tube(
         supports = np.sqrt(np.maximum([np.einsum("ij,jk,ik->i", rows, each, rows) for each in moved], 0.0))
         return supports.max(axis=0), np.max([end_sizes(each) for each in moved], axis=0)
 
-    power, summed, summed_end, reach = np.eye(plant.n), np.zeros(len(rows)), np.zeros(()), []
+    power, summed, summed_end = np.eye(plant.n), np.zeros(len(rows)), np.zeros(())
+    reach = [sizes(first, power)[0]]
     for _ in range(horizon):
         for shapes in (pushes, [plant.disturbance.shape_matrix]):
             support, at_end = sizes(shapes, power)
@@ -222,7 +226,7 @@ def _tube(
         power = (plant.A + plant.B @ K) @ power
         support, at_end = sizes(first, power)
         reach.append(summed + support)
-    return np.array(reach[:-1]), summed_end + at_end
+    return np.array(reach), summed_end + at_end
 
 
 # How each filter is made from a certificate and its plant.

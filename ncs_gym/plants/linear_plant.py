@@ -76,9 +76,6 @@ _KINDS = {
 }
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
-# Times per step at which the box of a plant made from a model in continuous time counts by default, if what is unknown
-# between them takes at most this share of every limit.
-_POINTS, _MOST_REMAINDER = 4, 0.1
 # Fingerprints that registered plants had on various processors (x86) before the last digits of their A and B were the
 # same on all. A certificate or an agent with one of them belongs to the plant of today: what a certificate claims is
 # verified for the numbers of today anyway.
@@ -165,8 +162,9 @@ class LinearPlant(ReadOnlyArrays):
         continuous_model: [Ac, Bc] of the model x' = Ac x + Bc u in continuous time that A and B were sampled from,
             shape (n, n + m) [1/s]; None if it is unknown.
         between_samples: Number N of times per step, 2 to 64, at which the box counts; with a bound on what is between
-            them it then counts at all times, for environments and certificates (docs/shield_proof.md). None, or 1: at
-            the sampling instants alone. Needs a continuous model without remainder and a box that bounds every state.
+            them it then counts at all times, for environments and certificates (docs/shield_proof.md), if what
+            disturbances have done by any time of a step respects the bound of a whole step. None, or 1: at the sampling
+            instants alone. Needs a continuous model without remainder and a box that bounds every state.
         error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
@@ -300,7 +298,7 @@ class LinearPlant(ReadOnlyArrays):
         if self.continuous_model is None:
             raise ValueError(
                 "between_samples needs a plant that was sampled from a model in continuous time "
-                "(LinearPlant.from_statespace); those with another process inside are not"
+                "(LinearPlant.from_statespace); plants that model another process have none"
             )
         if self.remainder is not None:
             raise ValueError(
@@ -351,9 +349,7 @@ class LinearPlant(ReadOnlyArrays):
             input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
                 estimator knows; box, bounds and names are given for the model's own states.
             settings: Other arguments of `LinearPlant` except A, B and H (`box` and `u_max` at least), or those of
-                `LinearPlant.around`. `between_samples` is 4 by default, so that the box counts at all times, for a
-                model in continuous time without input_delay and remainder, if its box bounds every state and what is
-                unknown between these times takes at most a tenth of each limit.
+                `LinearPlant.around`.
 
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
@@ -365,28 +361,15 @@ class LinearPlant(ReadOnlyArrays):
         if len(given) == 1:
             raise ValueError(f"{given.pop()} is given alone: give state_limits and input_limits, or box and u_max")
         plant = cls.around(**arguments) if given else cls(**arguments)
-        if input_delay:
-            return plant._delayed(input_delay)
-        if "between_samples" not in settings and plant._knows_between(_POINTS):
-            plant._set("between_samples", _POINTS)
-        return plant
-
-    def _knows_between(self, points: int) -> bool:
-        """Returns whether the box can count at so many times per step, and what is between them takes little of it."""
-        if self.continuous_model is None or self.remainder is not None or np.linalg.matrix_rank(self.box) < self.n:
-            return False
-        try:
-            grid = between_samples.grid_rows(self.continuous_model, self.box_rows, self.u_max, self.dt, points)
-        except OverflowError:
-            return False
-        return bool((grid.remainder <= _MOST_REMAINDER).all())
+        return plant if input_delay == 0 else plant._delayed(input_delay)
 
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
 
         Whatever disturbs it is taken to act in continuous time and to be constant during a step: with
         G(dt) = int_0^dt exp(Ac s) ds, the disturbances of a step become G(dt') G(dt)^-1 d. What is declared of sensors
-        and of the first estimate stays as it is. Where that is not what disturbs your plant, make the plant anew.
+        and of the first estimate stays as it is, and so does `between_samples`: a longer step may need more times.
+        Where that is not what disturbs your plant, make the plant anew.
 
         Raises:
             ValueError: If dt is out of range, the plant has no continuous model, or a remainder, which belongs to its
@@ -521,6 +504,8 @@ class LinearPlant(ReadOnlyArrays):
             assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
         if self.remainder is not None:
             assumed.append(self.remainder.sentence)
+        if self.between_samples is not None:
+            assumed.append("What disturbances have done by any time within a step respects the bound of a whole step.")
         return tuple(assumed)
 
     @property

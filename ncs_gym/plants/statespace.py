@@ -93,6 +93,8 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
             raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
         dt = own
     dt = as_number(dt, "dt", low=0.0, low_open=True)
+    if "continuous_model" in settings:
+        raise ValueError("continuous_model is that of sys, if it is one in continuous time: leave it out")
     if is_continuous:
         return sampled_model(A, B, dt) | {"H": H} | settings
     if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:

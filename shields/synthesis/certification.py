@@ -555,7 +555,7 @@ def _leaves_between_samples(shortfall: float) -> Infeasible:
     """Returns the exception for sets that hold at the sampling instants alone."""
     return Infeasible(
         "(B) the state leaves the box between two samples: a shorter dt, more grid points (between_samples=) or less "
-        "disturbance would help, and between_samples=None asks for the sampling instants alone",
+        "disturbance would help, and between_samples=1 asks for the sampling instants alone",
         "B",
         shortfall,
     )

@@ -227,6 +227,7 @@ def _scaled_grid(plant: LinearPlant, transform: np.ndarray) -> ScaledGrid:
     state, pushed, remainder = plant.grid_rows
     pushed = pushed * plant.u_max
     left = np.maximum(1.0 - remainder - float(ACTION_ROUNDING) * np.abs(pushed).sum(axis=-1), _NOTHING_LEFT)  # (N, k)
-    rho = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, plant.disturbance.shape_matrix, plant.box_rows))
+    squares = np.einsum("ji,ik,jk->j", plant.box_rows, plant.disturbance.shape_matrix, plant.box_rows)
+    rho = np.sqrt(np.maximum(squares, 0.0))
     rows, inputs = state @ transform / left[..., None], pushed / left[..., None]
     return ScaledGrid(rows.reshape(-1, plant.n), inputs.reshape(-1, plant.m), (rho / left).ravel())

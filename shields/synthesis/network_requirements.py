@@ -339,7 +339,7 @@ class BoundarySearch(Search):
             report(len(self.ages))
             return {inf: Answer(certificate)}
         while high - low > 1 and low < MAX_AGE:
-            report(0)  # who is told may end the search
+            report(0)  # the caller may end the search here
             age = min(2 * low + 1, MAX_AGE) if high == inf else (low + int(high)) // 2
             certificate = nearby_certificate(self.plant, _contract(age, self.quantization_step), best)
             answers[age] = Answer(certificate)

@@ -108,8 +108,8 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
 def ellipsoid_margin(problem: DesignProblem, gain: MaxMarginGain, *, input_limits: bool = True) -> float:
     """Returns the factor that all radii may grow by until a gain keeps no ellipsoid in the box.
 
-    Where the box counts between samples, which the search for the gain knows nothing of, at most what it bears with a
-    polytope.
+    Where the box counts between samples, which the search for the gain knows nothing of, a bound from above: at most
+    what the gain bears with a polytope, as far as that is known.
     """
     if not len(problem.grid.disturbed):
         return gain.margin

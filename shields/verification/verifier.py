@@ -99,7 +99,7 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
                 other = "made for another plant (fingerprints differ)"
                 if certificate.between_samples != plant.between_samples:
                     made, asked = (_when(points) for points in (certificate.between_samples, plant.between_samples))
-                    other = f"made for a box that counts {made}, and here it counts {asked}"
+                    other = f"made for another plant, or for a box that counts {made}: here it counts {asked}"
                 raise CertificateError(f"the certificate was {other}: synthesize one for this plant")
             raise CertificateError(
                 f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"

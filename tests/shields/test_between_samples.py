@@ -350,6 +350,38 @@ def oscillator(damping, limits, u_max):
     return plant, synthesize(plant)
 
 
+def test_at_all_times_assumes_that_disturbances_within_a_step_respect_its_bound():
+    """A torque constant over each step keeps the bound of a step, and does more in the middle of half a period."""
+    A, B, dt, torque = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]]), 3.1, 0.3
+    G = np.pad(np.hstack([A, B]), ((0, 1), (0, 0)))
+    times = [expm(G * tau)[:2] for tau in np.linspace(0.0, dt, 60)]
+    plant = LinearPlant.from_statespace(
+        (A, B, np.eye(2), np.zeros((2, 1))),
+        dt=dt,
+        box=[1.5, 1.0],
+        u_max=0.5,
+        disturbance_bound=(times[-1][:, 2:], [torque]),
+        sensor_bound=1e-4,
+        initial_bound=1e-3,
+        between_samples=32,
+    )
+    assert "by any time within a step" in " ".join(plant.assumptions)
+    loop, x = SafeLoop(synthesize(plant), plant, Channel(), on_unproved="ignore"), np.zeros(2)
+    rng, within, at_samples = np.random.default_rng(0), 0.0, 0.0
+    loop.start(x)
+    for step in range(400):
+        loop.receive([Packet(step, x.copy(), loop.episode)] if step else [])
+        assert loop.guaranteed
+        u = loop.decide(rng.choice([-1.0, 1.0]) * plant.u_max).input[0]
+        pushed = {
+            d: max(np.abs(plant.box_rows @ (each @ [*x, u + d])).max() for each in times) for d in (-torque, torque)
+        }
+        worst = max(pushed, key=pushed.get)
+        x = times[-1] @ [*x, u + worst]
+        within, at_samples = max(within, pushed[worst]), max(at_samples, np.abs(plant.box_rows @ x).max())
+    assert at_samples < 1.0 < within
+
+
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_inputs_on_their_way_at_a_start_in_the_middle_count_between_samples(mode):
     plant, certificate = oscillator(0.3, (1.0, 8.0), 0.9)

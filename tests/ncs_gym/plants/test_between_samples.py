@@ -171,23 +171,18 @@ def test_numbers_that_are_no_grid_are_refused(wrong):
         replace(truck_trailer(), between_samples=wrong)
 
 
-MOTOR = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])
-BOUNDS = {"disturbance_bound": [0.0, 0.1], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
+def test_once_per_step_is_at_the_sampling_instants_alone():
+    plant = replace(truck_trailer(), between_samples=8)
+    assert "by any time within a step" in " ".join(plant.assumptions)
+    assert replace(plant, between_samples=1).between_samples is None
+    assert replace(plant, between_samples=1).fingerprint == truck_trailer().fingerprint
 
 
-def test_plants_of_a_model_in_continuous_time_count_at_all_times_unless_they_cannot_or_are_told_otherwise():
-    def points(model=MOTOR, dt=0.01, box=(0.2, 4.0), **settings):
-        return LinearPlant.from_statespace(model, dt, box=box, u_max=12.0, **BOUNDS, **settings).between_samples
-
-    assert points() == 4
-    assert points(between_samples=8) == 8
-    assert points(between_samples=1) is None is points(between_samples=None)
-    assert points(dt=0.1) is None  # what is between four times takes more than a tenth of a limit
-    assert points(box=(0.2, 1e9)) is None
-    assert points(box=(0.2, np.inf)) is None
-    assert points(input_delay=1) is None
-    sampled = LinearPlant.from_statespace(MOTOR, 0.01, box=(0.2, 4.0), u_max=12.0, **BOUNDS)
-    assert points((sampled.A, sampled.B, sampled.H, [[0.0]], 0.01), None) is None
+def test_a_model_in_continuous_time_is_given_once():
+    bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    model = [[-1.0]], [[1.0]], [[1.0]], [[0.0]]
+    with pytest.raises(ValueError, match="continuous_model is that of sys"):
+        LinearPlant.from_statespace(model, 0.1, box=1.0, u_max=1.0, continuous_model=[[-2.0, 1.0]], **bounds)
 
 
 def test_plants_whose_times_between_samples_nobody_knows_are_refused():
