@@ -363,15 +363,15 @@ def _requests_text(found: Requirements, settings: RequirementsSettings) -> str:
 
 
 def _cheapest_text(found: Requirements, settings: RequirementsSettings, bearing: Network | None) -> str:
-    keep, where = settings.keep, f"--env {settings.env or _DEFAULT_ENV}"
-    if settings.plant is not None:
-        where = f"--plant {settings.plant}"
-    advice = f"`ncs synthesize {where} --max-age 0` says what binds, and what would help."
-    cheapest = found.cheapest(keep / 100.0, bearing)
+    cheapest = found.cheapest(settings.keep / 100.0, bearing)
     if cheapest is None:
-        return "" if bearing else f"No certificate was found for any of these networks. {advice}"
+        if bearing is not None:
+            return ""
+        plant = f"--env {settings.env or _DEFAULT_ENV}" if settings.plant is None else f"--plant {settings.plant}"
+        advice = f"`ncs synthesize {plant} --max-age 0` says what binds, and what would help"
+        return f"No certificate was found for any of these networks: {advice}."
     what = "Cheapest" if bearing is None else "Cheapest that bears the losses and delays of today"
-    return f"{what}, with at least {keep:g} % of the largest share: {_description(cheapest)}."
+    return f"{what}, with at least {settings.keep:g} % of the largest share: {_description(cheapest)}."
 
 
 def _description(point: Requirement) -> str:

@@ -20,6 +20,9 @@ from experiments.plots.figure_style import (
 from experiments.runs.loops import AS_TRAINED
 from experiments.study.summary import ATTACKED
 
+# Smaller margins are not drawn: with them arms do nearly what they do with none, and their points lie on one another.
+_LEAST_MARGIN = 20
+
 
 def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
     """Returns caption and PNG file of every figure by name, of what `study_summary` returns."""
@@ -35,7 +38,7 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
     with matplotlib.rc_context(STYLE):
         caption = (
             "Violating episodes under attack and return as trained, better to the upper left. Bars are 95 % intervals "
-            "over runs and episodes. Small numbers are margins in percent; those below 20 are left out."
+            f"over runs and episodes. Small numbers are margins in percent; those below {_LEAST_MARGIN} are left out."
         )
         figure = CaptionedFigure((4.1 * len(environments), 5.0), caption)
         handles = {}
@@ -43,11 +46,11 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
         for axis, (name, env) in zip(axes, environments.items(), strict=True):
             for arm_name, arm in env["arms"].items():
                 base, _, margin = arm_name.rpartition(":")
-                if margin.isdigit() and int(margin) < 20:  # they lie on one another
+                has_margin = margin.isdigit() and not base.startswith("penalized")  # whose number is a price
+                if has_margin and int(margin) < _LEAST_MARGIN:
                     continue
-                known = base if margin.isdigit() and not base.startswith("penalized") else arm_name
-                style = ArmStyle.of(arm_name)
-                _draw_point(axis, style, arm["scenarios"], margin if known == base else "")
+                known, style = base if has_margin else arm_name, ArmStyle.of(arm_name)
+                _draw_point(axis, style, arm["scenarios"], margin if has_margin else "")
                 handles.setdefault(known, style.handle(line=False, points=True))
             label(axis, "violating under attack [%]", "mean return as trained" if axis is axes[0] else "", name)
             axis.set_xlim(-5.0, 105.0)

@@ -17,6 +17,7 @@ from ncs_gym import (
     certified_error_set,
     exact,
 )
+from ncs_gym.plants.between_samples import GridRows
 from ncs_gym.uncertainty.shape_matrices import is_inside, joined
 from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
@@ -219,15 +220,31 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box_rows: np.ndarray) 
 def _scaled_grid(plant: LinearPlant, transform: np.ndarray) -> ScaledGrid:
     """Returns the plant's rows between samples in scaled coordinates z = T^-1 x and u / u_max."""
     try:
-        if plant.grid_rows is None:
+        grid = plant.grid_rows
+        if grid is None:
             return ScaledGrid(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0))
     except OverflowError as error:
         too_long = "(B) the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
         raise Infeasible(too_long, "B", 1.0) from error
-    state, pushed, remainder = plant.grid_rows
-    pushed = pushed * plant.u_max
-    left = np.maximum(1.0 - remainder - float(ACTION_ROUNDING) * np.abs(pushed).sum(axis=-1), _NOTHING_LEFT)  # (N, k)
-    squares = np.einsum("ji,ik,jk->j", plant.box_rows, plant.disturbance.shape_matrix, plant.box_rows)
-    rho = np.sqrt(np.maximum(squares, 0.0))
-    rows, inputs = state @ transform / left[..., None], pushed / left[..., None]
-    return ScaledGrid(rows.reshape(-1, plant.n), inputs.reshape(-1, plant.m), (rho / left).ravel())
+    state, pushed, _ = grid
+    left, disturbed = left_between_samples(plant, grid, plant.disturbance.shape_matrix)
+    left = np.maximum(left, _NOTHING_LEFT)
+    rows, inputs = state @ transform / left[..., None], pushed * plant.u_max / left[..., None]
+    return ScaledGrid(rows.reshape(-1, plant.n), inputs.reshape(-1, plant.m), (disturbed / left).ravel())
+
+
+def left_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what the rows of the box may reach at the times of a plant's grid, and what disturbances do of that.
+
+    Args:
+        plant: The plant.
+        grid: Its rows between samples.
+        D: Shape of the disturbance set, (n, n).
+
+    Returns:
+        1 - eta less the rounding of actions, shape (N, k), and the supports rho of the disturbance, (k,)
+        (docs/shield_proof.md, "Between the samples").
+    """
+    rounding = float(ACTION_ROUNDING) * (np.abs(grid.input) @ plant.u_max)
+    squares = np.einsum("ji,ik,jk->j", plant.box_rows, D, plant.box_rows)
+    return 1.0 - grid.remainder - rounding, np.sqrt(np.maximum(squares, 0.0))

@@ -118,13 +118,12 @@ def with_feasible_bounds(
         else:
             hints.append(f"{factor:.3g} times {change.what} or more")
             details[f"{change.name}_factor"] = factor
-    searcher = "it" if "quick search" in str(infeasible) else "a quick search"
-    found = [f"of single changes {searcher} finds these enough: {'; '.join(hints)}"] if hints else []
+    found = [f"single changes that a quick search finds enough: {'; '.join(hints)}"] if hints else []
     vain = [f"with a smaller {' or '.join(useless)}"] if useless else []
     if useless_limits:
         vain.append(f"with {' or '.join(useless_limits)} up to {_WIDENINGS[-1]:.0e} times as large")
     if vain:
-        found.append(f"{searcher} finds none {', nor '.join(vain)}")
+        found.append(f"a quick search finds none {', nor '.join(vain)}")
     if len(details) == len(infeasible.details):
         progress("no certificate: searching for two changes that have one")
         if (pair := _smallest_pair(plant, certifies)) is not None:

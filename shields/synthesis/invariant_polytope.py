@@ -21,6 +21,7 @@ from ncs_gym.plants.linear_plant import inputs_under_way
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
+from shields.synthesis.design_problem import left_between_samples
 from shields.verification import ACTION_ROUNDING
 
 # The search takes at most so long [s], of its thread's own time: what else a machine does decides no certificate.
@@ -180,12 +181,10 @@ def grid_in_closed_loop(feedback: Feedback, plant: LinearPlant) -> ClosedLoopGri
     """Returns the rows of docs/shield_proof.md, "Between the samples"; none for a plant without a grid."""
     if plant.grid_rows is None:
         return ClosedLoopGrid(np.empty((0, plant.n)), np.empty(0))
-    (K, errors, D), (state, pushed, remainder) = feedback, plant.grid_rows
-    answer = pushed @ K
+    (K, errors, D), (state, pushed, _) = feedback, plant.grid_rows
+    answer, (left, disturbed) = pushed @ K, left_between_samples(plant, plant.grid_rows, D)
     reach = np.sqrt(np.einsum("...i,lij,...j->l...", answer, errors, answer).max(axis=0))
-    rho = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, D, plant.box_rows))
-    left = 1.0 - remainder - rho - reach - float(ACTION_ROUNDING) * (np.abs(pushed) @ plant.u_max)
-    return ClosedLoopGrid((state + answer).reshape(-1, plant.n), left.ravel())
+    return ClosedLoopGrid((state + answer).reshape(-1, plant.n), (left - disturbed - reach).ravel())
 
 
 class _ClosedLoop:

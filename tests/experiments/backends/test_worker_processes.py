@@ -27,6 +27,20 @@ def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
     assert reports.empty()
 
 
+def test_a_run_told_to_stop_gives_up_where_it_reports_no_steps():
+    class Asking:
+        name = "asking"
+
+        def execute(self, on_progress, log_folder=None):
+            on_progress(0)
+
+    stop = threading.Event()
+    _execute_here(Asking(), Queue(), stop, None)
+    stop.set()
+    with pytest.raises(RunStopped, match="asking"):
+        _execute_here(Asking(), Queue(), stop, None)
+
+
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
     broken = replace(endless, arm="broken", policy_kind="Nowhere")
     begin, kept = time.monotonic(), []

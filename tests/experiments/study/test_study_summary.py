@@ -1,12 +1,14 @@
 import json
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
+from experiments.plots.figure_style import CaptionedFigure
 from experiments.study.channel_switches import SWITCHES
-from experiments.study.figures import study_figures
+from experiments.study.figures import return_figure, study_figures
 from experiments.study.study import quoted
 from experiments.study.summary import (
     PRIMARY,
@@ -202,6 +204,16 @@ def test_quoted_tables_replace_what_stands_between_the_marks():
 def test_pages_without_a_known_mark_are_refused(page, message):
     with pytest.raises(ValueError, match=message):
         quoted(page, {"agents": "new"})
+
+
+def test_small_margins_are_not_drawn_and_small_prices_are():
+    # Small numbers beside the points are margins; "penalized:10" has a price.
+    summary = study(**{"trusting:10": (10.0, 0.0, 0.5), "penalized:10": (11.0, 0.0, 0.5)})[0]
+    with mock.patch.object(CaptionedFigure, "png", b""):
+        figure = return_figure(summary)
+    labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+    assert "penalized:10" in labels
+    assert {text.get_text() for axis in figure.axes for text in axis.texts} == {"20"}
 
 
 def test_figures_show_every_arm_and_every_run(made):

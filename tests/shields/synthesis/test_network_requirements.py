@@ -12,7 +12,7 @@ from ncs_gym import Channel, ChannelContract, LinearPlant, contract_of
 from ncs_gym.processes.gym_pendulum import pendulum
 from shields import Infeasible, Network, requirements, synthesize, verify
 from shields.synthesis.certification import carried_over, nearby_certificate
-from shields.synthesis.network_requirements import with_radii
+from shields.synthesis.network_requirements import BoundarySearch, with_radii
 
 SERVO = (([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]), 0.01)
 BOUNDS = {
@@ -209,3 +209,19 @@ def test_infeasible_names_a_pair_where_no_change_alone_is_enough(monkeypatch):
     assert told.details.keys() == {"pair_factor"}
     assert told.details["pair_factor"] == pytest.approx(3.0, rel=0.03)
     assert "the limit of u1 and the safe box" in str(told)
+
+
+def test_search_for_the_largest_age_asks_before_every_age_whether_it_should_end():
+    plant = pendulum()
+    search = BoundarySearch(
+        name="beyond",
+        title="",
+        plant=plant,
+        quantization_step=0.0,
+        ages=(0, 4),
+        start=synthesize(plant, contract=ChannelContract(0)),
+    )
+    reported = []
+    answers = search(reported.append)
+    assert reported == [0] * len(answers) + [2]
+    assert len(answers) >= 2
