@@ -217,7 +217,7 @@ class Agent:
 def pretrained(env_id: str) -> Agent:
     """Returns the small agent of an environment that comes with the package.
 
-    It was trained behind the shield of the certificate beside it (`pretrained_folder(env_id) / "certificate.json"`).
+    It was trained behind the shield of the environment's certificate (`shields.certificate_for`).
 
     Args:
         env_id: Id of an environment of this package.
@@ -350,7 +350,10 @@ forgery.
 from agents import Agent, LoopConfig{imports}
 
 agent = Agent.load(".")
-loop = LoopConfig(env=agent.env, kwargs={{"channel": agent.channel}}{shield})
+loop = LoopConfig(
+    env=agent.env,
+    kwargs={{"channel": agent.channel}},{shield}
+)
 ```
 """
 
@@ -375,9 +378,10 @@ def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | 
         parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `ncs verify certificate.json`", ""]
     if evaluation is not None:
         parts += ["## Evaluation", "", *_figures(evaluation), ""]
-    known = "" if shield is None else f', shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"'
+    known = ""
     if shield is not None:
-        known += ")" if shield.horizon is None else f", horizon={shield.horizon})"
+        horizon = "" if shield.horizon is None else f", horizon={shield.horizon}"
+        known = f'\n    shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"{horizon}),'
     imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
     return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
 

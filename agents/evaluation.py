@@ -65,9 +65,11 @@ def _played(
     on_progress: Callable[[int], None] | None,
 ) -> tuple[list[Episode], list[dict[str, Any]]]:
     """Returns episodes played side by side, and the infos of episode 0, of its reset and its steps."""
-    count, prototype = len(indices), ncs_env(loop.single())
-    terminates, rows, envs = prototype.terminate_on_violation, prototype.plant.box_rows, loop.vector(count)
-    if terminates and isinstance(envs.unwrapped, NCSVectorEnv):
+    count, envs = len(indices), loop.vector(len(indices))
+    inner: Any = envs.unwrapped
+    single = inner.single if isinstance(inner, NCSVectorEnv) else ncs_env(inner.envs[0])
+    terminates, rows = single.terminate_on_violation, single.plant.box_rows
+    if terminates and isinstance(inner, NCSVectorEnv):
         # Episodes that end early are stepped on without being counted: the others' random numbers stay the same.
         envs = loop.vector(count, terminate_on_violation=False)
     env_seed = int(np.random.SeedSequence([seed, indices[0], _SEED_STREAM]).generate_state(1)[0] >> 1)

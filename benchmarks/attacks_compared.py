@@ -25,7 +25,7 @@ from experiments.terminal import text_table
 from ncs_gym import AdversarialDisturbance
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.uncertainty.disturbances import BY_NAME
-from shields.runtime.wrapper import certificate_for
+from shields import certificate_for
 
 ARMS = ("lqr", "governor:20", "mpc:20", "lqr+psf:20", "lqr+trusting:20", "lqr+shielded", "lqr+lookahead")
 SEED = 3_000_000

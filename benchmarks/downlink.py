@@ -21,8 +21,7 @@ from experiments.baselines import controller
 from experiments.plots.figure_style import STYLE, CaptionedFigure
 from ncs_gym import Actuator, Channel
 from ncs_gym.network import CommittedInputs
-from shields import VectorSafetyShield
-from shields.runtime.wrapper import certificate_for
+from shields import VectorSafetyShield, certificate_for
 
 ENVS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
 # The picture: commands of steps 0 .. 7, one step late, of which one is lost; c = 2.

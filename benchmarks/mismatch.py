@@ -23,8 +23,7 @@ import numpy as np
 from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import EPISODE_STEPS
-from shields import VectorSafetyShield
-from shields.runtime.wrapper import certificate_for
+from shields import VectorSafetyShield, certificate_for
 
 SAMPLES = 4_000
 MASSES = (0.5, 0.8, 0.9, 0.95, 0.99, 1.0, 1.01, 1.05, 1.1, 1.2, 1.5, 2.0)

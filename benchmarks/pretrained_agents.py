@@ -1,9 +1,10 @@
 """Trains the small agents that come with the package, one per registered id, behind the shield (mode project).
 
-    python benchmarks/pretrained_agents.py [--env ncs_gym/CartPole-v0 ...] [--out agents/trained]
+    python benchmarks/pretrained_agents.py [--env ncs_gym/CartPole-v0 ...] [--out agents/trained] [--evaluate-only]
 
 PPO with the hyperparameters and steps of agents/tuned, or the defaults and 150,000 steps, and networks of two layers of
-32. Each agent is evaluated on 200 episodes and saved with its card and its certificate; a line says how long that took.
+32. Each agent is evaluated on 200 episodes and saved with its card; a line says how long that took. Its certificate is
+the one in shields/certificates. --evaluate-only evaluates the agents that are there and writes their cards again.
 The seeds are those of `ncs compare --seed 3000000`, which no search and no table has.
 """
 
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from tune_agents import EPISODES, seeds_of, shielded_loop
 
-from agents import evaluate, train, tuned_hyperparams, tuned_steps
+from agents import Agent, evaluate, train, tuned_hyperparams, tuned_steps
 from agents.hyperparams import DEFAULTS, with_changes
 from ncs_gym.registration import registered_ids
 
@@ -24,19 +25,22 @@ SEED, STEPS = 3_000_000, 150_000
 NETWORKS = {"policy_kwargs": {"net_arch": [32, 32]}}
 
 
-def train_and_save(env_id: str, out: Path) -> None:
-    """Trains, evaluates and saves the agent of an environment, and prints a line about it."""
-    started = time.process_time()
+def train_and_save(env_id: str, folder: Path, evaluate_only: bool) -> None:
+    """Trains (unless it is there), evaluates and saves the agent of an environment, and prints a line about it."""
+    started, violations = time.process_time(), 0
     loop, (training_seed, evaluation_seed) = shielded_loop(env_id), seeds_of(SEED, 0)
-    hyperparams = with_changes(tuned_hyperparams(env_id) or DEFAULTS["PPO"], NETWORKS)
-    trained = train(loop, tuned_steps(env_id) or STEPS, training_seed, hyperparams=hyperparams)
-    agent = trained.agent
+    if evaluate_only:
+        agent = Agent.load(folder)
+    else:
+        hyperparams = with_changes(tuned_hyperparams(env_id) or DEFAULTS["PPO"], NETWORKS)
+        trained = train(loop, tuned_steps(env_id) or STEPS, training_seed, hyperparams=hyperparams)
+        agent, violations = trained.agent, trained.violation_steps
     evaluation = evaluate(loop, lambda observations, infos: agent.act(observations), EPISODES, evaluation_seed)
-    folder = out / env_id.rpartition("/")[2]
     agent.save(folder, loop.shield, evaluation)
+    refer_to_package(folder)
     size = sum(file.stat().st_size for file in folder.iterdir())
     mean = np.mean([each.episode_return for each in evaluation.episodes])
-    violations = trained.violation_steps + sum(each.violation_steps for each in evaluation.episodes)
+    violations += sum(each.violation_steps for each in evaluation.episodes)
     print(
         f"{env_id}: return {mean:.2f}, {violations} violating steps, {size / 1e3:.0f} kB, "
         f"{time.process_time() - started:.0f} s of CPU",
@@ -44,13 +48,33 @@ def train_and_save(env_id: str, out: Path) -> None:
     )
 
 
+def refer_to_package(folder: Path) -> None:
+    """Leaves out the copy of the certificate, and has the card say where the package has it."""
+    (folder / "certificate.json").unlink()
+    card = folder / "README.md"
+    text = card.read_text()
+    changes = {
+        "`certificate.json`, SHA-256": "The certificate that `shields.certificate_for` returns, SHA-256",
+        "; `ncs verify certificate.json`": "",
+        "import Certificate\n\nagent = ": 'import certificate_for\n\nenv = gym.make("{env}").unwrapped\nagent = ',
+        'Certificate.load("certificate.json")': "certificate_for(env.plant, env.certificate_contract)",
+        "```python\nfrom agents": "```python\nimport gymnasium as gym\n\nfrom agents",
+    }
+    for old, new in changes.items():
+        if old not in text:
+            raise ValueError(f"the card of {folder} has no {old!r}")
+        text = text.replace(old, new.format(env=f"ncs_gym:ncs_gym/{folder.name}") if "{env}" in new else new)
+    card.write_text(text)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", nargs="+", default=[each for each in registered_ids() if each.startswith("ncs_gym/")])
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent.parent / "agents" / "trained")
+    parser.add_argument("--evaluate-only", action="store_true")
     options = parser.parse_args()
     for env_id in options.env:
-        train_and_save(env_id, options.out)
+        train_and_save(env_id, options.out / env_id.rpartition("/")[2], options.evaluate_only)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from agents import AppliedActionBuffer, SB3VecEnv
 from ncs_gym.envs.env import ncs_env
-from shields import VectorSafetyShield
-from shields.runtime.wrapper import certificate_for
+from shields import VectorSafetyShield, certificate_for
 from shields.torch import SafeLayer
 
 IDS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0")

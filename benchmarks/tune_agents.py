@@ -26,7 +26,7 @@ from agents import LoopConfig, ShieldSettings, evaluate, train
 from agents.hyperparams import DEFAULTS, complete_hyperparams
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
-from shields.runtime.wrapper import certificate_for
+from shields import certificate_for
 
 TUNED = Path(__file__).resolve().parent.parent / "agents" / "tuned" / "ppo.json"
 SEARCH_SEED = 1_000_000

@@ -29,8 +29,7 @@ from experiments.runs.arms import Arm
 from experiments.settings import CompareSettings
 from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS, TRAINED_ARMS
 from ncs_gym.envs.env import ncs_env
-from shields import Certificate
-from shields.runtime.wrapper import certificate_for
+from shields import Certificate, certificate_for
 
 TUNED = Path(__file__).resolve().parent.parent / "experiments" / "baselines" / "tuned.json"
 SEARCH_SEED = 1_000_000

@@ -1,4 +1,4 @@
-"""What commands show on a terminal: tables, prose, warnings as sentences, and how far a synthesis is."""
+"""What commands show on a terminal: tables, prose, and warnings as sentences."""
 
 from __future__ import annotations
 
@@ -92,22 +92,3 @@ def _shown_by(show: Callable[..., object]) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
-
-
-# Most syntheses are over before anybody wonders [s].
-_SILENT_SECONDS = 3.0
-
-
-@contextmanager
-def synthesis_status() -> Iterator[Callable[[str], None]]:
-    """Yields what shows a line of progress on stderr, if that is a terminal and some seconds have passed."""
-    from tqdm import tqdm
-
-    form = "synthesis, {desc} [{elapsed}]"
-    with tqdm(bar_format=form, leave=False, disable=None, delay=_SILENT_SECONDS) as line:
-
-        def show(text: str) -> None:
-            line.set_description_str(text, refresh=False)
-            line.update(0)  # which draws, unlike the text alone, only after the delay
-
-        yield show

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, Multipliers, Proof, Updates
+from shields.certificates import certificate_for
 from shields.errors import CertificateError, GuaranteeLostError, GuaranteeLostWarning, Infeasible
 from shields.polytope import Polytope
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
@@ -51,6 +52,7 @@ __all__ = [
     "SensorNode",
     "Updates",
     "VectorSafetyShield",
+    "certificate_for",
     "certify",
     "linear_feedback_tolerance",
     "requirements",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -353,6 +353,16 @@ class Certificate(ReadOnlyArrays):
             *provenance_rows(recorded),
         ]
         return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
+
+    def without_polytope(self) -> Certificate:
+        """Returns the certificate of the ellipsoid alone.
+
+        Raises:
+            CertificateError: If it does not keep the ellipsoid.
+        """
+        of_polytopes = ("polytope_share_of_box", "no_polytope")
+        kept = {name: value for name, value in self.provenance.items() if name not in of_polytopes}
+        return replace(self, polytope=None, provenance=kept)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.

@@ -9,7 +9,8 @@ import fcntl
 import gc
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import is_dataclass
 from functools import partial
 from itertools import count
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 LONGEST_ID = 50
+SLOWEST = 25
 
 
 def pytest_make_parametrize_id(val: Any) -> str | None:
@@ -45,6 +47,45 @@ def pytest_collection_finish() -> None:
     """What is imported by now stays: the collector of garbage does not walk through it again and again."""
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Processor times are listed by the process that prints, which hears of every worker's tests."""
+    config.pluginmanager.register(ProcessorTimes(), "processor-times")
+
+
+class ProcessorTimes:
+    """Processor time of each test, its fixtures and its child processes; a busy machine hardly changes it."""
+
+    def __init__(self) -> None:
+        self.by_test: dict[str, float] = defaultdict(float)
+        self.reported = processor_seconds()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        """Puts the time since the report before into a report, which travels from worker to controller."""
+        report = yield
+        now = processor_seconds()
+        report.processor_seconds, self.reported = now - self.reported, now
+        return report
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Adds up the reports of set-up, call and tear-down."""
+        self.by_test[report.nodeid] += report.processor_seconds
+
+    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        """Prints the slowest tests and the sum."""
+        if not self.by_test:
+            return
+        terminalreporter.section(f"processor time [s], the {SLOWEST} slowest tests and all")
+        for test, seconds in sorted(self.by_test.items(), key=lambda each: -each[1])[:SLOWEST]:
+            terminalreporter.write_line(f"{seconds:8.1f}  {test}")
+        terminalreporter.write_line(f"{sum(self.by_test.values()):8.1f}  all {len(self.by_test):,} tests")
+
+
+def processor_seconds() -> float:
+    """Processor time of this process and of the ended processes that it started [s]."""
+    return sum(os.times()[:4])
 
 
 def _shown(value: Any) -> str:
@@ -123,11 +164,9 @@ def _folder_of(place: Path, name: str, make: Callable[[Path], None]) -> Path:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _nothing_proved_twice(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Certificates are synthesized once for a state of the source, and shields verify each once per process."""
-    from tests.certificates import keep_certificates, require_valid_once, source_digest
+def _nothing_synthesized_twice(request: pytest.FixtureRequest) -> None:
+    """Certificates are synthesized once for a state of the source."""
+    from tests.certificates import keep_certificates, source_digest
 
     if (cache := getattr(request.config, "cache", None)) is not None:
         keep_certificates(partial(_folder_of, cache.mkdir(f"certificates-{source_digest()}")))
-    with mock.patch("shields.runtime.safety_filter.require_valid", require_valid_once):
-        yield

@@ -41,6 +41,7 @@ LAYERS = {
         {"json_documents", "polytope"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
+        {"certificates"},
         {"runtime"},
         {"nodes", "torch"},
     ),

@@ -183,7 +183,10 @@ def _certificate(env: NCSEnv, certificate: Certificate) -> str:
     count = len(report.conditions)
     verified = f"`verify` finds that all {count} conditions hold in exact arithmetic." if report.valid else str(report)
     unbroken = str(certificate).replace("\n" + 14 * " ", " ")
-    text = "The [shield](../shield.md) here rests on a certificate that is synthesized when it is first asked for:"
+    text = (
+        "The [shield](../shield.md) here rests on a certificate that comes with the package; for a changed plant or "
+        "contract another one is synthesized:"
+    )
     return f"{text}\n\n```\n{_wrapped(unbroken, 14)}\n```\n\n{verified}"
 
 

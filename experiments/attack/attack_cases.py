@@ -26,8 +26,7 @@ from ncs_gym import (
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import ENVIRONMENTS, EPISODE_STEPS, loaded_truck_trailer
-from shields import Certificate
-from shields.runtime.wrapper import certificate_for
+from shields import Certificate, certificate_for
 
 # One channel of each kind: no loss, no packet at all, losses in bursts, and packets that overtake one another.
 _CHANNELS = {

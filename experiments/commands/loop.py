@@ -26,12 +26,10 @@ from experiments.network_loop.processes import (
 )
 from experiments.runs.loops import registered_env
 from experiments.settings import LoopSettings
-from experiments.terminal import synthesis_status
 from ncs_gym import NCSEnv
 from ncs_gym.network.wire import SHORTEST_KEY
-from shields import Certificate, Infeasible
+from shields import Certificate, Infeasible, certificate_for
 from shields.atomic_write import write_atomically
-from shields.runtime.wrapper import certificate_for
 from shields.verification import require_valid
 
 # Budget of `--smoke`.
@@ -93,8 +91,7 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     contract = None if env.contract is None else given.contract
     if settings.certificate is None:
         try:
-            with synthesis_status() as show:
-                certificate = certificate_for(env.plant, contract, show)
+            certificate = certificate_for(env.plant, contract)
         except Infeasible as error:
             ages = [
                 f"{way.most_consecutive_losses} + {way.delay} + {way.jitter} + {settings.room}"

@@ -9,9 +9,9 @@ from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.settings import SynthesizeSettings
 from experiments.settings.certificates import changed_contract
-from experiments.terminal import synthesis_status
 from ncs_gym import ChannelContract, LinearPlant
 from shields.certificate_text import size_of
+from shields.certificates import synthesis_status
 from shields.errors import SynthesisInterrupted
 
 _DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"

@@ -62,15 +62,7 @@ class Arm:
         Raises:
             ValueError: If the name is unknown.
         """
-        known, kind = _arms(mode), name.replace(" ", "-")
-        if kind in known:
-            return known[kind]
-        kind, colon, weight = kind.removesuffix(_RESIDUAL).partition(":")
-        if kind == _PENALIZED and colon and _is_weight(weight):
-            kind += _RESIDUAL if name.endswith(_RESIDUAL) else ""
-            return replace(known[kind], name=name, violation_weight=float(weight))
-        hint = " (several are separated by spaces)" if "," in name else ""
-        raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
+        return _parsed(name, mode)
 
     @property
     def is_shielded(self) -> bool:
@@ -124,6 +116,19 @@ def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
     """Returns the results of each arm in the order of their runs."""
     names = dict.fromkeys(result.arm for result in results)
     return {name: sorted((r for r in results if r.arm == name), key=lambda r: r.index) for name in names}
+
+
+@cache
+def _parsed(name: str, mode: str) -> Arm:
+    known, kind = _arms(mode), name.replace(" ", "-")
+    if kind in known:
+        return known[kind]
+    kind, colon, weight = kind.removesuffix(_RESIDUAL).partition(":")
+    if kind == _PENALIZED and colon and _is_weight(weight):
+        kind += _RESIDUAL if name.endswith(_RESIDUAL) else ""
+        return replace(known[kind], name=name, violation_weight=float(weight))
+    hint = " (several are separated by spaces)" if "," in name else ""
+    raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
 
 
 @cache

@@ -15,11 +15,9 @@ from experiments.runs.loops import other_scenarios
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, LearningSettings, settings_json
-from experiments.terminal import synthesis_status
 from ncs_gym.envs.env import ncs_env
-from shields import Certificate, Report
+from shields import Certificate, Report, certificate_for
 from shields.certificate_text import size_of
-from shields.runtime.wrapper import certificate_for
 from shields.verification import require_valid
 
 # Settings that results do not depend on.
@@ -49,8 +47,7 @@ def certificate_of(loop: LoopConfig, file: Path | None = None, safe_set: str | N
     """
     env = ncs_env(loop.single())
     if file is None:
-        with synthesis_status() as show:
-            return certificate_for(env.plant, env.certificate_contract, show, safe_set)
+        return certificate_for(env.plant, env.certificate_contract, safe_set)
     certificate = Certificate.load(file)
     require_valid(certificate, env.plant)
     return certificate

@@ -563,6 +563,10 @@ class LinearPlant(ReadOnlyArrays):
 
         It is the same on every machine: these numbers are given, or rounded once (`ncs_gym.exact`).
         """
+        return self.digest()
+
+    def digest(self) -> str:
+        """Returns what the fingerprint would be if it were computed now."""
         digest = hashlib.sha256()
         matrices = {"A": self.A, "B": self.B, "C": self.box_rows, "H": self.H, "u_max": self.u_max}
         names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")

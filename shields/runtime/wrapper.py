@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import hypot
 from typing import Any, Generic, TypeVar
 
@@ -13,12 +13,13 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import Annotation, Channel, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym import Annotation, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
+from shields.certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.guarantee import LoopObservation, LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
@@ -35,8 +36,6 @@ INTERRUPTED = (-1, -1)
 
 # What of an environment a shield's proof rests on.
 PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
-
-_synthesized: dict[tuple[str, ChannelContract | None, str | None], Certificate] = {}
 
 
 class BaseShield(RecordConstructorArgs, Generic[E]):
@@ -169,8 +168,9 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
 
     Args:
         env: An `NCSEnv`, possibly wrapped.
-        certificate: A certificate, its `document`, or the path of its file; None synthesizes one for the environment's
-            plant and contract, once per process. A spec holds the document, so that it is JSON.
+        certificate: A certificate, its `document`, or the path of its file; None takes the one that
+            `shields.certificate_for` has for the environment's plant and contract. A spec holds the document, so that
+            it is JSON.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
@@ -283,31 +283,6 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
             "episode_interventions": self._interventions,
             "episode_guaranteed": self._proved / (self._inner.steps + 1),
         }
-
-
-def certificate_for(
-    plant: LinearPlant,
-    contract: ChannelContract | None = None,
-    progress: Callable[[str], object] | None = None,
-    safe_set: str | None = None,
-) -> Certificate:
-    """Returns a synthesized certificate, made once per process, plant, channel contract and kind of safe set.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        progress: Called with a line of text per stage of the synthesis.
-        safe_set: "polytope", "ellipsoid" or None; see `synthesize`.
-
-    Raises:
-        Infeasible: If none is found.
-    """
-    key = plant.fingerprint, contract, safe_set
-    if key not in _synthesized:
-        from shields.synthesis import synthesize  # imported here: with a certificate given no solver is needed
-
-        _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
-    return _synthesized[key]
 
 
 def _hint_for(env: Any) -> str:

@@ -137,7 +137,7 @@ def synthesize(
     report = progress or (lambda line: None)
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if safe_set == "ellipsoid":
-        known = [_without_polytope(each) for each in known if each.keeps_ellipsoid]
+        known = [each.without_polytope() for each in known if each.keeps_ellipsoid]
     largest, *others = _certificates(plant, contract, report, known, polytope=safe_set != "ellipsoid")
     if safe_set == "ellipsoid":
         return largest
@@ -204,13 +204,6 @@ def with_largest_polytope(
     except (ArithmeticError, ValueError, CertificateError):  # a gain whose numbers are out of reach of float64
         pass
     return own
-
-
-def _without_polytope(certificate: Certificate) -> Certificate:
-    """Returns a certificate that keeps an ellipsoid with that alone."""
-    of_polytopes = ("polytope_share_of_box", "no_polytope")
-    kept = {name: value for name, value in certificate.provenance.items() if name not in of_polytopes}
-    return replace(certificate, polytope=None, provenance=kept)
 
 
 def _polytope_share(certificate: Certificate) -> float:

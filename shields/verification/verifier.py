@@ -87,12 +87,25 @@ def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
     return [belongs, *conditions(certificate, plant)]
 
 
+# Digests of the certificates and plants, as they were then, that have been verified in this process.
+_valid: set[tuple[str, str]] = set()
+
+
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
-    """Raises unless a certificate verifies for a plant.
+    """Raises unless a certificate verifies for a plant; what has verified in this process is not verified again.
+
+    Both are told apart by digests of every number that they hold now.
 
     Raises:
         CertificateError: Naming the first condition that does not hold.
     """
+    key = certificate.document["sha256"], plant.digest()
+    if key not in _valid:
+        _require_conditions(certificate, plant)
+        _valid.add(key)
+
+
+def _require_conditions(certificate: Certificate, plant: LinearPlant) -> None:
     for condition in verify(certificate, plant).conditions:
         if not condition.holds:
             if condition.name.startswith("plant"):

@@ -11,7 +11,7 @@ from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.processes import PendulumProcess
-from shields.runtime.wrapper import certificate_for
+from shields import certificate_for
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 

@@ -12,8 +12,7 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.stirred_tank import stirred_tank
-from shields import Infeasible, synthesize, verify
-from shields.runtime.wrapper import certificate_for
+from shields import Infeasible, certificate_for, synthesize, verify
 
 IDS = ("CSTR", "Convoy", "LaneKeeping")
 

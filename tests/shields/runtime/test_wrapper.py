@@ -23,7 +23,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.monitor import Monitor
 
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, NCSEnv
-from shields import Certificate, CertificateError, SafetyShield, synthesize
+from shields import Certificate, CertificateError, SafetyShield
 from shields.runtime.guarantee import (
     ALARM,
     FAR_OUT,
@@ -215,18 +215,6 @@ def test_boundary_overrides_more_often_than_switch(certificate):
             assert info["shield_guaranteed"]
         counts.append(info["episode_interventions"])
     assert counts[2] > counts[1]
-
-
-def test_certificate_is_synthesized_once_per_plant(monkeypatch):
-    from shields import synthesis
-    from shields.runtime import wrapper
-
-    calls = []
-    monkeypatch.setattr(wrapper, "_synthesized", {})
-    monkeypatch.setattr(synthesis, "synthesize", lambda plant, **settings: calls.append(plant) or synthesize(plant))
-    one, other = SafetyShield(gym.make(CRUISE)), SafetyShield(gym.make(CRUISE))
-    assert one.certificate is other.certificate
-    assert len(calls) == 1
 
 
 def test_wrong_certificates_are_refused(certificate, tmp_path):

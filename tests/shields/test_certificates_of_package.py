@@ -1,0 +1,126 @@
+"""Certificates that come with the package: one for every registered plant and contract, and none for another."""
+
+import json
+from dataclasses import replace
+
+import gymnasium as gym
+import pytest
+
+import shields.certificates
+from ncs_gym import ChannelContract, LinearPlant, contract_of
+from ncs_gym.network import downlink_protocol
+from ncs_gym.registration import ENVIRONMENTS
+from shields import CertificateError, SafetyShield, certificate_for, synthesize
+from shields.certificates import certificate_of_package
+from shields.verification import require_valid, verifier
+from tests.verdicts import verified
+
+IDS = [env_id for env_id, each in ENVIRONMENTS.items() if each.plant is not None]
+
+
+def plant_and_contract(env_id):
+    """What an environment is made with, which its process need not be installed for."""
+    factory = ENVIRONMENTS[env_id]
+    plant = factory.plant()
+    contract = factory.contract or contract_of(factory.channel)
+    protocol = downlink_protocol(factory.downlink, None)
+    if plant.spectral_radius < 1.0 and factory.contract is None:
+        contract = None
+    return plant, contract if protocol is None else protocol.behind(contract)
+
+
+@pytest.fixture
+def nothing_made(monkeypatch):
+    """A process that has asked for no certificate yet."""
+    monkeypatch.setattr(shields.certificates, "_made", {})
+
+
+@pytest.fixture
+def calls(monkeypatch, nothing_made):
+    """Arguments of each synthesis."""
+    seen = []
+    small = synthesize(
+        LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, gamma=1e-6), safe_set="ellipsoid"
+    )
+    monkeypatch.setattr("shields.synthesis.synthesize", lambda *given, **settings: seen.append(given) or small)
+    return seen
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_id_has_a_verified_certificate(env_id):
+    plant, contract = plant_and_contract(env_id)
+    certificate = certificate_of_package(plant, contract)
+    assert certificate.contract == contract
+    assert verified(certificate, plant).valid
+    if ENVIRONMENTS[env_id].is_installed:
+        env = gym.make(env_id).unwrapped
+        assert (env.plant.fingerprint, env.certificate_contract) == (plant.fingerprint, contract)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", IDS)
+def test_synthesis_gives_what_comes_with_the_package(env_id):
+    plant, contract = plant_and_contract(env_id)
+    kept, made = certificate_of_package(plant, contract), synthesize(plant, contract=contract)
+    assert replace(made, provenance={}) == replace(kept, provenance={})
+    alone = synthesize(plant, contract=contract, safe_set="ellipsoid")
+    assert replace(alone, provenance={}) == replace(kept.without_polytope(), provenance={})
+
+
+def test_shield_of_a_registered_id_synthesizes_nothing(calls):
+    one, other = (SafetyShield(gym.make("ncs_gym/CartPole-v0")) for _ in range(2))
+    assert one.certificate is other.certificate
+    assert not calls
+
+
+def test_other_plants_and_contracts_are_synthesized_once_and_that_is_said(calls, capfd):
+    plant, contract = plant_and_contract("ncs_gym/CartPole-v0")
+    assert certificate_for(plant, contract).contract == contract
+    assert capfd.readouterr().err == ""
+    for changed in [(plant, ChannelContract(2)), (replace(plant, delta=0.04), contract), (plant, None)]:
+        assert certificate_for(*changed) is certificate_for(*changed)
+        assert calls.pop() == changed[:1]
+        assert not calls
+        assert capfd.readouterr().err == "synthesizing a certificate, which takes seconds to minutes\n"
+
+
+def test_ellipsoid_alone_is_that_of_the_package(nothing_made):
+    plant, contract = plant_and_contract("ncs_gym/TruckTrailerCruise-v0")
+    alone, both = (certificate_for(plant, contract, safe_set) for safe_set in ("ellipsoid", "polytope"))
+    assert alone.polytope is None
+    assert both.polytope is not None
+    assert (alone.L == both.L).all()
+    assert verified(alone, plant).valid
+
+
+def test_damaged_file_of_the_package_is_refused(tmp_path, monkeypatch, nothing_made):
+    plant, contract = plant_and_contract("ncs_gym/TruckTrailerCruise-v0")
+    document = certificate_of_package(plant, contract).document
+    document["certificate"]["K"][0][0] += 1e-9
+    (tmp_path / "TruckTrailerCruise-v0.json").write_text(json.dumps(document))
+    monkeypatch.setattr(shields.certificates, "__file__", str(tmp_path / "__init__.py"))
+    with pytest.raises(CertificateError, match="was altered"):
+        certificate_for(plant, contract)
+
+
+def test_what_has_verified_is_not_verified_again_and_what_is_changed_is(monkeypatch):
+    plant, contract = plant_and_contract("ncs_gym/TruckTrailerCruise-v0")
+    certificate = certificate_of_package(plant, contract)
+    judged, verify = [], verifier.verify
+    monkeypatch.setattr(verifier, "_valid", set())
+    monkeypatch.setattr(verifier, "verify", lambda *given: judged.append(given) or verify(*given))
+    for _ in range(3):
+        require_valid(certificate, replace(plant))
+    assert len(judged) == 1
+    larger = replace(certificate, L=1.01 * certificate.L)
+    for _ in range(2):  # what does not verify is not remembered
+        with pytest.raises(CertificateError, match="does not verify"):
+            require_valid(larger, plant)
+    with pytest.raises(CertificateError, match="another plant"):
+        require_valid(certificate, replace(plant, delta=0.04))
+    assert len(judged) == 4
+    worn = replace(plant)
+    assert worn.fingerprint == plant.fingerprint
+    object.__setattr__(worn, "u_max", 0.01 * worn.u_max)  # as nobody should, after the fingerprint was computed
+    with pytest.raises(CertificateError):
+        require_valid(certificate, worn)
