@@ -348,6 +348,21 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         return int(require_on_request(self._requests).outstanding(self._estimator.age))
 
+    @property
+    def request_state(self) -> tuple[int, int]:
+        """The age of the newest sample used, and `outstanding` [steps, samples]."""
+        return self._estimator.age, self.outstanding
+
+    @property
+    def request_limits(self) -> np.ndarray:
+        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
+        input_delay = len(self._pending)
+        if self._contract is None:
+            most = self._horizon, max(self._channel.longest_delay + input_delay, 1)
+        else:
+            most = self._contract.max_age, self._contract.max_age + input_delay
+        return np.array(most, dtype=np.float64).clip(min=1.0)
+
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
 

@@ -121,7 +121,7 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
     outside. What the environment was made for bounds what may be drawn; see `NCSEnv.reset`.
 
     Args:
-        env: An `NCSEnv`, possibly wrapped.
+        env: An `NCSEnv`, or another environment in `Networked`, possibly wrapped.
         channel: A function (rng) -> Channel, or a list of channels of which each is equally likely; None for the
             environment's own.
         downlink: The same for the commands.
@@ -133,8 +133,8 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self, channel=channel, downlink=downlink)
         gym.Wrapper.__init__(self, env)
-        if not hasattr(env.unwrapped, "episode_channel"):
-            raise ValueError(f"RandomChannel is for an NCSEnv, got {env.unwrapped}")
+        if not env.has_wrapper_attr("episode_channel"):
+            raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")
         self._drawn = _drawn(channel, downlink)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -146,7 +146,7 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
     """`RandomChannel` for an `NCSVectorEnv`: one is drawn for every episode of every one, in any autoreset mode.
 
     Args:
-        env: An `NCSVectorEnv`, possibly wrapped.
+        env: An `NCSVectorEnv`, or another one in `VectorNetworked`, possibly wrapped.
         channel: See `RandomChannel`.
         downlink: See `RandomChannel`.
 
