@@ -144,6 +144,21 @@ class Snapshots:
         return sample.copy() if self._reused else sample
 
 
+def handed_out(sample: Any, *, anew: bool) -> Any:
+    """Returns a sample for the agent, whose arrays are its own.
+
+    Large ones are not copied where they are seen for the first time: an agent that writes into them changes what it
+    sees again while nothing arrives.
+    """
+    if isinstance(sample, dict):
+        return {key: handed_out(each, anew=anew) for key, each in sample.items()}
+    if isinstance(sample, tuple):
+        return tuple(handed_out(each, anew=anew) for each in sample)
+    if isinstance(sample, np.ndarray) and (sample.nbytes <= SMALL or not anew):
+        return sample.copy()
+    return sample
+
+
 class Entries:
     """The entries that `observe` adds to observations, of one environment or of N.
 

@@ -35,7 +35,6 @@ class NetworkSettings:
         channels: Their channels.
         downlink: The network of the actions; None for an ideal one.
         fill: "last", "zero" or a predictor.
-        zeros: The zero of each part, where "zero" is seen.
         late: "apply", "drop" or "queue".
         idle: "hold" or "neutral".
         neutral: The action before the first command arrives; None where all arrive at once.
@@ -65,7 +64,9 @@ class NetworkSettings:
             )
         if callable(self.fill) and len(self.parts) > 1:
             raise ValueError("a function for fill is for one channel: it returns a whole observation")
-        self.zeros = [zero_of(part.space) for part in self.parts] if self.fill == "zero" else []
+        if self.fill == "zero":
+            for part in self.parts:
+                zero_of(part.space)
         self.late = _one_of(settings["late"], LATE, "late")
         self.idle = _one_of(settings["idle"], IDLE, "idle")
         self.neutral = _neutral(settings["neutral"], actions, needed=self.downlink is not None)

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
-from ncs_gym.networked.observations import Snapshots, joined, quantized
+from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor
 from ncs_gym.networked.wrapper import NETWORK_STREAM, nothing
 
@@ -103,9 +103,10 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
         for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
             links.give(given, np.flatnonzero(chosen).tolist())
-        if not self._started or chosen.all():
+        everywhere = bool(chosen.all())
+        if everywhere:
             self._make()
-        self._begin(chosen, self._snapshots.taken(observations))
+        self._begin(chosen, self._snapshots.taken(observations), anew=not everywhere)
         return self._seen(), self._with_network(info)
 
     def _make(self) -> None:
@@ -187,13 +188,13 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
     def _seen(self) -> Any:
         """Returns what the agent sees now."""
         settings, arrivals = self._settings, self._arrivals
-        seen = [each.sample for each in arrivals]
+        seen = [handed_out(each.sample, anew=bool(each.arrived.any())) for each in arrivals]
         if settings.fill == "zero":
-            pairs = zip(seen, settings.zeros, arrivals, strict=True)
-            seen = [_where(each.arrived | (each.stamp == self._steps), sample, zero) for sample, zero, each in pairs]
+            pairs = zip(seen, settings.parts, arrivals, strict=True)
+            seen = [_where(each.is_new(self._steps), sample, zero_of(part.space)) for sample, part, each in pairs]
         elif callable(settings.fill):
             filled = settings.fill(seen[0], self._steps - arrivals[0].stamp, self._decided)
-            seen = [_where(arrivals[0].arrived | (arrivals[0].stamp == self._steps), seen[0], filled)]
+            seen = [_where(arrivals[0].is_new(self._steps), seen[0], filled)]
         ages = np.stack([self._steps - each.stamp for each in arrivals], axis=1)
         arrived = np.stack([each.arrived for each in arrivals], axis=1)
         return settings.entries.added_to(joined(settings.parts, seen), ages, arrived, self._decided)
@@ -236,6 +237,10 @@ class _Arrivals:
         self.sample = samples if self.sample is None else _where(chosen, samples, self.sample)
         self.stamp, self.earned = np.where(chosen, 0, self.stamp), np.where(chosen, 0.0, self.earned)
         self.arrived = self.arrived & ~chosen
+
+    def is_new(self, steps: np.ndarray) -> np.ndarray:
+        """Returns where the newest sample arrived at this step, as the first of an episode does, shape (N,)."""
+        return self.arrived | (self.stamp == steps)
 
     def exchange(
         self, rng: np.random.Generator, steps: np.ndarray, part: Any, samples: Any, earned: np.ndarray

@@ -14,7 +14,7 @@ from ncs_gym.envs.env import NCSEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
-from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, joined, quantized
+from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor
 
 # Keeps what the network draws apart from what an environment of the same seed draws.
@@ -224,13 +224,13 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
 
     def _seen(self) -> Any:
         """Returns what the agent sees now."""
-        if self._sees_newest:
-            return self._arrivals[0].sample
         settings, step = self._settings, self._step
-        seen = [arrivals.sample for arrivals in self._arrivals]
+        if self._sees_newest:
+            return self._arrivals[0].seen(step)
+        seen = [arrivals.seen(step) for arrivals in self._arrivals]
         if settings.fill == "zero":
-            pairs = zip(seen, settings.zeros, self._arrivals, strict=True)
-            seen = [sample if arrivals.is_new(step) else zero for sample, zero, arrivals in pairs]
+            pairs = zip(seen, settings.parts, self._arrivals, strict=True)
+            seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
         elif callable(settings.fill) and not self._arrivals[0].is_new(step):
             seen = [settings.fill(seen[0], step - self._arrivals[0].stamp, np.array(self._decided))]
         observation = joined(settings.parts, seen)
@@ -278,6 +278,10 @@ class _Arrivals:
         """Starts an episode, whose first sample is there."""
         self.link, self.sample = link, sample
         self.stamp, self.arrived, self.earned = 0, False, 0.0
+
+    def seen(self, step: int) -> Any:
+        """Returns the newest sample for the agent, at a step."""
+        return handed_out(self.sample, anew=self.is_new(step))
 
     def is_new(self, step: int) -> bool:
         """Returns whether the newest sample arrived at this step, as the first of an episode does."""
