@@ -71,6 +71,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         self._uplinks, self._downlinks = settings.uplinks(self.num_envs), settings.downlinks(self.num_envs)
         self._snapshots, self._rng = Snapshots(), None
         self._nothing = settings.neutral if settings.neutral is not None else nothing(env.single_action_space)
+        self._keeps_actions = bool(settings.entries.names) or callable(settings.fill)
         self._started = False
 
     @property
@@ -135,19 +136,20 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             samples: Observations of all environments.
             anew: Whether other episodes ran before, whose packets are on their way.
         """
-        settings, rng = self._settings, self.np_random
+        settings, rng, rows = self._settings, self.np_random, np.flatnonzero(chosen)
         if anew:
             for arrivals, links in zip(self._arrivals, self._uplinks, strict=True):
-                arrivals.link.begin(rng, chosen, links.begin(rng, chosen))
+                arrivals.link.begin(rng, rows, links.begin(rng, chosen))
             if self._actuator is not None:
-                self._actuator.begin(rng, chosen, self._downlinks.begin(rng, chosen))
+                self._actuator.begin(rng, rows, self._downlinks.begin(rng, chosen))
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
-            arrivals.begin(chosen, part.of(samples))
-        for array in (self._steps, self._packets, self._earned, self._told):
-            array[chosen] = 0
-        self._decided[chosen] = np.asarray(self._nothing)
-        self._applied = _where(chosen, np.asarray(self._nothing), self._applied)
-        self._decided_at = np.where(chosen, 0, self._decided_at)
+            arrivals.begin(rows, part.of(samples))
+        self._steps[rows] = self._packets[rows] = self._decided_at[rows] = 0
+        self._applied[rows] = self._nothing
+        if settings.delay_reward:
+            self._earned[rows] = self._told[rows] = 0.0
+        if self._keeps_actions:
+            self._decided[rows] = self._nothing
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Sends the actions, steps the environments with those that act now, and sees what arrives."""
@@ -157,7 +159,8 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         self._applied, self._decided_at = actions.copy(), self._steps.copy()
         if self._actuator is not None:
             self._applied, self._decided_at = self._actuator.exchange(rng, self._steps, actions)
-        self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
+        if self._keeps_actions:
+            self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
         observations, rewards, terminated, truncated, info = self.env.step(self._applied)
         self._steps += 1
         done = terminated | truncated
@@ -188,13 +191,15 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
     def _seen(self) -> Any:
         """Returns what the agent sees now."""
         settings, arrivals = self._settings, self._arrivals
-        seen = [handed_out(each.sample, anew=bool(each.arrived.any())) for each in arrivals]
+        seen = [each.seen() for each in arrivals]
         if settings.fill == "zero":
             pairs = zip(seen, settings.parts, arrivals, strict=True)
             seen = [_where(each.is_new(self._steps), sample, zero_of(part.space)) for sample, part, each in pairs]
         elif callable(settings.fill):
             filled = settings.fill(seen[0], self._steps - arrivals[0].stamp, self._decided)
             seen = [_where(arrivals[0].is_new(self._steps), seen[0], filled)]
+        if not settings.entries.names:
+            return joined(settings.parts, seen)
         ages = np.stack([self._steps - each.stamp for each in arrivals], axis=1)
         arrived = np.stack([each.arrived for each in arrivals], axis=1)
         return settings.entries.added_to(joined(settings.parts, seen), ages, arrived, self._decided)
@@ -221,22 +226,34 @@ class _Arrivals:
     Attributes:
         link: Their channels.
         stamp: Step at which the newest sample was taken, shape (N,).
-        sample: These samples, never written into.
+        sample: These samples.
         arrived: Whether one arrived at this step, shape (N,).
         earned: Sums of the rewards until they were taken, shape (N,).
     """
 
     def __init__(self, link: VectorChannelState, count: int) -> None:
-        self.link, self.sample = link, None
+        self.link, self.sample, self._is_own = link, None, False
         self.stamp, self.arrived = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         self.earned = np.zeros(count)
         self._past: deque[tuple[Any, np.ndarray]] = deque()
 
-    def begin(self, chosen: np.ndarray, samples: Any) -> None:
-        """Starts episodes where a mask says so, whose first samples are there."""
-        self.sample = samples if self.sample is None else _where(chosen, samples, self.sample)
-        self.stamp, self.earned = np.where(chosen, 0, self.stamp), np.where(chosen, 0.0, self.earned)
-        self.arrived = self.arrived & ~chosen
+    def begin(self, rows: np.ndarray, samples: Any) -> None:
+        """Starts episodes in some environments, whose first samples are there."""
+        self._take(rows, samples)
+        self.stamp[rows], self.earned[rows], self.arrived[rows] = 0, 0.0, False
+
+    def _take(self, rows: np.ndarray, samples: Any) -> None:
+        """Takes the samples of some environments; those of all are taken as they are."""
+        if len(rows) == len(self.stamp):
+            self.sample, self._is_own = samples, False
+            return
+        if not self._is_own:
+            self.sample, self._is_own = handed_out(self.sample, anew=False), True
+        _write(self.sample, samples, rows)
+
+    def seen(self) -> Any:
+        """Returns the newest samples for the agent."""
+        return handed_out(self.sample, anew=not self._is_own and bool(self.arrived.any()))
 
     def is_new(self, steps: np.ndarray) -> np.ndarray:
         """Returns where the newest sample arrived at this step, as the first of an episode does, shape (N,)."""
@@ -254,11 +271,10 @@ class _Arrivals:
             self._past.pop()
         self.arrived = np.zeros(len(steps), np.bool_)
         for age, arrives in self.link.arrivals():
-            fresh = arrives & (steps - age > self.stamp)
+            rows = np.flatnonzero(arrives & (steps - age > self.stamp))
             sample, by_then = self._past[age]
-            self.sample = sample if fresh.all() else _where(fresh, sample, self.sample)
-            self.stamp, self.earned = np.where(fresh, steps - age, self.stamp), np.where(fresh, by_then, self.earned)
-            self.arrived |= fresh
+            self._take(rows, sample)
+            self.stamp[rows], self.earned[rows], self.arrived[rows] = steps[rows] - age, by_then[rows], True
         return sends
 
 
@@ -274,12 +290,10 @@ class _Actuators:
         # What waits for its turn, oldest first: how old each was at its arrival, counted from now on; -1 for none.
         self._waiting = np.zeros((0, count), np.int64)
 
-    def begin(self, rng: np.random.Generator, chosen: np.ndarray, channels: Any) -> None:
-        """Starts episodes where a mask says so; what is on its way there never arrives."""
-        self._link.begin(rng, chosen, channels)
-        self._action = _where(chosen, self._neutral, self._action)
-        self._stamp = np.where(chosen, -1, self._stamp)
-        self._waiting = np.where(chosen, -1, self._waiting)
+    def begin(self, rng: np.random.Generator, rows: np.ndarray, channels: Any) -> None:
+        """Starts episodes in some environments; what is on its way there never arrives."""
+        self._link.begin(rng, rows, channels)
+        self._action[rows], self._stamp[rows], self._waiting[:, rows] = self._neutral, -1, -1
 
     def exchange(
         self, rng: np.random.Generator, steps: np.ndarray, actions: np.ndarray
@@ -297,11 +311,11 @@ class _Actuators:
         acts = np.zeros(len(steps), np.bool_)
         for age, arrives in arrivals:
             fresh = arrives & ((steps - age > self._stamp) | (self._late == "queue"))
-            self._action = _where(fresh, self._past[age], self._action)
-            self._stamp, acts = np.where(fresh, steps - age, self._stamp), acts | fresh
+            rows = np.flatnonzero(fresh)
+            self._action[rows], self._stamp[rows], acts[rows] = self._past[age][rows], steps[rows] - age, True
         if self._idle == "neutral":
-            return _where(acts, self._action, self._neutral), self._stamp
-        return self._action.copy(), self._stamp
+            return _where(acts, self._action, self._neutral), self._stamp.copy()
+        return self._action.copy(), self._stamp.copy()
 
     def _next_in_turn(self, arrivals: list[tuple[int, np.ndarray]]) -> list[tuple[int, np.ndarray]]:
         """Returns the command of each environment whose turn it is, by its age, and has the others wait."""
@@ -314,6 +328,18 @@ class _Actuators:
         rows = np.take_along_axis(rows, order, axis=0)
         first, self._waiting = rows[0], rows[1:][(rows[1:] >= 0).any(axis=1)]
         return [(age, first == age) for age in np.unique(first[first >= 0]).tolist()]
+
+
+def _write(samples: Any, new: Any, rows: np.ndarray) -> None:
+    """Writes rows of a batch over those of another one."""
+    if isinstance(samples, dict):
+        for key, each in samples.items():
+            _write(each, new[key], rows)
+    elif isinstance(samples, tuple):
+        for each, other in zip(samples, new, strict=True):
+            _write(each, other, rows)
+    else:
+        samples[rows] = new[rows]
 
 
 def _where(chosen: np.ndarray, there: Any, elsewhere: Any) -> Any:
