@@ -1,4 +1,4 @@
-"""Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
+"""Imperfect networks around any Gymnasium environment, and plants behind them; importing registers the ids."""
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel

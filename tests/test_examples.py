@@ -33,6 +33,11 @@ RUNS = {
             r"proved in 24\d\d of 9600 steps, outside the box in 0; now: True; the newest sample is older",
         ],
     ),
+    "delayed_classics.py": (
+        ["--smoke", "--only", "CartPole-v1"],
+        [rf"CartPole +PPO +bursts +{NUMBER} +{NUMBER}"],
+    ),
+    "pettingzoo_network.py": ([], [rf"both see three steps late: {NUMBER}"]),
     "mpc_loop.py": (
         [],
         [r"monitor: outside the box in [1-9]\d* steps", r"project: outside the box in 0 steps, [1-9].* in 300 of 300"],

@@ -34,6 +34,7 @@ LAYERS = {
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
         {"envs"},
+        {"networked"},
         {"registration"},
     ),
     "shields": (
