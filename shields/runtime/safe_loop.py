@@ -453,7 +453,7 @@ class SafeLoop:
         """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
         pending = self._inputs.pending
         earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._input_delay)]
-        self._monitored.begin(self._report(), known, earlier=earlier, pending=pending)
+        self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
 
     def _find(self, packets: Iterable[Packet]) -> None:
         """Takes in samples of a state that is not known, and begins anew where they prove where it is."""
