@@ -18,6 +18,7 @@ from shields.runtime.one_step import FARTHEST, PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 
 ALARM = "a measurement contradicts the assumed bounds"
+NOT_FINITE = "a sample held NaN or infinity: where a sensor has no reading, no packet may be sent"
 OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
@@ -35,7 +36,7 @@ NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies wha
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
-    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED,
+    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED, NOT_FINITE,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 ON_UNPROVED = ("ignore", "warn", "raise")
@@ -68,12 +69,14 @@ class LoopObservation(NamedTuple):
         errors: What is known of the error shapes, in the same order.
         alarm: Whether the innovation monitor raised an alarm.
         age: Steps since the newest sample used was taken, which is asked for only to explain a large error.
+        damaged: Whether that alarm is about a sample that was no finite numbers.
     """
 
     estimate: np.ndarray
     errors: PredictedErrors
     alarm: Any
     age: Any = 0
+    damaged: Any = False
 
 
 class GuaranteeMonitor:
@@ -206,11 +209,11 @@ class GuaranteeMonitor:
         self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True
     ) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves: not what was on the way."""
-        estimate, errors, alarm, _ = report
+        estimate, errors, alarm, _, damaged = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
-        broken = _first(broken, alarm, ALARM)
+        broken = _first(_first(broken, damaged, NOT_FINITE), alarm, ALARM)
         if not _all(within):
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
@@ -282,7 +285,7 @@ class LostGuarantee:
             text = f"the state is not proved safe now: {EXPLANATIONS[code]}"
             if self.on_unproved == "raise":
                 raise GuaranteeLostError(text)
-            warnings.warn(text, GuaranteeLostWarning, stacklevel=_levels_to_the_caller())
+            warn_caller(text, GuaranteeLostWarning)
 
     def tell_of(self, reason: str) -> None:
         """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
@@ -311,9 +314,9 @@ def _first(broken: Any, condition: Any, explanation: str) -> Any:
     return broken + (broken == 0) * condition * CODES[explanation]
 
 
-def _levels_to_the_caller() -> int:
-    """Returns the stack level, as `warnings.warn` in `tell` counts it, of the first caller outside this package."""
-    level, frame = 1, sys._getframe(1)
+def warn_caller(text: str, category: type[Warning]) -> None:
+    """Warns the first caller outside this package."""
+    level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shields."):
         level, frame = level + 1, frame.f_back
-    return level
+    warnings.warn(text, category, stacklevel=level)

@@ -117,9 +117,11 @@ class MonitoredFilter:
         self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report, on_time)
         self.report = report
 
-    def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool, age: int = 0) -> LoopObservation:
+    def reported(
+        self, estimate: np.ndarray, error_shape: Any, alarm: bool, age: int = 0, damaged: bool = False
+    ) -> LoopObservation:
         """Returns the report of an estimate, shape (n,), that nobody writes into, and of an error shape, (n, n)."""
-        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm, age)
+        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm, age, damaged)
 
     @property
     def plan_length(self) -> int:

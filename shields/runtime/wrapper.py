@@ -264,7 +264,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age)
+        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age, known.damaged)
 
     def _read_clock(self) -> tuple[int, int]:
         return self._inner.episodes, self._inner.steps
