@@ -439,7 +439,12 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         constraints = Constraints(values, worst, cost, self._violations)
         estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         self._known = Known(
-            *self._predicted_estimate(), estimator.age, alarm, inputs.applied.copy(), inputs.committed.copy()
+            *self._predicted_estimate(),
+            estimator.age,
+            alarm,
+            estimator.damaged,
+            inputs.applied.copy(),
+            inputs.committed.copy(),
         )
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:

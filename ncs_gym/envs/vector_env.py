@@ -341,7 +341,8 @@ class NCSVectorEnv(VectorEnv):
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
                 damaged = np.asarray(~np.isfinite(samples).all(axis=0))
                 self._channel_state.discard(damaged)
-                estimator.alarm |= sends & damaged
+                estimator.damaged |= sends & damaged
+                estimator.alarm |= estimator.damaged
                 samples[:, damaged] = 0.0  # times a gain of zero it is to be nothing
         arrivals = self._channel_state.arrivals()
         estimator.advance(u.copy(), samples, arrivals)
@@ -436,7 +437,8 @@ class NCSVectorEnv(VectorEnv):
         predicted = self._estimate[0], table.shapes.take(numbers, axis=0)
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        self._known = Known(*predicted, self._estimator.age.copy(), alarm, *(each.copy() for each in inputs[:2]))
+        own = self._estimator.age.copy(), alarm, self._estimator.damaged.copy()
+        self._known = Known(*predicted, *own, *(each.copy() for each in inputs[:2]))
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
@@ -456,7 +458,7 @@ class NCSVectorEnv(VectorEnv):
         self._worst = self._plant.constraint_values(self._state)
         fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
-        self._known = Known(*self._known[:4], *inputs)
+        self._known = Known(*self._known[:5], *inputs)
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

@@ -59,6 +59,7 @@ class Estimator:
         step: Steps since the start of the episode.
         episode: Number of the episode, counted from 0; packets of any other are discarded.
         alarm: Whether a measurement contradicted the assumed bounds in this episode.
+        damaged: Whether one did because it was no finite numbers.
 
     Raises:
         UnstablePlantError: If no error set is given and the plant is not Schur stable.
@@ -133,7 +134,7 @@ class Estimator:
     def _begin(self, mean: np.ndarray, step: int = 0) -> None:
         """Forgets everything but an estimate, shape (n,), at a step."""
         self.step, self.age = step, 0
-        self.alarm = False
+        self.alarm = self.damaged = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self._history = self._histories.root
         # By age: means before updates, inputs that led there, and samples.
@@ -218,7 +219,7 @@ class Estimator:
         if after == history:
             return history
         if not np.isfinite(packet.measurement).all():
-            self.alarm = True  # no sensor within the assumptions sends this
+            self.alarm = self.damaged = True  # no sensor within the assumptions sends this
             return history
         self._samples[age] = packet.measurement
         return after

@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 
 from ncs_gym import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
-from ncs_gym.validation import read_only
+from ncs_gym.validation import frozen, read_only
 from shields.certificate import Certificate, CertificateError
 from shields.runtime.projection import closest_admissible, closest_on_line
 from shields.verification import ACTION_ROUNDING
@@ -260,6 +260,10 @@ class PredictedErrors(NamedTuple):
     def single(self, number: int = 0) -> Self:
         """Returns one of them without a last axis."""
         return self._make(array.item(number) if array.ndim == 1 else array[..., number].copy() for array in self)
+
+    def read_only(self) -> Self:
+        """Returns the same, read-only."""
+        return self._make(frozen(each) if isinstance(each, np.ndarray) else each for each in self)
 
     def batch(self) -> Self:
         """Returns a single one as a batch of one."""

@@ -263,14 +263,17 @@ class SafetyFilter(ReadOnlyArrays):
         return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
-        """Returns what is known of one error shape, (n, n), without a last axis; remembered, since shapes recur."""
+        """Returns what is known of one error shape, (n, n), without a last axis, read-only.
+
+        It is remembered, since shapes recur: all loops of this filter share it, in whatever threads they run.
+        """
         shape = _as_array(error_shape)
         key = shape.tobytes() if shape.shape == (self.plant.n, self.plant.n) else b""
         known = self._remembered.get(key)
         if known is None:
             # Of what the key says: somebody may write into the shape.
             usable = np.frombuffer(key) if key else np.full(self.plant.n**2, np.nan)
-            known = self.errors_of_many(usable.reshape(1, self.plant.n, self.plant.n)).single()
+            known = self.errors_of_many(usable.reshape(1, self.plant.n, self.plant.n)).single().read_only()
             if len(self._remembered) >= MOST_REMEMBERED:
                 self._remembered.clear()
             self._remembered[key] = known

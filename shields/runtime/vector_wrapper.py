@@ -191,7 +191,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
 
     def _observed(self, known: Known) -> LoopObservation:
         errors = self._errors_of(self._inner.error_shapes[1])
-        return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age)
+        return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age, known.damaged)
 
     def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns what is known of the error shapes with these numbers in the environment's table."""
@@ -254,7 +254,8 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         done = np.flatnonzero(is_done)
         errors = self._filter.errors_of_many(known.error_shape[done])
         known = known._replace(applied=known.applied[:, done], committed=known.committed[:, done])
-        report = LoopObservation(known.estimate[:, done], errors, known.alarm[done], known.age[done])
+        alarms = known.alarm[done], known.age[done], known.damaged[done]
+        report = LoopObservation(known.estimate[:, done], errors, *alarms)
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
         same_input, on_time = _as_decided(known, decided.input, None if due is None else due[:, done])

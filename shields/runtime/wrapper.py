@@ -225,7 +225,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         report = self._observed(known)
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._input_delay)
-        self._monitored.begin(report, self._known, clock[1] == 0, self._inner.estimates_ahead()[:-1])
+        self._monitored.begin(report, self._known, clock[1] == 0, earlier=self._inner.estimates_ahead()[:-1])
         self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, known.error_shape, u)
@@ -264,7 +264,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age)
+        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age, known.damaged)
 
     def _read_clock(self) -> tuple[int, int]:
         return self._inner.episodes, self._inner.steps

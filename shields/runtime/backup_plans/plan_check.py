@@ -49,25 +49,23 @@ class PlanTest:
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
         self._most = min(MOST_REMEMBERED, max(1, MOST_NUMBERS // (prediction.steps * len(prediction.rows))))
-        # Where in the table the tightenings of a shape are.
-        self._remembered: dict[bytes, int] = {}
-        self._table = tightenings(prediction, np.empty((0, plant.n, plant.n)))
+        # Tightenings, and where among them those of a shape are: both are replaced together and never written into,
+        # since threads share them.
+        self._known: tuple[dict[bytes, int], Tightening] = {}, tightenings(prediction, np.empty((0, plant.n, plant.n)))
 
     def tightenings_of(self, shapes: np.ndarray) -> Tightening:
         """Returns the tightenings of error shapes Sigma_k, shape (E, n, n); remembered, since shapes recur."""
         shapes = np.ascontiguousarray(shapes)
-        keys = [shape.tobytes() for shape in shapes]
-        new = {key: e for e, key in enumerate(keys) if key not in self._remembered}
-        if len(self._remembered) + len(new) > self._most:
-            self._remembered.clear()
-            new = {key: e for e, key in enumerate(keys)}
+        keys, (numbers, table) = [shape.tobytes() for shape in shapes], self._known
+        new = {key: e for e, key in enumerate(keys) if key not in numbers}
+        if len(numbers) + len(new) > self._most:
+            numbers, table, new = {}, table.some(slice(0)), {key: e for e, key in enumerate(keys)}
         if new:
             found = tightenings(self.prediction, shapes[list(new.values())])
-            known = self._table.some(slice(len(self._remembered)))
-            self._table = Tightening(*(np.concatenate(pair) for pair in zip(known, found, strict=True)))
-            self._remembered |= {key: len(self._remembered) + e for e, key in enumerate(new)}
-        numbers = [self._remembered[key] for key in keys]
-        return self._table.some(numbers)
+            table = Tightening(*(np.concatenate(pair) for pair in zip(table, found, strict=True)))
+            numbers = numbers | {key: len(numbers) + e for e, key in enumerate(new)}
+            self._known = numbers, table
+        return table.some([numbers[key] for key in keys])
 
     @np.errstate(all="ignore")  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ from ncs_gym import (
 )
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
+from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.safety_filter import MODES
 from tests import arrays
@@ -363,7 +363,7 @@ def test_measurement_that_is_not_finite_is_an_alarm():
     loop = started(channel=Channel())
     loop.step(0.0)
     loop.step(0.0, [Packet(1, [np.nan, 0.0])])
-    assert loop.reason == ALARM
+    assert loop.reason == NOT_FINITE
     loop.start([0.0, 0.0])
     assert loop.guaranteed
 
