@@ -8,7 +8,7 @@ import json
 import platform
 import zipfile
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -34,6 +34,7 @@ from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym import Channel, LinearPlant
+from ncs_gym.envs.json_settings import to_json
 from shields.atomic_write import write_atomically
 
 
@@ -155,7 +156,7 @@ class Agent:
             "algorithm": self.algorithm,
             "hyperparams": self.hyperparams,
             "env": self.env,
-            "channel": None if self.channel is None else asdict(self.channel),
+            "channel": to_json(self.channel),
             "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
             "plant": None if (plant := _plant_of(self.env)) is None else plant.fingerprint,
             "normalization": {

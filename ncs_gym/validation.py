@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, Self
@@ -12,6 +13,8 @@ import numpy as np
 LARGEST_NUMBER, SMALLEST_NUMBER = 1e75, 1e-75
 # Steps and environments are counted in 32 bits.
 LARGEST_COUNT = 2**31 - 1
+# A sparse matrix with more entries, zeros included, is not expanded.
+MOST_EXPANDED = 10_000_000
 # Messages quote no more of a value than this many letters.
 MAX_QUOTED_LENGTH = 200
 # Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
@@ -84,7 +87,7 @@ def as_numbers(value: Any) -> np.ndarray | None:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
-        array = np.asarray(value)
+        array = _as_array(value)
         if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiub":
             return None
         with np.errstate(all="ignore"):
@@ -105,7 +108,15 @@ def shown(value: Any) -> str:
 def as_setting(value: Any) -> np.ndarray | None:
     """Returns a new float64 array; None for what is not real numbers: text, truth values, complex or masked ones."""
     numbers = as_numbers(value)
-    return None if numbers is None or np.asarray(value).dtype.kind == "b" else np.array(numbers)
+    return None if numbers is None or _as_array(value).dtype.kind == "b" else np.array(numbers)
+
+
+def _as_array(value: Any) -> np.ndarray:
+    """Returns an array, also of a sparse matrix of scipy, which numpy takes for an object, unless it is too large."""
+    array = np.asarray(value)
+    if array.dtype.kind == "O" and array.ndim == 0 and hasattr(value, "toarray") and hasattr(value, "nnz"):
+        return value.toarray() if math.prod(value.shape) <= MOST_EXPANDED else array
+    return array
 
 
 def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:

@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
+from ncs_gym.plants.between_samples import MOST_POINTS
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, read_only, shown
 from shields.errors import CertificateError
 
 # A polytope has at most so many rows, so that a decision and a verification stay fast; each stands for two faces.
 MOST_ROWS = 400
+# Multipliers belong to its rows, to as many inputs at most, and to the rows of a box at every time of a step.
+MOST_MULTIPLIERS = (MOST_POINTS + 2) * MOST_ROWS
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,10 +36,11 @@ class Polytope(ReadOnlyArrays):
     multipliers: np.ndarray
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if the shapes do not fit or a number is not finite."""
+        """Raises CertificateError if the shapes do not fit, a number is not finite, or there are too many rows."""
         try:
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
+            require_size(len(rows), len(multipliers))
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
         object.__setattr__(self, "rows", rows)
@@ -107,6 +111,15 @@ class Polytope(ReadOnlyArrays):
         return directions / self.gauge(directions)[:, None]
 
 
+def require_size(rows: int, multipliers: int) -> None:
+    """Raises ValueError if a polytope would have more rows, or rows of multipliers, than any may have."""
+    if rows > MOST_ROWS or multipliers > MOST_MULTIPLIERS:
+        raise ValueError(
+            f"a polytope has at most {MOST_ROWS} rows and {MOST_MULTIPLIERS} rows of multipliers, got {rows} and "
+            f"{multipliers}"
+        )
+
+
 def polytope_content(polytope: Polytope) -> dict[str, Any]:
     """Returns the JSON values of a polytope; of the multipliers the pairs [number of the row, value] that count."""
     multipliers = [[[int(i), float(row[i])] for i in np.flatnonzero(row)] for row in polytope.multipliers]
@@ -120,8 +133,7 @@ def polytope_of(content: Any) -> Polytope:
         KeyError, TypeError, ValueError: If an entry is missing or of a wrong kind.
     """
     rows, pairs = as_matrix(content["rows"], (None, None), "the rows of the polytope"), content["multipliers"]
-    if len(rows) > MOST_ROWS or not len(rows) < len(pairs) <= 2 * MOST_ROWS:
-        raise ValueError(f"a polytope has at most {MOST_ROWS} rows, and multipliers for each and for every input")
+    require_size(len(rows), len(pairs))
     multipliers = np.zeros((len(pairs), len(rows)))
     for row, entries in zip(multipliers, pairs, strict=True):
         if len({index for index, _ in entries}) < len(entries):

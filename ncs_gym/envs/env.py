@@ -12,6 +12,7 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
+from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import (
     CHANNELS,
     expect,
@@ -52,7 +53,7 @@ class RenderModeError(ValueError, TypeError):
     """An unknown render mode; a TypeError too, because stable-baselines3 asks for "rgb_array" and retries on that."""
 
 
-class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
+class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     """A plant behind an imperfect network; the controller sees an estimate of the state.
 
     ## Action space

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
+from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
@@ -33,7 +34,7 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, setting, shown
 
 
-class NCSVectorEnv(VectorEnv):
+class NCSVectorEnv(SpecOfJson, VectorEnv):
     """N copies of `NCSEnv` with the same semantics, spaces and info keys; every info value has N as its first axis.
 
     Inside, the environment is the last axis, so that A x + B u stands as in the formulas. What depends only on when

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from ncs_gym.network.channel import LONGEST_DELAY, Channel
+from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel
 from ncs_gym.validation import shown
 
 # Ages beyond this are observed as this [steps].
@@ -46,7 +46,7 @@ def parts_of(space: spaces.Space, channel: Any) -> tuple[list[Part], list[Any]]:
     Raises:
         ValueError: If there are channels of keys that the space does not have.
     """
-    if isinstance(channel, Mapping) and not channel.keys() <= Channel.__dataclass_fields__.keys() | {"trace"}:
+    if isinstance(channel, Mapping) and not channel.keys() <= TraceChannel.__dataclass_fields__.keys() | {"type"}:
         keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
         if unknown := [key for key in channel if key not in keys]:
             known = f"its keys are {', '.join(map(str, keys))}" if keys else f"the space is {shown(space)}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
 from functools import partial
 from typing import Any
 
@@ -11,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 
 from ncs_gym.envs.episode_channels import EpisodeChannels
-from ncs_gym.network.channel import Channel, TraceChannel
+from ncs_gym.envs.json_settings import from_json, to_json
+from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
@@ -75,8 +75,9 @@ class NetworkSettings:
         self.entries = Entries(settings["observe"], observations, actions, len(self.parts), self.pending)
         self.delay_reward = as_flag(settings["delay_reward"], "delay_reward")
         self.recorded = dict(settings) | {
-            "channel": _recorded(settings["channel"]),
-            "downlink": _recorded(settings["downlink"]),
+            "channel": to_json(settings["channel"]),
+            "downlink": to_json(settings["downlink"]),
+            "neutral": to_json(settings["neutral"]),
             "observe": list(self.entries.names),
         }
 
@@ -121,22 +122,10 @@ def as_channel(value: Any, name: str) -> Channel | None:
     Raises:
         ValueError: If it is neither.
     """
-    if value is None or isinstance(value, Channel):
-        return value
-    if isinstance(value, Mapping):
-        kind = TraceChannel if "trace" in value else Channel
-        if value.keys() <= {entry.name for entry in fields(kind)}:
-            given = dict(value)
-            return kind(**(given | {"trace": tuple(given["trace"])} if "trace" in given else given))
+    channel = from_json(value, (Channel,), name)
+    if channel is None or isinstance(channel, Channel):
+        return channel
     raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}")
-
-
-def _recorded(value: Any) -> Any:
-    if isinstance(value, Channel):
-        return asdict(value)
-    if isinstance(value, Mapping):
-        return {key: _recorded(each) for key, each in value.items()}
-    return [_recorded(each) for each in value] if isinstance(value, tuple | list) else value
 
 
 def _one_of(value: Any, known: tuple[str, ...], name: str) -> str:

@@ -11,7 +11,7 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -448,29 +448,42 @@ class LinearPlant(ReadOnlyArrays):
             state_units=[*self.state_units, *tuple(self.input_units) * delay],
         )
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
+        return {"format": _FORMAT, "plant": {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}}
+
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Returns the plant in a file of `save`, checked like any other.
+    def read(cls, given: Mapping[str, Any] | str | os.PathLike[str]) -> Self:
+        """Returns the plant of a `document`, or of the file at a path, checked like any other.
 
         Raises:
             ValueError: If the file is missing or not that of a plant, or an argument is wrong.
         """
-        try:
-            document = json.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, TypeError, ValueError, RecursionError) as error:
-            reason = getattr(error, "strerror", None) or "it is not valid JSON"
-            raise ValueError(f"cannot read the plant in {shown(path)}: {reason}") from error
-        content = document.get("plant") if isinstance(document, dict) and document.get("format") == _FORMAT else None
-        if not isinstance(content, dict):
-            raise ValueError(f"{shown(path)} is not a plant of format {_FORMAT!r}")
-        arguments = {name: _from_json(value) for name, value in content.items()}
+        document, name = given, "the document"
+        if not isinstance(given, Mapping):
+            name = shown(given)
+            try:
+                document = json.loads(Path(given).read_text(encoding="utf-8"))
+            except (OSError, TypeError, ValueError, RecursionError) as error:
+                reason = getattr(error, "strerror", None) or "it is not valid JSON"
+                raise ValueError(f"cannot read the plant in {name}: {reason}") from error
+        content = document.get("plant") if isinstance(document, Mapping) and document.get("format") == _FORMAT else None
+        if not isinstance(content, Mapping):
+            raise ValueError(f"{name} is not a plant of format {_FORMAT!r}")
+        arguments = {key: _from_json(value) for key, value in content.items()}
         box = as_setting(arguments.get("box"))
         if box is not None:
             arguments["box"] = box  # an array: `save` wrote computed rows
         try:
             return cls(**arguments)
         except TypeError as error:  # an argument is missing or unknown
-            raise ValueError(f"{shown(path)} is not the file of a plant: {error}") from error
+            raise ValueError(f"{name} is not that of a plant: {error}") from error
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Returns the plant in a file of `save`; see `read`."""
+        return cls.read(path)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every number is exact.
@@ -478,9 +491,7 @@ class LinearPlant(ReadOnlyArrays):
         Raises:
             OSError: If the file cannot be written.
         """
-        content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
-        document = {"format": _FORMAT, "plant": content}
-        Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
         return _describe(self)
@@ -883,6 +894,8 @@ def _as_json(value: Any) -> Any:
         return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
         return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, tuple):
+        return list(value)
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
