@@ -37,6 +37,7 @@ LARGEST_BODY, SHORTEST_KEY, TAG_SIZE = 1400, 16, 16
 LARGEST_STAMP = 2**62
 _HEADER = struct.Struct("<4sBBH8sQQQ")
 _ECHO = struct.Struct("<Q16s")
+LARGEST_DATAGRAM = _HEADER.size + LARGEST_BODY + TAG_SIZE
 
 
 class WireError(ValueError):
@@ -89,6 +90,17 @@ class Message:
     requests: tuple[bool, ...] = ()
 
 
+def require_key(key: bytes) -> bytes:
+    """Returns a key.
+
+    Raises:
+        ValueError: If it is too short.
+    """
+    if not isinstance(key, bytes) or len(key) < SHORTEST_KEY:
+        raise ValueError(f"the key must be at least {SHORTEST_KEY} bytes, as os.urandom(32) makes them")
+    return key
+
+
 class Wire:
     """Encodes and decodes the messages of one control loop.
 
@@ -105,9 +117,7 @@ class Wire:
     """
 
     def __init__(self, plant: LinearPlant, input_delay: int, key: bytes) -> None:
-        if not isinstance(key, bytes) or len(key) < SHORTEST_KEY:
-            raise ValueError(f"the key must be at least {SHORTEST_KEY} bytes, as os.urandom(32) makes them")
-        self._key, self._fingerprint = key, bytes.fromhex(plant.fingerprint)[:8]
+        self._key, self._fingerprint = require_key(key), bytes.fromhex(plant.fingerprint)[:8]
         self.input_delay = as_count(input_delay, "input_delay", low=0)
         shapes = {Kind.SAMPLE: (plant.p,), Kind.COMMAND: (self.input_delay + 1, plant.m)}
         self._shapes = shapes | {Kind.ECHO: (0,), Kind.BEACON: (0,)}
