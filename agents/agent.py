@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import platform
 import zipfile
 from contextlib import suppress
@@ -35,6 +34,7 @@ from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
+from ncs_gym.reading import LARGEST_MODEL, MOST_MEMBERS, json_values, read_file
 from shields.atomic_write import write_atomically
 
 
@@ -254,6 +254,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
+    require_moderate_zip(weights)
     model = build_model(algorithm, SB3VecEnv(loop.vector(2)), hyperparams, seed=0)  # as in `untrained`
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
@@ -281,6 +282,21 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     )
 
 
+def require_moderate_zip(content: bytes) -> None:
+    """Returns if a zip, and those that it holds, unpack to no more than files of agents may.
+
+    Raises:
+        ValueError: If they would.
+        zipfile.BadZipFile: If it is no zip, or one that it holds is none.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        if len(members) > MOST_MEMBERS or sum(each.file_size for each in members) > LARGEST_MODEL:
+            raise ValueError(f"it unpacks to more than {MOST_MEMBERS} files or {LARGEST_MODEL:,} bytes")
+        for name in (each.filename for each in members if each.filename.endswith((".pth", ".pt"))):
+            require_moderate_zip(archive.read(name))
+
+
 # What only one algorithm's file has among its settings; the first that fits.
 _MARKS = {"TQC": "top_quantiles_to_drop_per_net", "SAC": "target_entropy", "TD3": "target_policy_noise"}
 _MARKS |= {"PPO": "clip_range", "TRPO": "cg_max_steps", "A2C": "gae_lambda"}
@@ -304,9 +320,11 @@ def load_sb3_zip(path: Path, env_id: str) -> Agent:
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-        _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
+        weights = read_file(path, LARGEST_MODEL)
+        require_moderate_zip(weights)
+        with zipfile.ZipFile(io.BytesIO(weights)) as archive:
+            data = json_values(archive.read("data"))
+        _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
         algorithm = next((name for name, mark in _MARKS.items() if mark in data), None)
         policy = data.get("policy_kwargs", {})
     except Exception as error:  # a forged file may break any part of the libraries that read it

@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ncs_gym.reading import LARGEST_MODEL, json_values, read_file
 from ncs_gym.validation import shown
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
@@ -57,12 +58,13 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
         folder: The folder, or one of the two files in it.
 
     Raises:
-        AgentError: If a file is missing, damaged or of another format.
+        AgentError: If a file is missing, damaged, of another format or larger than it may be (`ncs_gym.reading`).
     """
     folder = Path(folder)
     folder = folder.parent if folder.name in AGENT_FILES else folder
     try:
-        document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
+        document = json_values(read_file(folder / "agent.json"))
+        weights = read_file(folder / "model.zip", LARGEST_MODEL)
     except OSError as error:
         raise AgentError(
             f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); `ncs compare` leaves "

@@ -28,6 +28,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text
 from ncs_gym.validation import shown
 
 # The package of each algorithm, which has a class of the same name.
@@ -41,12 +42,16 @@ ALGORITHMS = {
     "CrossQ": "sb3_contrib",
 }
 # Numbers that are counted from 1: of a wrong one the library complains only while it trains, or never.
-_COUNTS = ("n_envs", "n_steps", "n_epochs", "buffer_size")
 # Keys of rl-zoo3's files that are no hyperparameters of an algorithm: what is put around environments, and callbacks.
 RL_ZOO_KEYS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "env_kwargs", "monitor_kwargs", "callback")
 # Names of torch.nn as rl-zoo3's files write them, and what is no part of a literal.
 _OF_TORCH = re.compile(r"(?:(?:torch|th)\.)?nn\.([A-Za-z]\w*)")
 _NO_LITERALS = (ast.Call, ast.Name, ast.Attribute, ast.Lambda, ast.comprehension, ast.Starred)
+# The largest: of ten million transitions a buffer takes gigabytes.
+MOST_TRANSITIONS = 10_000_000
+_COUNTS = {"n_envs": 100_000, "n_steps": MOST_TRANSITIONS, "n_epochs": 100_000, "buffer_size": MOST_TRANSITIONS}
+# Most weights of the networks of an agent together, and most outputs of each.
+MOST_WEIGHTS, MOST_OUTPUTS = 20_000_000, 1000
 # Algorithms that learn from whole rollouts of `n_steps` steps in every environment.
 ON_POLICY = ("PPO", "A2C", "TRPO")
 
@@ -100,8 +105,9 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
         given: Hyperparameters by name; None for none.
 
     Raises:
-        ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or `gamma` or a count
-            (`n_envs`, `n_steps`, `n_epochs`, `buffer_size`) is out of range.
+        ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, `gamma` or a count
+            (`n_envs`, `n_steps`, `n_epochs`, `buffer_size`) is out of range, or networks are larger than
+            `MOST_WEIGHTS`.
     """
     if algorithm not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {algorithm!r}; known are {', '.join(ALGORITHMS)}")
@@ -112,13 +118,37 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
     except (TypeError, ValueError) as error:
         raise ValueError(f"hyperparameters must be JSON values: {error}") from error
     hyperparams = with_changes(DEFAULTS[algorithm], copied)
-    for name in _COUNTS:
-        if name in hyperparams and (type(value := hyperparams[name]) is not int or value < 1):
-            raise ValueError(f"{name} must be a whole number >= 1, got {shown(value)}")
+    for name, most in _COUNTS.items():
+        if name in hyperparams and (type(value := hyperparams[name]) is not int or not 1 <= value <= most):
+            raise ValueError(f"{name} must be a whole number >= 1, at most {most:,}, got {shown(value)}")
+    if hyperparams["n_envs"] * hyperparams.get("n_steps", 1) > MOST_TRANSITIONS:
+        raise ValueError(f"n_envs times n_steps must be at most {MOST_TRANSITIONS:,}")
+    require_moderate_networks(hyperparams.get("policy_kwargs") or {})
     gamma = hyperparams["gamma"]
     if type(gamma) not in (int, float) or not 0.0 <= gamma <= 1.0:
         raise ValueError(f"gamma must be in [0, 1], got {shown(gamma)}")
     return hyperparams
+
+
+def require_moderate_networks(policy_kwargs: Any) -> None:
+    """Returns if networks of these settings are moderate; whether they are right the library says.
+
+    Raises:
+        ValueError: If they have more than `MOST_WEIGHTS` weights, or a count that is larger than `MOST_OUTPUTS`.
+    """
+    if not isinstance(policy_kwargs, Mapping):
+        return
+    counts = {name: each for name, each in policy_kwargs.items() if type(each) in (int, float)}
+    if any(not abs(each) <= MOST_OUTPUTS for each in counts.values()):
+        raise ValueError(f"policy_kwargs must have numbers of at most {MOST_OUTPUTS}, got {shown(counts)}")
+    arch = policy_kwargs.get("net_arch") or []
+    nets = [arch, arch] if isinstance(arch, list) else [*arch.values()] if isinstance(arch, Mapping) else []
+    weights = 0
+    for net in nets:
+        widths = [each for each in (net if isinstance(net, list) else []) if type(each) is int]
+        weights += sum(a * b for a, b in zip([MOST_OUTPUTS, *widths], widths, strict=False) if min(a, b) > 0)
+    if (total := weights * 2 * max(counts.get("n_critics", 1), 1)) > MOST_WEIGHTS:
+        raise ValueError(f"networks may have {MOST_WEIGHTS:,} weights, those of {shown(arch)} might have {total:,.0f}")
 
 
 def rollout_steps(algorithm: str, hyperparams: Mapping[str, Any]) -> int:
@@ -155,7 +185,8 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
 
     Args:
         file: YAML (.yml, .yaml) or JSON: hyperparameters by environment id, or under "default" for all others. Texts
-            such as `dict(net_arch=[64, 64], activation_fn=nn.ReLU)` are read as Python's literals.
+            such as `dict(net_arch=[64, 64], activation_fn=nn.ReLU)` are read as Python's literals. At most 256 KiB, and
+            100,000 values once all aliases are written out.
         env_id: Id by which the environment is registered.
 
     Raises:
@@ -163,9 +194,9 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
         OSError: If it cannot be read.
     """
     path = Path(file)
-    text = path.read_text("utf-8")
+    text = read_text(path, LARGEST_HYPERPARAMS)
     try:
-        document = json.loads(text) if path.suffix == ".json" else _yaml(text)
+        document = json_values(text) if path.suffix == ".json" else _yaml(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"hyperparameters {path} are damaged: {' '.join(str(error).split())}") from error
     entries = document if isinstance(document, dict) else {}
@@ -185,6 +216,7 @@ def _yaml(text: str) -> Any:
     import yaml  # of the extra "train", as everything that is trained needs
 
     try:
+        _require_moderate(yaml.compose(text, Loader=yaml.SafeLoader))
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
@@ -205,6 +237,22 @@ def value_of(name: str, value: Any) -> Any:
             "(nn.ReLU) are read, nothing is evaluated"
         )
     return found
+
+
+def _require_moderate(root: Any) -> None:
+    """Raises ValueError if a YAML document has too many values once all of its aliases are written out."""
+    sizes: dict[int, int] = {}
+
+    def size_of(node: Any) -> int:
+        if id(node) not in sizes:
+            sizes[id(node)] = MOST_HYPERPARAMS + 1  # of one that holds itself
+            parts = node.value if isinstance(node.value, list) else ()
+            flat = (each for part in parts for each in (part if isinstance(part, tuple) else (part,)))
+            sizes[id(node)] = 1 + sum(map(size_of, flat))
+        return sizes[id(node)]
+
+    if root is not None and size_of(root) > MOST_HYPERPARAMS:
+        raise ValueError(f"with its aliases written out it has more than {MOST_HYPERPARAMS:,} values")
 
 
 def literal(text: str) -> Any:

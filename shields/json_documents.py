@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from ncs_gym.reading import json_values, read_text
 from shields.atomic_write import write_atomically
 
 
@@ -18,7 +19,7 @@ def digest(content: Any) -> str:
 
 def with_literal_numbers(text: str) -> Any:
     """Returns the values of a JSON text with every number as the text of its digits, so that a digest counts each."""
-    return json.loads(text, parse_float=str, parse_int=str)
+    return json_values(text, parse_float=str, parse_int=str)
 
 
 def document_of(kind: str, format_name: str, content: Any) -> dict[str, Any]:
@@ -46,10 +47,11 @@ def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> A
     """Returns the content of the document in a file, after comparing its checksum; for arguments see `document_of`.
 
     Raises:
-        ValueError: If the file is missing, no JSON, of another kind or format, or altered; the message says which.
+        ValueError: If the file is missing, no JSON or larger than documents may be (`ncs_gym.reading`), of another kind
+            or format, or altered; the message says which.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, TypeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not valid JSON"
         raise ValueError(f"cannot read {kind} {path}: {reason}") from error
@@ -59,7 +61,7 @@ def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> A
 def content_of(text: str, path: Any, kind: str, format_name: str) -> Any:
     """Returns what `read_content` does, of the text of a document, which messages call `path`."""
     try:
-        document, literal = json.loads(text), with_literal_numbers(text)
+        document, literal = json_values(text), with_literal_numbers(text)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"cannot read {kind} {path}: it is not valid JSON") from error
     if not isinstance(document, dict) or document.get("format") != format_name or kind not in document:

@@ -7,6 +7,7 @@ time may jump, and no stamp is taken from it.
 """
 
 import time
+from collections import deque
 
 import numpy as np
 import rclpy
@@ -16,7 +17,7 @@ from rclpy.qos import qos_profile_sensor_data
 from std_msgs.msg import UInt8MultiArray
 
 from ncs_gym import Channel, truck_trailer
-from ncs_gym.network.wire import Wire
+from ncs_gym.network.wire import LARGEST_DATAGRAM, Wire
 from shields import Certificate, ControllerNode, SafeLoop
 from shields.nodes import Datagram, StepClock
 
@@ -25,12 +26,12 @@ class TopicTransport:
     """The `Transport` of a node over two topics."""
 
     def __init__(self, node: Node, hears: str, says: str) -> None:
-        self._waiting: list[Datagram] = []
+        self._waiting: deque[Datagram] = deque(maxlen=512)
         self._publisher = node.create_publisher(UInt8MultiArray, says, qos_profile_sensor_data)
         node.create_subscription(UInt8MultiArray, hears, self._hear, qos_profile_sensor_data)
 
     def _hear(self, message: UInt8MultiArray) -> None:
-        self._waiting.append(Datagram(time.monotonic(), bytes(message.data), None))
+        self._waiting.append(Datagram(time.monotonic(), bytes(message.data[: LARGEST_DATAGRAM + 1]), None))
 
     def send(self, data: bytes, to: object = None) -> None:
         """Publishes a datagram."""
@@ -38,7 +39,8 @@ class TopicTransport:
 
     def received(self) -> list[Datagram]:
         """Returns what arrived since the last call."""
-        arrived, self._waiting = self._waiting, []
+        arrived = list(self._waiting)
+        self._waiting.clear()
         return arrived
 
     def close(self) -> None:

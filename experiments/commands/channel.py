@@ -13,6 +13,7 @@ from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import PacketLog, contract_of
+from ncs_gym.network.contract import MAX_AGE
 from shields.atomic_write import write_atomically
 
 # Rows of the table of contracts that are printed: those nearest to what was kept.
@@ -99,32 +100,32 @@ def _compared(contract: Any, found: dict[str, Any]) -> str:
     return f"The environment's contract, max_age = {contract.max_age}, was broken in {broken}."
 
 
-# A block is this many times as long as the largest age: what happens in one hardly depends on the one before.
-_AGES_PER_BLOCK = 10
+# A block is at least so many times as long as the largest age: what happens in one hardly depends on the one before.
+_AGES_PER_BLOCK, _MOST_BLOCKS = 10, 5000
 _RESAMPLES = 2000
 
 
 def broken_contracts(ages: np.ndarray, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Returns, for every largest age up to the recorded one, in what fraction of steps it was exceeded.
+    """Returns, for every largest age up to the recorded one that contracts can have, how often it was exceeded.
 
-    The interval is that of a circular block bootstrap of the steps (95 %), blocks being ten times as long as the
-    largest age. Where an age was never exceeded it ends at 3 / (number of blocks), what is excluded at that level if
-    blocks are independent. `halves` are the two halves of the record.
+    The interval is that of a circular block bootstrap of the steps (95 %), blocks being at least ten times as
+    long as the largest age. Where an age was never exceeded it ends at 3 / (number of blocks), what is excluded at that
+    level if blocks are independent. `halves` are the two halves of the record.
 
     Args:
         ages: Age of the newest sample at every step, shape (k,).
         rng: Draws the blocks.
 
     Returns:
-        Rows of JSON values, from the age that was kept down to 0.
+        Rows of JSON values, from the age that was kept (or `MAX_AGE`) down to 0.
     """
     largest, steps = int(ages.max()), len(ages)
-    block = min(_AGES_PER_BLOCK * (largest + 1), steps)
+    block = min(max(_AGES_PER_BLOCK * (largest + 1), steps // _MOST_BLOCKS), steps)
     blocks = -(-steps // block)
     starts = rng.integers(steps, size=(_RESAMPLES, blocks))
     halves = np.array_split(ages, 2)
     rows = []
-    for age in range(largest, -1, -1):
+    for age in range(min(largest, MAX_AGE), -1, -1):
         broken = ages > age
         sums = np.concatenate([[0], np.cumsum(np.concatenate([broken, broken[:block]]))])
         resampled = (sums[starts + block] - sums[starts]).sum(axis=1) / (blocks * block)

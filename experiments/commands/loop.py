@@ -28,6 +28,7 @@ from experiments.runs.loops import registered_env
 from experiments.settings import LoopSettings
 from ncs_gym import NCSEnv
 from ncs_gym.network.wire import SHORTEST_KEY
+from ncs_gym.reading import LARGEST_KEY, read_file
 from shields import Certificate, Infeasible, certificate_for
 from shields.atomic_write import write_atomically
 from shields.verification import require_valid
@@ -113,7 +114,7 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     uplink, downlink = network_channels(env, settings.channel, settings.downlink)
     if settings.ask_age is not None and not uplink.on_request:
         raise ValueError(f"--ask-age: {settings.env} sends samples by itself; --channel on_request=True makes it ask")
-    key = os.urandom(32) if settings.key_file is None else settings.key_file.read_bytes()
+    key = os.urandom(32) if settings.key_file is None else read_file(settings.key_file, LARGEST_KEY)
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
     max_age = 0 if env.contract is None else env.contract.max_age

@@ -25,6 +25,7 @@ from experiments.settings import RequirementsSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.network.requests import spare_samples
+from ncs_gym.reading import json_values, read_file
 from shields import Certificate, Network, Requirement, Requirements
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
@@ -163,7 +164,7 @@ class _Store:
         if not file.exists():
             return None
         try:
-            document = json.loads(file.read_bytes())
+            document = json_values(read_file(file))
             if document["key"] != _key(search):
                 return None
             answers = {}

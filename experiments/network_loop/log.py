@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from ncs_gym.reading import LARGEST_LINE, open_file
 
 # Rows of a file, 5.5 hours at 50 Hz.
 ROWS_PER_FILE = 1_000_000
@@ -48,9 +51,16 @@ class StepLog:
 
 
 def rows_of(folder: Path, name: str) -> Iterator[dict[str, str]]:
-    """Yields the rows of a log, of all its files in order; a last line that was cut off is left out."""
+    """Yields the rows of a log, of all its files in order; a last line that was cut off is left out.
+
+    Of a line that is longer than 64 KiB the pieces count as lines (`ncs_gym.reading`).
+
+    Raises:
+        OSError: If a file cannot be read, or is none.
+    """
     for path in sorted(folder.glob(f"{name}-[0-9][0-9][0-9]*.csv")):
-        with open(path, newline="") as file:
-            for row in csv.DictReader(file):
+        with open_file(path) as file:
+            lines = (line.decode("utf-8", "replace") for line in iter(partial(file.readline, LARGEST_LINE), b""))
+            for row in csv.DictReader(lines):
                 if None not in row.values() and None not in row:
                     yield row

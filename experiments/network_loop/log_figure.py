@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 
 import matplotlib
@@ -18,8 +19,8 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
     Raises:
         ValueError: If there are no rows, or they are of another plant.
     """
-    logs = {name: pd.DataFrame(rows_of(folder, name)) for name in ("plant", "controller")}
-    logs = {name: log.tail(steps) for name, log in logs.items() if len(log)}
+    logs = {name: pd.DataFrame(deque(rows_of(folder, name), steps)) for name in ("plant", "controller")}
+    logs = {name: log for name, log in logs.items() if len(log)}
     if not logs:
         raise ValueError(f"no logs of ncs loop in {folder}: plant-000.csv or controller-000.csv")
     columns = {"plant": "x_", "controller": "x_hat_"}

@@ -22,6 +22,7 @@ from experiments.json_values import flat
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
 from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
+from ncs_gym.reading import json_values, read_file
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
@@ -164,7 +165,7 @@ def _require_own_settings(path: Path) -> None:
     if not path.exists():
         return
     try:
-        is_own = json.loads(path.read_bytes())["format"] == SETTINGS_FORMAT
+        is_own = json_values(read_file(path))["format"] == SETTINGS_FORMAT
     except (ValueError, KeyError, TypeError, RecursionError):
         is_own = False
     if not is_own:
@@ -175,7 +176,7 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
     """Raises OtherResultsError if the results in a folder are not those of a command with these settings."""
     advice = "give another --out, or --force to replace them"
     try:
-        document = json.loads((folder / "settings.json").read_bytes())
+        document = json_values(read_file(folder / "settings.json"))
         kept_command, kept = document["command"], document["settings"]
         if not isinstance(kept, dict):
             raise TypeError("settings")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from itertools import pairwise
@@ -14,6 +13,7 @@ from experiments.errors import ResultsError
 from experiments.json_values import from_json
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import CHECKPOINT, Start, TrainingRun
+from ncs_gym.reading import LARGEST_MODEL, json_values, read_file
 from shields.atomic_write import write_atomically
 
 # Folder of the agent that the training in an output folder went on from.
@@ -67,10 +67,10 @@ def _read(folder: Path) -> Start | None:
     if not path.exists():
         return None
     try:
-        history = from_json(json.loads(path.read_bytes()), list[TrainingPoint], null=float("nan"))
+        history = from_json(json_values(read_file(path)), list[TrainingPoint], null=float("nan"))
         if not history or not all(a.steps < b.steps for a, b in pairwise([TrainingPoint(0, 0.0, 0, 0), *history])):
             raise ValueError("its steps do not grow")
-        return Start({name: (folder / name).read_bytes() for name in AGENT_FILES}, history)
+        return Start({name: read_file(folder / name, LARGEST_MODEL) for name in AGENT_FILES}, history)
     except (OSError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ResultsError(f"no training can go on from {folder} ({reason}): remove it, or give --force") from error

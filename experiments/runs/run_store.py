@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from agents.agent_file import require_names, write_files
 from experiments.errors import ResultsError
 from experiments.json_values import from_json, to_json
+from ncs_gym.reading import LARGEST_MODEL, read_file
 from ncs_gym.validation import MAX_QUOTED_LENGTH
 from shields.atomic_write import write_atomically
 from shields.json_documents import document_of, read_content
@@ -145,7 +146,7 @@ class RunStore:
         files = {}
         for name, checksum in digests.items():
             path = self._folder / "models" / run.name / name
-            files[name] = path.read_bytes() if path.is_file() else b""
+            files[name] = read_file(path, LARGEST_MODEL) if path.is_file() else b""
             if hashlib.sha256(files[name]).hexdigest() != checksum:
                 raise ValueError(f"files: {name} is missing or was altered")
         return files

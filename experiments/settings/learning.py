@@ -49,7 +49,7 @@ class BackendSettings:
     gpus_per_run: float = 0.0
 
     def __post_init__(self) -> None:
-        require_limits(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
+        require_limits(self, jobs=(1, MOST_JOBS), ray_wait=0, cpus_per_run=0.0001)
         if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         whole = self.gpus_per_run <= 1.0 or self.gpus_per_run.is_integer()
@@ -61,6 +61,8 @@ class BackendSettings:
                     raise ValueError(f"--{field.name.replace('_', '-')} is a setting of --engine ray")
 
 
+# Whatever a file of settings says, there are no more worker processes, runs per arm and episodes per run.
+MOST_JOBS, MOST_SEEDS, MOST_EPISODES = 1024, 10_000, 1_000_000
 # Training steps where none belong to tuned hyperparameters.
 _DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
@@ -174,7 +176,8 @@ class LearningSettings(BackendSettings):
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
-        require_limits(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
+        counts = {"seeds": (1, MOST_SEEDS), "steps": 1, "episodes": (1, MOST_EPISODES), "seed": 0}
+        require_limits(self, **counts, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
         require_horizon(self, self.mode, *arms)
 
@@ -277,7 +280,7 @@ class EvaluateSettings:
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_limits(self, episodes=1, seed=0)
+        require_limits(self, episodes=(1, MOST_EPISODES), seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
             require_horizon(self, self.shield)
 
@@ -393,7 +396,8 @@ class StudySettings(BackendSettings):
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
-        require_limits(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
+        counts = {"seeds": (1, MOST_SEEDS), "episodes": (1, MOST_EPISODES), "channel_episodes": (0, MOST_EPISODES)}
+        require_limits(self, **counts, seed=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
         if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):

@@ -11,6 +11,7 @@ from typing import Any
 from experiments.errors import SettingsError
 from experiments.json_values import from_json
 from experiments.settings.arguments import id_alone
+from ncs_gym.reading import json_values, read_file
 from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
@@ -45,8 +46,8 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
     """Returns the settings in the file given by `--config`, or None, and the other arguments.
 
     Raises:
-        SettingsError: If the flag is given more than once or without a file, or the file is missing, damaged or another
-            command's, or holds a wrong value.
+        SettingsError: If the flag is given more than once or without a file, or the file is missing, damaged, larger
+            than documents may be (`ncs_gym.reading`) or another command's, or holds a wrong value.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", action="append", nargs="?", const="", default=[])
@@ -63,7 +64,7 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
 
 def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
     try:
-        document = json.loads(path.read_bytes())
+        document = json_values(read_file(path))
     except OSError as error:
         raise SettingsError(f"cannot read settings {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

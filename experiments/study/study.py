@@ -36,6 +36,7 @@ from experiments.study.tables import (
     tables_by_name,
     training_table,
 )
+from ncs_gym.reading import json_values, read_file, read_text
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`: enough to pass through every part, in the first environment, with baselines of one margin each.
@@ -49,13 +50,13 @@ def study(settings: StudySettings) -> None:
     baselines = tuple(name for name in settings.baselines if ":" not in name)
     settings = short_version(settings, **_SMOKE, envs=settings.envs[:1], baselines=baselines)
     for path in settings.quote:
-        require_marks(path.read_text("utf-8"))
+        require_marks(read_text(path))
     with claim_folder("study", settings):
         parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
         comparisons, channels = {}, {}
         for name, part in parts.items():
             compare(part)
-            comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
+            comparisons[name] = json_values(read_file(part.out / "summary.json"))
             if settings.channel_episodes:
                 sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
                 channels[name] = channel_switches(sweep, trained_agents(part))
@@ -93,7 +94,7 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
     }
     write_results(settings.out, summary, files, figures)
     for path in settings.quote:
-        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(summary)))
+        write_atomically(path, quoted(read_text(path), tables_by_name(summary)))
 
 
 # A mark names a table; what stands between it and the end is replaced.

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ncs_gym.reading import MOST_PACKETS
 from ncs_gym.validation import as_count, as_flag, as_number, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
@@ -189,7 +190,8 @@ class TraceChannel(Channel):
         trace: After how many steps each packet arrived, one after the other; -1 for a lost one.
 
     Raises:
-        ValueError: If the trace is empty or has other entries, or a loss or delay is given that is not the trace's.
+        ValueError: If the trace is empty, has other entries or more than two million of them, or a loss or delay is
+            given that is not the trace's.
     """
 
     trace: tuple[int, ...] = ()
@@ -199,6 +201,8 @@ class TraceChannel(Channel):
             raise ValueError(
                 f"trace must be the delays of recorded packets, -1 for a lost one, got {shown(self.trace)}"
             )
+        if len(self.trace) > MOST_PACKETS:
+            raise ValueError(f"a trace has at most {MOST_PACKETS:,} packets, got {len(self.trace):,}")
         trace = tuple(as_count(each, "a delay of the trace", low=-1, high=LONGEST_DELAY) for each in self.trace)
         arrived = [each for each in trace if each >= 0] or [0]
         own = {

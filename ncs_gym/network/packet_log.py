@@ -6,14 +6,14 @@ import csv
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Self
 
 import numpy as np
 
 from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel
+from ncs_gym.reading import LARGEST_LOG, MOST_PACKETS, MOST_STEPS, read_text
 from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, shown
 
 # A line of ping: the stamp that -D prints, the number of the packet, and the time until its answer.
@@ -31,7 +31,8 @@ class PacketLog(ReadOnlyArrays):
         delays: How long each was on its way, shape (k,); NaN for a lost one [s].
 
     Raises:
-        ValueError: If there are fewer than two packets, they are not in order, or one arrived before it was sent.
+        ValueError: If there are fewer than two packets or more than two million, they are not in order, or one arrived
+            before it was sent.
     """
 
     sent: np.ndarray
@@ -41,6 +42,7 @@ class PacketLog(ReadOnlyArrays):
         sent, delays = as_setting(self.sent), as_setting(self.delays)
         if sent is None or delays is None or sent.ndim != 1 or sent.shape != delays.shape or len(sent) < 2:
             raise ValueError("a log needs at least two packets, each with the time at which it was sent")
+        _require_moderate(len(sent))
         if not np.isfinite(sent).all() or (np.diff(sent) <= 0.0).any():
             raise ValueError("packets must be sent one after the other, at finite times")
         if (delays < 0.0).any() or np.isinf(delays).any():
@@ -67,10 +69,11 @@ class PacketLog(ReadOnlyArrays):
             step: Duration of the steps of `ncs loop` [s].
 
         Raises:
-            ValueError: If the file cannot be read or holds neither.
+            ValueError: If the file cannot be read or holds neither, has more than 128 MiB, or more than two million
+                packets with those that were lost (`ncs_gym.reading`).
         """
         try:
-            lines = Path(path).read_text(encoding="utf-8").splitlines()
+            lines = read_text(path, LARGEST_LOG).splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"cannot read packets from {shown(path)}: {error}") from error
         if any("icmp_seq=" in line for line in lines):
@@ -97,7 +100,7 @@ class PacketLog(ReadOnlyArrays):
     ) -> Self:
         """Returns the packets of a log of `ncs loop`: the steps at which those that arrived were sent and received."""
         arrivals: dict[str, dict[int, int]] = {}
-        for number, row in enumerate(csv.reader(lines), 2):
+        for number, row in _rows(lines, 2, path):
             try:
                 sent, received = (int(row[column]) for column in columns)
                 arrived = arrivals.setdefault(row[episode], {})
@@ -106,6 +109,7 @@ class PacketLog(ReadOnlyArrays):
                     f"line {number} of {shown(path)} is not an episode, a step sent and one received"
                 ) from None
             arrived[sent] = min(received, arrived.get(sent, received))  # a second one is a duplicate
+        _require_moderate(sum(max(*arrived, 0) for arrived in arrivals.values()))
         delays = [
             arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)
         ]
@@ -114,7 +118,7 @@ class PacketLog(ReadOnlyArrays):
     @classmethod
     def _of_csv(cls, lines: Iterable[str], columns: list[int], path: str | os.PathLike[str]) -> Self:
         packets = []
-        for number, row in enumerate(csv.reader(lines), 1):
+        for number, row in _rows(lines, 1, path):
             cells = [cell.strip() for cell in row]
             if not any(cells):
                 continue
@@ -150,6 +154,7 @@ class PacketLog(ReadOnlyArrays):
                 answers.setdefault(number, np.nan)
         if not answers:
             raise ValueError("no packet of ping has a number")
+        _require_moderate(max(answers) - min(answers) + 1)
         numbers = np.arange(min(answers), max(answers) + 1)
         delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
         if len(stamps) > 1:
@@ -178,8 +183,15 @@ class PacketLog(ReadOnlyArrays):
         return tuple(np.where(usable, steps, -1.0).astype(int).tolist())
 
     def send_period(self, dt: float) -> int:
-        """Returns the number of control steps between packets, at least one."""
-        return max(round(self.period / as_number(dt, "dt", low=0.0, low_open=True)), 1)
+        """Returns the number of control steps between packets, at least one.
+
+        Raises:
+            ValueError: If there are more than ten million.
+        """
+        steps = self.period / as_number(dt, "dt", low=0.0, low_open=True)
+        if not steps <= MOST_STEPS:
+            raise ValueError(f"packets are {steps:,.3g} control steps of {dt:g} s apart, more than {MOST_STEPS:,}")
+        return max(round(steps), 1)
 
     def channel(self, dt: float, *, quantization_step: float = 0.0) -> TraceChannel:
         """Returns the channel that replays the log in control steps of duration dt [s]."""
@@ -189,12 +201,31 @@ class PacketLog(ReadOnlyArrays):
         """Returns the age of the newest sample at every step, shape (steps,), from the first arrival on [steps].
 
         Sample i is taken at step i times `send_period`.
+
+        Raises:
+            ValueError: If these are more than ten million steps.
         """
-        trace, period = np.array(self.trace(dt)), self.send_period(dt)
-        steps = len(trace) * period
+        period = self.send_period(dt)
+        steps = len(self.sent) * period
+        if steps > MOST_STEPS:
+            raise ValueError(f"the record spans {steps:,} control steps of {dt:g} s, more than {MOST_STEPS:,}")
+        trace = np.array(self.trace(dt))
         newest = np.full(steps, -1)
         for i in np.flatnonzero(trace >= 0).tolist():
             if (arrival := i * period + trace[i]) < steps:
                 newest[arrival] = max(newest[arrival], i * period)
         newest = np.maximum.accumulate(newest)
         return (np.arange(steps) - newest)[newest >= 0]
+
+
+def _require_moderate(packets: int) -> None:
+    if packets > MOST_PACKETS:
+        raise ValueError(f"a log has at most {MOST_PACKETS:,} packets, with those that were lost; this one {packets:,}")
+
+
+def _rows(lines: Iterable[str], first: int, path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
+    """Yields the rows of a CSV file with their numbers; raises ValueError for what is no such file."""
+    try:
+        yield from enumerate(csv.reader(lines), first)
+    except csv.Error as error:
+        raise ValueError(f"{shown(path)} is no CSV file: {error}") from error

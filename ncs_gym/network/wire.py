@@ -4,7 +4,7 @@ Every datagram is a header, a body whose length its kind fixes, and a tag, all n
 
     offset  size  field
          0     4  magic, the letters NCSW
-         4     1  version, 2
+         4     1  version, 3
          5     1  kind: 1 sample, 2 command, 3 echo, 4 beacon
          6     2  zero
          8     8  the first 8 bytes of the plant's fingerprint
@@ -31,12 +31,13 @@ import numpy as np
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import as_count, shown
 
-MAGIC, VERSION = b"NCSW", 2
+MAGIC, VERSION = b"NCSW", 3
 # Where one datagram has to fit into one frame of a usual network.
 LARGEST_BODY, SHORTEST_KEY, TAG_SIZE = 1400, 16, 16
 LARGEST_STAMP = 2**62
 _HEADER = struct.Struct("<4sBBH8sQQQ")
 _ECHO = struct.Struct("<Q16s")
+LARGEST_DATAGRAM = _HEADER.size + LARGEST_BODY + TAG_SIZE
 
 
 class WireError(ValueError):
@@ -89,6 +90,17 @@ class Message:
     requests: tuple[bool, ...] = ()
 
 
+def require_key(key: bytes) -> bytes:
+    """Returns a key.
+
+    Raises:
+        ValueError: If it is too short.
+    """
+    if not isinstance(key, bytes) or len(key) < SHORTEST_KEY:
+        raise ValueError(f"the key must be at least {SHORTEST_KEY} bytes, as os.urandom(32) makes them")
+    return key
+
+
 class Wire:
     """Encodes and decodes the messages of one control loop.
 
@@ -97,19 +109,20 @@ class Wire:
         input_delay: c, the number of steps from a decision to its effect.
         key: What sensor, controller and actuator share and nobody else knows, at least 16 bytes.
 
+    Attributes:
+        input_delay: c.
+
     Raises:
         ValueError: If the key is too short, or a command does not fit into one datagram.
     """
 
     def __init__(self, plant: LinearPlant, input_delay: int, key: bytes) -> None:
-        if not isinstance(key, bytes) or len(key) < SHORTEST_KEY:
-            raise ValueError(f"the key must be at least {SHORTEST_KEY} bytes, as os.urandom(32) makes them")
-        self._key, self._fingerprint = key, bytes.fromhex(plant.fingerprint)[:8]
-        shapes = {Kind.SAMPLE: (plant.p,), Kind.COMMAND: (as_count(input_delay, "input_delay", low=0) + 1, plant.m)}
+        self._key, self._fingerprint = require_key(key), bytes.fromhex(plant.fingerprint)[:8]
+        self.input_delay = as_count(input_delay, "input_delay", low=0)
+        shapes = {Kind.SAMPLE: (plant.p,), Kind.COMMAND: (self.input_delay + 1, plant.m)}
         self._shapes = shapes | {Kind.ECHO: (0,), Kind.BEACON: (0,)}
-        self._ahead = self._shapes[Kind.COMMAND][0]
         sizes = {kind: 8 * int(np.prod(shape)) for kind, shape in self._shapes.items()}
-        sizes |= {Kind.ECHO: _ECHO.size, Kind.BEACON: self._ahead}
+        sizes |= {Kind.ECHO: _ECHO.size, Kind.BEACON: self.input_delay + 1}
         if max(sizes.values()) > LARGEST_BODY:
             raise ValueError(f"samples and commands of this plant take more than {LARGEST_BODY} bytes: {shapes}")
         self._lengths = {kind: _HEADER.size + size + TAG_SIZE for kind, size in sizes.items()}
@@ -125,8 +138,8 @@ class Wire:
         if kind is Kind.ECHO:
             body = _ECHO.pack(message.missing, message.digest)
         elif kind is Kind.BEACON:
-            if len(message.requests) != self._ahead:
-                raise ValueError(f"a beacon has {self._ahead} requests, got {shown(message.requests)}")
+            if len(message.requests) != self.input_delay + 1:
+                raise ValueError(f"a beacon has {self.input_delay + 1} requests, got {shown(message.requests)}")
             body = bytes(message.requests)
         else:
             values = np.asarray(message.values, dtype="<f8")

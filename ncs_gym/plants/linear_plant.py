@@ -22,6 +22,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.plants import between_samples, limits, statespace
+from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
@@ -464,7 +465,7 @@ class LinearPlant(ReadOnlyArrays):
         if not isinstance(given, Mapping):
             name = shown(given)
             try:
-                document = json.loads(Path(given).read_text(encoding="utf-8"))
+                document = json_values(read_text(given))
             except (OSError, TypeError, ValueError, RecursionError) as error:
                 reason = getattr(error, "strerror", None) or "it is not valid JSON"
                 raise ValueError(f"cannot read the plant in {name}: {reason}") from error

@@ -17,20 +17,26 @@ import numpy as np
 
 from ncs_gym import Actuator, Command, Echo, Packet
 from ncs_gym.network.wire import Kind, Message, Wire, WireError
-from shields.nodes.step_clock import StepClock
+from shields.nodes.step_clock import SETTLED, StepClock
 from shields.nodes.transport import Datagram, Transport
 from shields.runtime.decisions import Decision
 from shields.runtime.safe_loop import SafeLoop
 
-# Steps without a message of its episode after which a node may be taken over by another one.
+# Steps beyond its longest delay for which a message shows that its sender is there.
 PATIENCE = 10
 # Steps by which samples and echoes may be early; beyond it their stamps are not plausible.
 EARLIEST = 16
 # Steps that a controller makes up for at once after it was held up; more of them end the episode.
 MOST_SKIPPED = 1000
 NO_EPISODE = 0
-# Steps for which all nodes hear of an episode before it starts: stamps in datagrams are counted from their beginning.
-PRELUDE = 40
+# Steps that an answer of a sensor or an actuator may take, beside the c + 1 of the message that it answers.
+LONGEST_ANSWER = 20
+# Steps for which all nodes hear of an episode before it starts, and 2 c more: `_prelude`.
+PRELUDE = PATIENCE + 2 + SETTLED + LONGEST_ANSWER
+# Greetings that are answered at a step, the newest of different ones.
+MOST_GREETINGS = 32
+# The newest step of a peer of which nothing was heard.
+NEVER = -(2**62)
 # What begins within this part of a step begins now.
 EARLY = 0.1
 
@@ -40,8 +46,8 @@ class _PlantNode:
 
     A node that belongs to no episode says so at every step, with a challenge that it draws when it is made and whenever
     it joins or leaves. It joins the episode of the message that answers this challenge, so that what was recorded in
-    earlier episodes moves nothing. It leaves an episode when it has heard nothing of it for `PATIENCE` steps, or when
-    the clock of the controller jumps.
+    earlier episodes moves nothing. It leaves an episode when it has heard nothing that was sent in the last
+    c + `PATIENCE` steps of its clock, whatever is repeated, or when the clock of the controller jumps.
 
     Attributes:
         episode: Number of the episode, drawn by the controller; 0 for none.
@@ -52,7 +58,8 @@ class _PlantNode:
 
     def __init__(self, wire: Wire, transport: Transport, clock: StepClock) -> None:
         self.wire, self.transport, self.clock = wire, transport, clock
-        self.episode, self._challenge, self._heard_at = NO_EPISODE, _drawn(), 0.0
+        self.episode, self._challenge, self._newest = NO_EPISODE, _drawn(), NEVER
+        self._prelude, self._patience = _prelude(wire.input_delay), PATIENCE + wire.input_delay
         self.refused: Counter[str] = Counter()
 
     def listen(self, now: float) -> None:
@@ -66,28 +73,30 @@ class _PlantNode:
                     self.refused["episode"] += 1
                     continue
                 self._join(message, time)
-            self._heard_at = time
-            if self.clock.follow(message.stamp - PRELUDE, time):
+            step = message.stamp - self._prelude
+            self._newest = max(self._newest, step)
+            if self.clock.follow(step, time):
                 self._use(message)
             else:
                 self._leave()
-        is_silent = now - self._heard_at > PATIENCE * self.clock.dt
+        is_silent = self.clock.step_at(now) - self._newest > self._patience
         if self.episode != NO_EPISODE and (is_silent or self.clock.episode != self.episode):
             self._leave()
 
     def _join(self, message: Message, time: float) -> None:
-        self.episode, self._challenge = message.episode, _drawn()
-        self.clock.join(message.episode, time, message.stamp - PRELUDE)
+        self.episode, self._challenge, self._newest = message.episode, _drawn(), NEVER
+        self.clock.join(message.episode, time, message.stamp - self._prelude)
 
     def _leave(self) -> None:
         """Belongs to no episode any more; what was recorded answers an earlier challenge."""
         self.episode, self._challenge = NO_EPISODE, _drawn()
+        self.clock.give_up()
 
     def _use(self, message: Message) -> None:
         """Uses a message of the episode."""
 
     def _send(self, kind: Kind, step: int, **fields: Any) -> None:
-        stamp = step + PRELUDE if self.episode != NO_EPISODE else 0
+        stamp = step + self._prelude if self.episode != NO_EPISODE else 0
         common = {"kind": kind, "episode": self.episode, "stamp": stamp, "challenge": self._challenge}
         self.transport.send(self.wire.encode(Message(**common, **fields)))
 
@@ -123,7 +132,7 @@ class SensorNode(_PlantNode):
         self._requests = {}
 
     def _use(self, message: Message) -> None:
-        for ahead, requested in enumerate(message.requests, message.stamp - PRELUDE + 1):
+        for ahead, requested in enumerate(message.requests, message.stamp - self._prelude + 1):
             self._requests.setdefault(ahead, requested)
 
 
@@ -160,24 +169,49 @@ class ActuatorNode(_PlantNode):
 
     def _use(self, message: Message) -> None:
         if message.kind is Kind.COMMAND and message.values is not None:
-            self.actuator.receive([Command(message.stamp - PRELUDE, message.values)])
+            self.actuator.receive([Command(message.stamp - self._prelude, message.values)])
 
 
 class _Peer:
-    """What a controller knows of a sensor or an actuator."""
+    """What a controller knows of a sensor or an actuator: what carries the number of the episode, and who greets.
+
+    A greeting proves nothing, because it may be a recording. It is answered, beside what goes to the peer, until
+    somebody answers with the number of the episode.
+    """
 
     def __init__(self) -> None:
-        self.address: Any = None
-        self.challenge, self.newest, self.heard_at = 0, -1, 0.0
+        self.newest = NEVER
+        self._address: Any = None
+        self._challenge = 0
+        self._greetings: dict[int, Any] = {}
+
+    def greet(self, challenge: int, address: Any) -> None:
+        """Takes in a greeting."""
+        self._greetings.pop(challenge, None)
+        self._greetings[challenge] = address
+        if len(self._greetings) > MOST_GREETINGS:
+            del self._greetings[next(iter(self._greetings))]
+
+    def hear(self, step: int, challenge: int, address: Any) -> None:
+        """Takes in a message of the episode."""
+        if step > self.newest:
+            self.newest, self._challenge, self._address, self._greetings = step, challenge, address, {}
+
+    @property
+    def addressees(self) -> dict[int, Any]:
+        """Addresses to which messages go, by challenge."""
+        return self._greetings if self.newest == NEVER else {self._challenge: self._address} | self._greetings
 
 
 class ControllerNode:
     """Runs a `SafeLoop` behind a downlink at every step, and numbers the steps of all.
 
-    It waits until sensor and actuator are there and belong to no episode, draws a number, tells it to both for
-    `PRELUDE` steps, and then starts the loop at step 0. A sensor or an actuator that is restarted joins the episode
-    again: samples that are missing meanwhile are lost, inputs that are missing end the guarantee, because echoes tell.
-    A controller that is restarted begins another episode. Where samples are on request, beacons say which.
+    It waits until sensor and actuator greet, draws the number of an episode, tells it to both for `PRELUDE` + 2 c
+    steps, and then starts the loop at step 0, if messages of both carry the number, the newest at most `PATIENCE` steps
+    beyond its delay old. Otherwise it waits again: greetings are recordings, or somebody has left. That is decided
+    while there is time for the others to leave before step 0. A sensor or an actuator that is restarted joins the
+    episode again: samples that are missing meanwhile are lost, inputs that are missing end the guarantee, because
+    echoes tell. A controller that is restarted begins another episode. Where samples are on request, beacons say which.
 
     Args:
         loop: With a downlink, and with `echo_age`.
@@ -185,7 +219,8 @@ class ControllerNode:
         transport: Where sensor and actuator are heard.
         clock: Its clock, which the others follow.
         x_hat0: First estimate, shape (n,).
-        known: Whether its error is known to lie in `plant.initial_error`; after a restart it is not (`SafeLoop.start`).
+        known: Whether its error is known to lie in `plant.initial_error` at step 0; after a restart it is not
+            (`SafeLoop.start`).
 
     Attributes:
         episode: Number drawn for this episode; 0 while it waits.
@@ -196,7 +231,7 @@ class ControllerNode:
         decision: The last one.
 
     Raises:
-        ValueError: If the loop has no downlink or no echoes.
+        ValueError: If the loop has no downlink or no echoes, or samples may be too late for the prelude.
     """
 
     def __init__(
@@ -204,22 +239,30 @@ class ControllerNode:
     ) -> None:
         if loop.input_delay == 0 or loop.echo_age is None:
             raise ValueError("commands that go over a network need SafeLoop(..., downlink=Channel(...), echo_age=...)")
+        if loop.channel.longest_delay > LONGEST_ANSWER:
+            raise ValueError(
+                f"samples may be {loop.channel.longest_delay} steps late, and nodes hear of each other within "
+                f"{LONGEST_ANSWER}: sample less often"
+            )
         self.loop, self.wire, self.transport, self.clock = loop, wire, transport, clock
         self.refused: Counter[str] = Counter()
         self.decision: Decision
         # A sensor that is not asked may be silent for as long as the contract lets it.
         contract = loop.contract if loop.channel.on_request else None
-        self._patience = (PATIENCE + (0 if contract is None else contract.max_age)) * clock.dt
+        self._patience = PATIENCE + loop.channel.longest_delay + (0 if contract is None else contract.max_age)
+        self._prelude = _prelude(wire.input_delay)
+        # Who was told nothing from this step on leaves before step 0.
+        self._joined_by = -(wire.input_delay + PATIENCE + 2)
         self.begin(x_hat0, known=known)
 
     def begin(self, x_hat0: Any, *, known: bool) -> None:
-        """Ends the episode; the next one begins when the others have noticed, after `PATIENCE` steps of silence."""
+        """Ends the episode; the next one begins when the others have noticed, after c + `PATIENCE` steps of silence."""
         self.episode, self._first = NO_EPISODE, (x_hat0, known)
         self._peers = {Kind.SAMPLE: _Peer(), Kind.ECHO: _Peer()}
         self._waiting: list[Packet | Echo] = []
         self.arrived: list[int] = []
         self.skipped, self.missing, self._is_started = 0, 0, False
-        self.step = -PRELUDE
+        self.step = -self._prelude
 
     def receive(self, now: float) -> np.ndarray | None:
         """Returns the estimate at the step that begins now, shape (n,), or None while it waits for the others.
@@ -231,18 +274,22 @@ class ControllerNode:
             if message is not None:
                 self._hear(message, datagram)
         if self.episode == NO_EPISODE:
-            if not all(peer.challenge for peer in self._peers.values()):
+            if not all(peer.addressees for peer in self._peers.values()):
                 return None
             self.episode = _drawn()
-            self.clock.start(now, -PRELUDE)
+            self.clock.start(now, -self._prelude)
         step = self.clock.step_at(now + EARLY * self.clock.dt)
+        x_hat0, known = self._first
+        is_beginning = not self._is_started and step >= self._joined_by
+        if is_beginning and any(self._is_silent(peer, step) for peer in self._peers.values()):
+            self.begin(x_hat0, known=known and self.step <= self._joined_by)
+            return None
         if step < 0:
             for heard in self._peers:  # the first c samples are requested by agreement
                 self._answer(heard, Kind.BEACON, step, requests=(True,) * (self.loop.input_delay + 1))
             self.step = step + 1
             return None
-        if self.step <= 0 and not self._is_started:
-            x_hat0, known = self._first
+        if not self._is_started:
             self.loop.start(x_hat0, known=known)
             self.step, self._is_started = 0, True
         late = step - self.step
@@ -274,29 +321,28 @@ class ControllerNode:
         return self.decision
 
     def _answer(self, heard: Kind, kind: Kind, step: int, **fields: Any) -> None:
-        peer = self._peers[heard]
-        common = {"kind": kind, "episode": self.episode, "stamp": step + PRELUDE, "challenge": peer.challenge}
-        self.transport.send(self.wire.encode(Message(**common, **fields)), peer.address)
+        common = {"kind": kind, "episode": self.episode, "stamp": step + self._prelude}
+        for challenge, address in self._peers[heard].addressees.items():
+            self.transport.send(self.wire.encode(Message(**common, challenge=challenge, **fields)), address)
+
+    def _is_silent(self, peer: _Peer, step: int) -> bool:
+        return step - peer.newest > self._patience
 
     def _hear(self, message: Message, datagram: Datagram) -> None:
         """Takes in a message, and where its sender is."""
-        peer, time = self._peers[message.kind], datagram.time
-        if message.episode == NO_EPISODE:  # a node that waits, or was restarted
-            if self.episode == NO_EPISODE or time - peer.heard_at > self._patience:
-                peer.address, peer.challenge = datagram.sender, message.challenge
+        peer = self._peers[message.kind]
+        if message.episode == NO_EPISODE:  # a node that waits or was restarted, or a recording
+            if self._is_silent(peer, self.step):
+                peer.greet(message.challenge, datagram.sender)
             return
         if message.episode != self.episode:
             self.refused["episode"] += 1
-            if self.episode == NO_EPISODE:
-                peer.challenge = 0  # it still belongs to another one
             return
-        step = message.stamp - PRELUDE
+        step = message.stamp - self._prelude
         if step > self.step + EARLIEST:
             self.refused["ahead"] += 1
             return
-        if message.stamp > peer.newest:
-            peer.address, peer.challenge, peer.newest = datagram.sender, message.challenge, message.stamp
-            peer.heard_at = time
+        peer.hear(step, message.challenge, datagram.sender)
         if step < 0:
             return
         if message.kind is Kind.SAMPLE:
@@ -392,6 +438,11 @@ def _decoded(wire: Wire, data: bytes, kinds: Sequence[Kind], refused: Counter[st
 
 def _stamp(early: Packet | Echo) -> int:
     return early.stamp if isinstance(early, Packet) else early.steps
+
+
+def _prelude(input_delay: int) -> int:
+    """Returns for how many steps all hear of an episode before it starts; stamps are counted from their beginning."""
+    return PRELUDE + 2 * input_delay
 
 
 def _drawn() -> int:

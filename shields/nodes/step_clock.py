@@ -49,6 +49,11 @@ class StepClock:
         self.origin, self._first, self.drift = now - step * self.dt, None, 0.0
         self._origins.clear()
 
+    def give_up(self) -> None:
+        """Leaves an episode of which too little was heard to go by it."""
+        if not self.is_settled:
+            self.episode = 0
+
     def step_at(self, now: float) -> int:
         """Returns the number of the step that is under way."""
         return int((now - self.origin) // self.dt)

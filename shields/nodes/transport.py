@@ -6,6 +6,8 @@ import asyncio
 from collections import deque
 from typing import Any, NamedTuple, Protocol
 
+from ncs_gym.network.wire import LARGEST_DATAGRAM
+
 # More than a node can have missed; beyond it the oldest are dropped, so that a flood takes no memory.
 MOST_WAITING = 512
 
@@ -72,8 +74,9 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._socket = transport
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Is called by asyncio."""
-        self._waiting.append(Datagram(asyncio.get_running_loop().time(), data, addr))
+        """Is called by asyncio; of a datagram that is too long for the loop one byte too many is kept."""
+        time = asyncio.get_running_loop().time()
+        self._waiting.append(Datagram(time, data[: LARGEST_DATAGRAM + 1], addr))
 
     def error_received(self, exc: Exception) -> None:
         """Is called by asyncio: nobody listens at the other end, so that what was sent is lost."""

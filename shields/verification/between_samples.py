@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from fractions import Fraction
+from math import ceil
 
 import numpy as np
 
@@ -18,12 +19,13 @@ from shields.verification.rational_matrix import (
     multiply,
     quadratic,
     rational,
-    scale,
     weighted_size,
 )
 
-# A series ends where what is left of it is below this, next to what a row reaches; one that is longer is not summed.
-_SMALLEST_TAIL, _MOST_TERMS = Fraction(1, 2**100), 1000
+# A series ends where what is left of it is below 2^-100, next to what a row reaches; one that is longer is not summed.
+_LEFT_BITS, _SMALLEST_LEFT, _MOST_TERMS = 200, 2**100, 1000
+# What rounding makes of a term is below this power of 1/2, next to what a row reaches.
+_BITS = 140
 
 
 def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -103,7 +105,8 @@ def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fractio
     h, error, bend, square = dt / points, Fraction(0), Fraction(0), multiply(G, G)
     norm = max(weighted_size(line, sizes) / sizes[i] for i, line in enumerate(G))
     drift = max(weighted_size(line, sizes) / sizes[i] + line[i] - abs(line[i]) for i, line in enumerate(G))
-    growth = _moved([Fraction(1)], [[max(drift, Fraction(0))]], [Fraction(1)], h, max(drift, Fraction(0)))
+    rising = max(Fraction(ceil(drift * 2**64), 2**64), Fraction(0))
+    growth = _moved([Fraction(1)], [[rising]], [Fraction(1)], h, rising)
     if growth is None:
         return None
     for i, given in enumerate(grid):
@@ -120,17 +123,43 @@ def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fractio
 def _moved(
     row: list[Fraction], G: Matrix, sizes: list[Fraction], time: Fraction, norm: Fraction
 ) -> tuple[list[Fraction], Fraction] | None:
-    """Returns row exp(G t) by its series, and a bound of what is left of that; None if it is too long.
+    """Returns row exp(G t) by its series, and a bound of what it is off by; None if the series is too long.
 
-    After the term of power p that is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)), with norm = |G|.
+    After the term of power p, left is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)), with norm = |G|.
+    Entry j of a term is a whole number of 2^-b / 2^(e_j), e_j least with W_j <= 2^(e_j), so that numbers stay short:
+    rounding adds at most N 2^-b to each of p + 1 terms, and grows in later ones by at most exp(t |G|).
+
+    Args:
+        row: The row, shape (N,).
+        G: The generator; its numbers are floats or others whose denominators are powers of two.
+        sizes: W, shape (N,), by which |row| = sum |row_j| W_j.
+        time: t.
+        norm: |G|.
     """
-    term, total, step = row, row, scale(time, G)
-    left = size = weighted_size(row, sizes)
+    reach, size = time * norm, weighted_size(row, sizes)
+    if 2 * reach > _MOST_TERMS or size == 0:
+        return None if size else (row, size)
+    growth = 2 * ceil(reach)  # exp(reach) <= 2^growth
+    scales = [size_j.numerator.bit_length() - size_j.denominator.bit_length() + 1 for size_j in sizes]
+    b = (
+        _BITS + growth + size.denominator.bit_length() - size.numerator.bit_length() + 1
+    )  # 2^-b <= |row| 2^-_BITS / 2^growth
+    scaled = [
+        [entry * Fraction(2) ** (e - scales[i]) for entry, e in zip(line, scales, strict=True)]
+        for i, line in enumerate(G)
+    ]
+    shift = max(entry.denominator.bit_length() - 1 for line in scaled for entry in line)
+    columns = [*zip(*([int(entry * 2**shift) for entry in line] for line in scaled), strict=True)]
+    term = [int(entry * Fraction(2) ** (e + b)) for entry, e in zip(row, scales, strict=True)]
+    total, left = term, 2**_LEFT_BITS
+    up, over = ceil(reach * 2**_LEFT_BITS), time.denominator << shift
     for power in range(1, _MOST_TERMS):
-        left *= time * norm / power
-        term = [entry / power for entry in multiply([term], step)[0]]
-        total = [a + b for a, b in zip(total, term, strict=True)]
-        ratio = time * norm / (power + 2)
-        if 2 * ratio <= 1 and left <= _SMALLEST_TAIL * size:
-            return total, left * 2 * time * norm / (power + 1)
+        left = -(-left * up // (power << _LEFT_BITS))
+        pushed = [sum(a * g for a, g in zip(term, column, strict=True)) for column in columns]
+        term = [each * time.numerator // (over * power) for each in pushed]
+        total = [a + c for a, c in zip(total, term, strict=True)]
+        if 2 * reach <= power + 2 and left <= _SMALLEST_LEFT:
+            exact = [Fraction(entry) / Fraction(2) ** (e + b) for entry, e in zip(total, scales, strict=True)]
+            rounded = Fraction((power + 1) * len(row), 2**_BITS)
+            return exact, size * (Fraction(left, 2**_LEFT_BITS) * 2 * reach / (power + 1) + rounded)
     return None

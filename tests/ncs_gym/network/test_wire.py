@@ -64,7 +64,7 @@ def test_one_bit_more_or_less_or_another_is_refused(message, data):
 @examples(500)
 def test_noise_is_refused(noise):
     assert reason_of(noise) in {"format", "length", "tag"}
-    assert reason_of(MAGIC + b"\2\1\0\0" + noise) in {"length", "tag"}
+    assert reason_of(MAGIC + b"\3\1\0\0" + noise) in {"length", "tag"}
 
 
 def tagged(wire, head):
@@ -77,7 +77,7 @@ def test_what_has_the_key_and_another_plant_version_or_size_is_refused():
     other = Wire(cart_pole(), 3, KEY).encode(Message(kind=Kind.BEACON, episode=1, stamp=2, requests=(True,) * 4))
     assert reason_of(other) == "plant"
     assert reason_of(Wire(PLANT, 3, KEY + b"!").encode(sample)) == "tag"
-    for place, value in [(4, 1), (4, 3), (5, 0), (5, 5), (6, 1)]:
+    for place, value in [(4, 2), (4, 4), (5, 0), (5, 5), (6, 1)]:
         head = bytearray(data[:-TAG_SIZE])
         head[place] = value
         assert reason_of(tagged(WIRE, bytes(head))) == "format"
@@ -105,13 +105,13 @@ def test_layout_is_the_documented_one():
     data = WIRE.encode(Message(kind=Kind.SAMPLE, episode=7, stamp=9, challenge=11, values=np.array([1.5, -2.0])))
     head = (
         b"NCSW"
-        + bytes([2, 1, 0, 0])
+        + bytes([3, 1, 0, 0])
         + bytes.fromhex(PLANT.fingerprint)[:8]
         + struct.pack("<QQQdd", 7, 9, 11, 1.5, -2.0)
     )
     assert data == head + hmac.new(KEY, head, hashlib.sha256).digest()[:16]
     data = WIRE.encode(Message(kind=Kind.BEACON, episode=7, stamp=9, challenge=11, requests=(True, False, False, True)))
-    head = b"NCSW" + bytes([2, 4, 0, 0]) + bytes.fromhex(PLANT.fingerprint)[:8]
+    head = b"NCSW" + bytes([3, 4, 0, 0]) + bytes.fromhex(PLANT.fingerprint)[:8]
     head += struct.pack("<QQQ", 7, 9, 11) + bytes([1, 0, 0, 1])
     assert data == head + hmac.new(KEY, head, hashlib.sha256).digest()[:16]
 

@@ -35,7 +35,8 @@ async def over_udp():
 async def over_zeromq():
     zeromq = pytest.importorskip("shields.nodes.zeromq", reason="the extra [zmq] is not installed")
     address = f"tcp://127.0.0.1:{free_port()}"
-    return zeromq.ZmqTransport(bind=address), [zeromq.ZmqTransport(connect=address) for _ in range(2)]
+    key = bytes(range(32))
+    return zeromq.ZmqTransport(key, bind=address), [zeromq.ZmqTransport(key, connect=address) for _ in range(2)]
 
 
 async def run(opened, controller, budget=None):

@@ -1,0 +1,79 @@
+"""Reads what comes from outside: regular files of a bounded size, and JSON of a bounded number of values.
+
+The limits of all readers of files stand here (SECURITY.md), and are checked before anything is read, unpacked or
+expanded. Those of messages are the sizes in `ncs_gym.network.wire`.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+from typing import Any, BinaryIO
+
+# Bytes of a certificate, a plant, settings, results, an `agent.json` or a page, and values of its JSON.
+LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
+# Bytes of a file of hyperparameters, and values in it once all aliases are written out.
+LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
+# Bytes of a `model.zip`, of all that it unpacks to, and files in it.
+LARGEST_MODEL, MOST_MEMBERS = 256 << 20, 64
+# Bytes of a key, and of a line in a log of `ncs loop`.
+LARGEST_KEY, LARGEST_LINE = 4096, 64 << 10
+# Bytes of a file of recorded packets, packets of a log with those that were lost, and control steps that they span.
+LARGEST_LOG, MOST_PACKETS, MOST_STEPS = 128 << 20, 2_000_000, 10_000_000
+
+
+def read_file(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> bytes:
+    """Returns the bytes of a regular file, or of one that a link leads to.
+
+    Raises:
+        OSError: If it cannot be read, is a folder, a pipe or a device, or has more than so many bytes.
+    """
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(most + 1) if size <= most else b""
+    if max(size, len(content)) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most:,} bytes", os.fspath(path))
+    return content
+
+
+def open_file(path: str | os.PathLike[str]) -> BinaryIO:
+    """Returns a regular file, or one that a link leads to, open for reading.
+
+    Raises:
+        OSError: If it cannot be read, or is a folder, a pipe or a device.
+    """
+    file = open(os.fspath(path), "rb", opener=_opened)
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is not a regular file", os.fspath(path))
+    return file
+
+
+def _opened(path: str, flags: int) -> int:
+    """Opens a file without waiting for whoever writes into it if it is a pipe."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_text(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> str:
+    """Returns the text of a file in UTF-8, as `read_file` its bytes.
+
+    Raises:
+        OSError: As from `read_file`.
+        UnicodeDecodeError: If it is no such text.
+    """
+    return read_file(path, most).decode("utf-8").replace("\r\n", "\n")
+
+
+def json_values(text: str | bytes, **keywords: Any) -> Any:
+    """Returns the values of a JSON text, as `json.loads` does.
+
+    Raises:
+        ValueError: If it is none, or has more than `MOST_VALUES` values.
+        RecursionError: If its lists are too deep.
+    """
+    marks: Any = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
+    if sum(map(text.count, marks)) > MOST_VALUES:
+        raise ValueError(f"it has more than {MOST_VALUES:,} values")
+    return json.loads(text, **keywords)
