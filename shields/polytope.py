@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from ncs_gym.plants.between_samples import MOST_POINTS
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, own_error_state, read_only, shown
 from shields.errors import CertificateError
 
 # A polytope has at most so many rows, so that a decision and a verification stay fast; each stands for two faces.
@@ -57,6 +57,7 @@ class Polytope(ReadOnlyArrays):
         """The dimension n."""
         return self.rows.shape[1]
 
+    @own_error_state
     def gauge(self, points: Any) -> Any:
         """Returns max |g x| over the rows: 0 at the center, 1 on the boundary.
 
@@ -66,6 +67,7 @@ class Polytope(ReadOnlyArrays):
         gauges = np.abs(np.asarray(points, dtype=np.float64) @ self.rows.T).max(axis=-1)
         return float(gauges) if gauges.ndim == 0 else gauges
 
+    @own_error_state
     def support(self, directions: Any) -> Any:
         """Returns max of a'x over the polytope for a direction a (n,), or for each of shape (count, n), by a solver.
 
@@ -85,6 +87,7 @@ class Polytope(ReadOnlyArrays):
             found.append(-solution.fun * size)
         return float(found[0]) if np.ndim(directions) == 1 else np.array(found)
 
+    @own_error_state
     def outline(self, pair: tuple[int, int]) -> np.ndarray:
         """Returns corners of a polygon around the projection onto two coordinates, shape (k, 2); for pictures.
 
@@ -100,10 +103,12 @@ class Polytope(ReadOnlyArrays):
         heights = np.stack([heights, np.roll(heights, -1)], axis=1)
         return np.linalg.solve(normals, heights[..., None])[..., 0]
 
+    @own_error_state
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
 
+    @own_error_state
     def sample_boundary(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns points of the boundary in random directions, shape (count, n)."""
         scale = 1.0 / np.maximum(np.abs(self.rows).max(axis=0), np.finfo(float).tiny)

@@ -10,6 +10,7 @@ from scipy.linalg import null_space
 from torch import nn
 
 from ncs_gym import LinearPlant
+from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.one_step import ReachableSets
 from shields.runtime.polytope_step import PolytopeSets, SetsOnGrid
@@ -44,6 +45,7 @@ class SafeLayer(nn.Module):
         ValueError: If the error shape is no positive semidefinite matrix, or there is none.
     """
 
+    @own_error_state
     def __init__(self, certificate: Certificate, plant: LinearPlant, error_shape: Any = None) -> None:
         super().__init__()
         self.filter = SafetyFilter(certificate, plant)
@@ -57,6 +59,7 @@ class SafeLayer(nn.Module):
     def __deepcopy__(self, memo: dict[int, Any]) -> SafeLayer:
         return self  # nothing in it is learned
 
+    @own_error_state
     def forward(
         self, actions: torch.Tensor, estimates: torch.Tensor, error_shapes: torch.Tensor | None = None
     ) -> torch.Tensor:
@@ -119,6 +122,7 @@ class _Projected(torch.autograd.Function):
         return (gradients[0][:, :, None] * jacobians).sum(dim=1), None, None, None
 
 
+@own_error_state
 def projection_jacobians(
     shield: SafetyFilter, estimates: np.ndarray, error_shapes: np.ndarray, proposals: np.ndarray
 ) -> np.ndarray:

@@ -31,7 +31,7 @@ from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, setting, shown
+from ncs_gym.validation import as_count, own_error_state, setting, shown
 
 
 class NCSVectorEnv(SpecOfJson, VectorEnv):
@@ -88,6 +88,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
 
+    @own_error_state
     def __init__(
         self,
         num_envs: int = 1,
@@ -176,11 +177,13 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         done, known = self._ended
         return done.copy(), Known(*(each.copy() for each in known))
 
+    @own_error_state
     def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), `error_shapes`."""
         pending = self._downlink_state.committed.pending
         return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
 
+    @own_error_state
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -217,6 +220,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._draw(info, begins=mask, moved=False)
         return self._observation(), info
 
+    @own_error_state
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies u = u_max * action, actions of shape (N, m), for one step of every environment.
 
@@ -270,6 +274,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         """
         return require_on_request(self._requests).outstanding(self._estimator.age)
 
+    @own_error_state
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
 

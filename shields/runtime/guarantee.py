@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -11,7 +9,7 @@ import numpy as np
 
 from ncs_gym.network import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH, inputs_under_way
-from ncs_gym.validation import shown
+from ncs_gym.validation import shown, warn_caller
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
 from shields.runtime.one_step import FARTHEST, PredictedErrors
@@ -312,11 +310,3 @@ def _first(broken: Any, condition: Any, explanation: str) -> Any:
     if condition is False or not np.count_nonzero(condition):  # the usual case
         return broken
     return broken + (broken == 0) * condition * CODES[explanation]
-
-
-def warn_caller(text: str, category: type[Warning]) -> None:
-    """Warns the first caller outside this package."""
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shields."):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(text, category, stacklevel=level)

@@ -18,7 +18,7 @@ from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
 from ncs_gym.network.downlink import as_echo
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.network.requests import Requests, require_on_request
-from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, setting, shown
+from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, own_error_state, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
@@ -30,7 +30,6 @@ from shields.runtime.guarantee import (
     UNKNOWN_START,
     LoopObservation,
     LostGuarantee,
-    warn_caller,
 )
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
@@ -65,7 +64,8 @@ def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Conc
         parts = parts if loop._requests is None else (*parts, loop._requests)
         before = [(part, part.saved()) for part in parts]
         try:
-            return method(loop, *args, **kwargs)
+            with np.errstate(all="ignore"):
+                return method(loop, *args, **kwargs)
         except (GuaranteeLostError, GuaranteeLostWarning, UnusedPacketsWarning):  # warnings where they are errors
             raise
         except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
@@ -145,6 +145,7 @@ class SafeLoop:
     echo_age: int | None = setting("echo_age")
     channel: Channel = setting("channel", "_estimator.channel")
 
+    @own_error_state
     def __init__(
         self,
         certificate: Certificate,
@@ -482,6 +483,7 @@ class SafeLoop:
         estimator = self._estimator
         return self._monitored.reported(*self._predicted(), estimator.alarm, estimator.age, estimator.damaged)
 
+    @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
         return self._estimator.predicted(self._inputs.pending[: self._input_delay])

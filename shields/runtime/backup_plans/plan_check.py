@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
-from ncs_gym.validation import read_only
+from ncs_gym.validation import own_error_state, read_only
 from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
 from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test, supports
 
@@ -67,7 +67,7 @@ class PlanTest:
             self._known = numbers, table
         return table.some([numbers[key] for key in keys])
 
-    @np.errstate(all="ignore")  # what is not finite is not certified
+    @own_error_state  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
         """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN if unknown."""
         size = np.abs(estimates)
@@ -87,7 +87,7 @@ class PlanTest:
             weighted += weighting[:, :, i] * centers[:, i, None]
         return values.reshape(steps, -1, count, number), weighted
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
         """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N)."""
         block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
@@ -107,7 +107,7 @@ class PlanTest:
         allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
         return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
         rows, extents = self.prediction.rows[: len(self.prediction.plant.box_rows)], np.sqrt(np.diag(error_shape))
@@ -283,7 +283,7 @@ class Tightening(NamedTuple):
         return Tightening(*(part[chosen] for part in self))
 
 
-@np.errstate(all="ignore")  # what overflows passes no test
+@own_error_state  # what overflows passes no test
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 

@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.plants.lqr import lqr_gain
-from ncs_gym.validation import read_only
+from ncs_gym.validation import own_error_state, read_only
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
 from shields.runtime.one_step import OneStepTest
 from shields.runtime.polytope_step import PolytopeTest
@@ -107,7 +107,7 @@ class Planner:
         candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 1, 0]])
         return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
 
-    @np.errstate(all="ignore")  # what is not finite passes no test
+    @own_error_state  # what is not finite passes no test
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
         """Returns proposals followed by either loop, (E, 2, N, m), limited after the prediction: one product for all.
 
@@ -228,7 +228,7 @@ class PlanProgram:
         numbered.data = np.concatenate([self._linear, -(root @ self._end).ravel()])[self._order]
         self._typical = numbered
 
-    @np.errstate(all="ignore")  # what is not finite has no plan
+    @own_error_state  # what is not finite has no plan
     def solve(
         self,
         estimate: np.ndarray,
@@ -309,7 +309,7 @@ def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate(inputs).T)
 
 
-@np.errstate(all="ignore")  # what is not finite passes no test
+@own_error_state  # what is not finite passes no test
 def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """Returns plans that go on with u_j = gain c_j, saturated and expressible, where a beginning is NaN.
 
