@@ -120,7 +120,8 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
     hyperparams = with_changes(DEFAULTS[algorithm], copied)
     for name, most in _COUNTS.items():
         if name in hyperparams and (type(value := hyperparams[name]) is not int or not 1 <= value <= most):
-            raise ValueError(f"{name} must be a whole number >= 1, at most {most:,}, got {shown(value)}")
+            at_most = f" and at most {most:,}" if type(value) is int and value > most else ""
+            raise ValueError(f"{name} must be a whole number >= 1{at_most}, got {shown(value)}")
     if hyperparams["n_envs"] * hyperparams.get("n_steps", 1) > MOST_TRANSITIONS:
         raise ValueError(f"n_envs times n_steps must be at most {MOST_TRANSITIONS:,}")
     require_moderate_networks(hyperparams.get("policy_kwargs") or {})

@@ -32,10 +32,9 @@ def read_file(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> byt
     """
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
-        content = file.read(most + 1) if size <= most else b""
-    if max(size, len(content)) > most:
-        raise OSError(errno.EFBIG, f"it has more than {most:,} bytes", os.fspath(path))
-    return content
+        if size > most:
+            raise OSError(errno.EFBIG, f"it has more than {most:,} bytes", os.fspath(path))
+        return file.read(size)
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
@@ -44,7 +43,7 @@ def open_file(path: str | os.PathLike[str]) -> BinaryIO:
     Raises:
         OSError: If it cannot be read, or is a folder, a pipe or a device.
     """
-    file = open(os.fspath(path), "rb", opener=_opened)
+    file = open(os.fspath(path), "rb", opener=_opened)  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise OSError(errno.EINVAL, "it is not a regular file", os.fspath(path))

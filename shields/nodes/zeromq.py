@@ -14,6 +14,9 @@ from zmq.utils import z85
 from ncs_gym.network.wire import LARGEST_DATAGRAM, require_key
 from shields.nodes.transport import MOST_WAITING, Datagram
 
+# What encryption adds to a message at most.
+CURVE_OVERHEAD = 64
+
 
 class ZmqTransport:
     """A ROUTER socket for the controller, a DEALER socket for sensor and actuator; made where an event loop runs.
@@ -43,7 +46,7 @@ class ZmqTransport:
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
         self._socket.setsockopt(zmq.SNDHWM, MOST_WAITING)
         self._socket.setsockopt(zmq.RCVHWM, MOST_WAITING)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_DATAGRAM)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_DATAGRAM + CURVE_OVERHEAD)
         if self._is_router:
             self._socket.curve_server, self._socket.curve_secretkey = True, secret
         else:

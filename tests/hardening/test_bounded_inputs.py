@@ -1,0 +1,391 @@
+"""Small files and messages that would take memory or time without bound; each is refused before it is expanded."""
+
+import io
+import json
+import os
+import re
+import socket
+import tracemalloc
+import zipfile
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ncs_gym import LinearPlant, PacketLog, TraceChannel, truck_trailer
+from ncs_gym.reading import (
+    LARGEST_DOCUMENT,
+    LARGEST_HYPERPARAMS,
+    LARGEST_LOG,
+    MOST_PACKETS,
+    MOST_VALUES,
+    json_values,
+    read_file,
+    read_text,
+)
+from shields import Certificate, CertificateError
+from shields.verification.between_samples import between_conditions
+from tests.certificates import certificate_of
+
+pytestmark = pytest.mark.filterwarnings("ignore:the times in")
+
+
+@contextmanager
+def little_memory(most=64 << 20):
+    """Fails unless what is done inside takes little memory, as Python counts it."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(name, content):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+# Files that never end, and one that nobody writes to.
+ENDLESS = ["/dev/zero", "pipe"]
+
+
+@pytest.fixture(params=ENDLESS)
+def endless(request, tmp_path):
+    if request.param == "pipe":
+        os.mkfifo(tmp_path / "pipe")
+        return tmp_path / "pipe"
+    return request.param
+
+
+def readers():
+    from agents.hyperparams import read_hyperparams
+    from experiments.settings import CompareSettings, config_defaults
+
+    return {
+        "bytes": read_file,
+        "text": read_text,
+        "plant": LinearPlant.load,
+        "certificate": Certificate.load,
+        "packets": PacketLog.load,
+        "hyperparameters": lambda path: read_hyperparams(path, "ncs_gym/CSTR-v0"),
+        "settings": lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings),
+    }
+
+
+NAMES = ["bytes", "text", "plant", "certificate", "packets", "hyperparameters", "settings"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pipes_and_devices_are_refused_by_every_reader_of_files(name, endless):
+    with little_memory(), pytest.raises((OSError, ValueError), match="not a regular file"):
+        readers()[name](endless)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_file_of_many_bytes_is_refused_before_it_is_read(name, tmp_path):
+    path = tmp_path / "large"
+    with open(path, "wb") as file:
+        file.truncate(LARGEST_LOG + 1)  # takes no place on the disk
+    with little_memory(), pytest.raises((OSError, ValueError), match="has more than"):
+        readers()[name](path)
+
+
+def test_folders_and_missing_files_are_named_as_such(tmp_path):
+    for path in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(OSError, match=re.escape(path.name)):
+            read_file(path)
+
+
+def test_link_to_a_file_is_read(write, tmp_path):
+    (tmp_path / "link").symlink_to(write("file", "text\r\n"))
+    assert read_text(tmp_path / "link") == "text\n"
+
+
+@pytest.mark.parametrize("part", ["[],", "{},", "0,", '"",'])
+def test_json_of_many_values_is_refused_before_it_is_expanded(part, write):
+    text = f"[{part * MOST_VALUES}0]"
+    assert len(text) < LARGEST_DOCUMENT
+    with little_memory(), pytest.raises(ValueError, match="values"):
+        json_values(text)
+    with little_memory(100 << 20), pytest.raises(CertificateError, match="not valid JSON"):
+        Certificate.load(write("certificate.json", text))
+    assert json_values("[1, 2]") == [1, 2]
+
+
+LOGS = {
+    "ping numbers": "icmp_seq=1 ttl=1 time=1 ms\n64 bytes: icmp_seq=10000000000 ttl=1 time=1 ms\n",
+    "steps": "episode,sent,received\n1,1,1\n1,1000000000000,1000000000001\n",
+    "steps of episodes": "episode,sent,received\n"
+    + "".join(f"{episode},{MOST_PACKETS // 2},{MOST_PACKETS}\n" for episode in range(3)),
+    "one field": "sent,received\n0,0\n" + '"' + 200_000 * "1" + '",1\n',
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_packet_log_that_expands_is_refused(kind, write):
+    with little_memory(), pytest.raises(ValueError, match=r"at most|no CSV file"):
+        PacketLog.load(write("log.csv", LOGS[kind]))
+
+
+@pytest.mark.parametrize(("gap", "dt"), [(1e9, 0.01), (1e300, 1e-3), (1e6, 0.01)])
+def test_packets_that_are_far_apart_have_no_ages(gap, dt, write):
+    log = PacketLog.load(write("log.csv", f"0,0.1\n{gap},{gap}\n{2 * gap},{2 * gap}\n"))
+    for expand in (log.ages, log.channel) if gap / dt > 1e7 else (log.ages,):
+        with little_memory(), pytest.raises(ValueError, match="control steps"):
+            expand(dt)
+
+
+def test_trace_of_a_channel_has_a_largest_length():
+    with pytest.raises(ValueError, match="at most 2,000,000"):
+        TraceChannel(trace=range(MOST_PACKETS + 1))
+
+
+def test_contracts_of_a_long_record_take_few_blocks():
+    pytest.importorskip("tyro")
+    from experiments.commands.channel import broken_contracts
+
+    ages = np.zeros(300_000, dtype=int)
+    ages[5] = 3000
+    with little_memory(400 << 20):
+        rows = broken_contracts(ages[:3_001], np.random.default_rng(0))
+        assert [rows[0]["max_age"], rows[-1]["max_age"]] == [1000, 0]
+        assert len(broken_contracts(np.zeros_like(ages), np.random.default_rng(0))) == 1
+
+
+LAUGHS = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]\n" + "".join(
+    f"{new}: &{new} [{', '.join(10 * ['*' + old])}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
+)
+MERGED = "a: &a {x0: 1, x1: 1}\n" + "".join(
+    f"{new}: &{new} {{<<: [*{old}, *{old}]}}\n"
+    for old, new in zip("abcdefghijklmnopqrstuv", "bcdefghijklmnopqrstuvw", strict=True)
+)
+
+
+@pytest.mark.parametrize("text", [LAUGHS, MERGED, "a: &a [*a]\n"], ids=["laughs", "merged", "in itself"])
+def test_yaml_that_expands_is_refused(text, write):
+    from agents.hyperparams import read_hyperparams
+
+    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
+        read_hyperparams(write("laughs.yml", text), "default")
+
+
+def test_yaml_with_moderate_aliases_is_read(write):
+    from agents.hyperparams import read_hyperparams
+
+    text = "common: &common {gamma: 0.9, n_envs: 4}\ndefault:\n  <<: *common\n  n_envs: 8\n"
+    assert read_hyperparams(write("zoo.yml", text), "default") == {"gamma": 0.9, "n_envs": 8}
+    with pytest.raises(OSError, match=f"{LARGEST_HYPERPARAMS:,} bytes"):
+        read_hyperparams(write("long.yml", text + "#" * LARGEST_HYPERPARAMS), "default")
+
+
+HUGE = [
+    {"policy_kwargs": {"net_arch": [12_000, 12_000]}},
+    {"policy_kwargs": {"net_arch": {"pi": [64], "vf": [12_000, 12_000]}}},
+    {"policy_kwargs": {"net_arch": [10**9]}},
+    {"policy_kwargs": {"net_arch": [64] * 100_000}},
+    {"policy_kwargs": {"n_critics": 10**9}},
+    {"policy_kwargs": {"n_quantiles": 10**9}},
+    {"policy_kwargs": {"net_arch": [1024, 1024], "n_critics": 100}},
+    {"buffer_size": 10**12},
+    {"n_envs": 10**9},
+    {"n_envs": 10_000, "n_steps": 10_000},
+]
+
+
+@pytest.mark.parametrize("hyperparams", HUGE, ids=[json.dumps(each)[:50] for each in HUGE])
+def test_hyperparameters_that_take_much_memory_are_refused(hyperparams):
+    from agents.hyperparams import complete_hyperparams
+
+    algorithm = "TQC" if {"n_critics", "n_quantiles"} & hyperparams.get("policy_kwargs", {}).keys() else "PPO"
+    algorithm = "SAC" if "buffer_size" in hyperparams else algorithm
+    with little_memory(), pytest.raises(ValueError, match=r"at most|may have|numbers of"):
+        complete_hyperparams(algorithm, hyperparams)
+
+
+def test_networks_of_usual_sizes_are_taken():
+    from agents.hyperparams import complete_hyperparams
+
+    for arch in ([64, 64], [400, 300], [1024, 1024], {"pi": [256, 256], "qf": [512, 512]}):
+        for algorithm in ("PPO", "SAC"):
+            complete_hyperparams(algorithm, {"policy_kwargs": {"net_arch": arch}})
+
+
+def forged(folder, hyperparams):
+    """A folder with the agent.json of a pretrained agent, other hyperparameters and a checksum that fits."""
+    from agents.agent_file import document_of, pretrained_folder
+
+    source = pretrained_folder("ncs_gym/CSTR-v0")
+    content = json.loads((source / "agent.json").read_text())["agent"]
+    (folder / "agent.json").write_bytes(document_of(content | {"hyperparams": hyperparams}))
+    (folder / "model.zip").write_bytes((source / "model.zip").read_bytes())
+    return folder
+
+
+def test_agent_of_large_networks_is_refused_before_they_are_made(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from agents import Agent, AgentError
+
+    folder = forged(tmp_path, {"policy_kwargs": {"net_arch": [12_000, 12_000]}})
+    with little_memory(), pytest.raises(AgentError, match="weights"):
+        Agent.load(folder)
+
+
+def zipped(members):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            with archive.open(name, "w") as file:
+                for piece in content:
+                    file.write(piece)
+    return buffer.getvalue()
+
+
+def bomb(mebibytes=300):
+    return zipped({"data": [bytes(1 << 20)] * mebibytes})
+
+
+@pytest.mark.parametrize("kind", ["outside", "inside", "many"])
+def test_zip_that_unpacks_to_much_is_refused(kind, write):
+    pytest.importorskip("stable_baselines3")
+    from agents import AgentError
+    from agents.agent import load_sb3_zip
+
+    content = {
+        "outside": bomb,
+        "inside": lambda: zipped({"data": [b"{}"], "policy.pth": [bomb()]}),
+        "many": lambda: zipped({f"{i}": [b""] for i in range(1000)}),
+    }[kind]()
+    assert len(content) < 1 << 20
+    path = write("agent.zip", content)
+    with little_memory(), pytest.raises(AgentError, match="unpacks to more than"):
+        load_sb3_zip(path, "ncs_gym/CSTR-v0")
+
+
+def test_settings_name_no_more_runs_and_processes_than_there_may_be():
+    from experiments.settings import CompareSettings
+
+    for changes in ({"seeds": 10**9}, {"jobs": 10**6}, {"episodes": 10**9}):
+        with pytest.raises(ValueError, match="at most"):
+            CompareSettings(**changes)
+
+
+def test_key_file_is_a_file(endless, tmp_path):
+    from experiments.commands.loop import loop
+    from experiments.settings import LoopSettings
+
+    with pytest.raises(OSError, match="not a regular file"):
+        loop(LoopSettings(role="plant", key_file=Path(endless), out=tmp_path / "out"))
+
+
+def test_log_of_a_loop_with_one_long_line_is_read_in_pieces(write, tmp_path):
+    from experiments.network_loop.log import rows_of
+
+    write("controller-000.csv", "a,b\n1,2\n" + "1" * (40 << 20) + "\n3,4\n")
+    with little_memory(8 << 20):
+        assert list(rows_of(tmp_path, "controller")) == [{"a": "1", "b": "2"}, {"a": "3", "b": "4"}]
+    (tmp_path / "controller-000.csv").unlink()
+    os.mkfifo(tmp_path / "controller-000.csv")
+    with pytest.raises(OSError, match="not a regular file"):
+        list(rows_of(tmp_path, "controller"))
+
+
+def stiff(speed, points=64):
+    """A plant with a state that follows its input so many times faster than the other."""
+    model = np.array([[-1.0, 1.0], [0.0, -speed]]), np.array([[0.0], [speed]]), np.eye(2), np.zeros((2, 1))
+    bounds = {name: [1e-3, 1e-3] for name in ("disturbance_bound", "sensor_bound", "initial_bound")}
+    return LinearPlant.from_statespace(model, dt=0.1, box=[1.0, 1.0], u_max=1.0, between_samples=points, **bounds)
+
+
+def grid_conditions(plant):
+    """What is decided of the plant's grid; the certificate is another plant's, which these conditions do not ask."""
+    certificate = replace(certificate_of(truck_trailer(mass=4000.0)), between_samples=plant.between_samples)
+    found = []
+    for condition in between_conditions(certificate, plant):
+        if condition.name.startswith("(B)"):
+            break
+        found.append(condition)
+    return [each for each in found if each.name.startswith("(G)")]
+
+
+@pytest.mark.parametrize(("speed", "holds"), [(10.0, True), (300.0, True), (1000.0, True), (1e5, False)])
+def test_stiff_models_are_decided_in_numbers_of_bounded_length(speed, holds):
+    conditions = grid_conditions(stiff(speed))
+    assert len(conditions) == 2
+    assert all(each.holds for each in conditions) == holds
+
+
+@pytest.mark.parametrize("speed", [3.0, 300.0])
+def test_bound_between_grid_points_is_hardly_more_than_it_has_to_be(speed):
+    """The plant's own eta is one percent more than needed, of which the verification leaves most."""
+    plant = stiff(speed)
+    rows = plant.grid_rows
+    other = replace(plant)
+    other.__dict__["grid_rows"] = rows._replace(remainder=0.98 * rows.remainder)
+    assert all(each.holds for each in grid_conditions(plant))
+    assert not all(each.holds for each in grid_conditions(other))
+
+
+def test_long_datagrams_are_cut_off_and_refused():
+    import asyncio
+
+    from ncs_gym.network.wire import LARGEST_DATAGRAM, Wire, WireError
+    from shields.nodes import UdpTransport
+
+    async def sent():
+        receiver = await UdpTransport.open(local=("127.0.0.1", 0))
+        sender = await UdpTransport.open(peer=receiver.address)
+        for _ in range(100):
+            sender.send(bytes(60_000))
+            await asyncio.sleep(0.005)
+            if arrived := receiver.received():
+                break
+        sender.close()
+        receiver.close()
+        return arrived[0].data
+
+    data = asyncio.run(sent())
+    assert len(data) == LARGEST_DATAGRAM + 1
+    with pytest.raises(WireError, match=r"format|length"):
+        Wire(truck_trailer(mass=4000.0), 4, bytes(32)).decode(data)
+
+
+def test_zeromq_hears_nobody_without_the_key_and_no_long_message():
+    zmq = pytest.importorskip("zmq")
+    import asyncio
+
+    from ncs_gym.network.wire import LARGEST_DATAGRAM
+    from shields.nodes.zeromq import ZmqTransport
+
+    async def heard():
+        context = zmq.Context()
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+        controller, sizes = ZmqTransport(bytes(32), bind=address), set()
+        stranger = context.socket(zmq.DEALER)
+        stranger.setsockopt(zmq.LINGER, 0)
+        stranger.connect(address)
+        senders = [ZmqTransport(bytes(32), connect=address) for _ in range(2)]
+        other_key = ZmqTransport(bytes(31) + b"1", connect=address)
+        for _ in range(200):
+            with suppress(zmq.Again):  # it does not even come to a connection
+                stranger.send_multipart([b"stranger"] * 100, zmq.NOBLOCK)
+            other_key.send(b"other key")
+            senders[0].send(bytes(LARGEST_DATAGRAM))
+            senders[1].send(bytes(2 * LARGEST_DATAGRAM))
+            await asyncio.sleep(0.005)
+            sizes |= {len(each.data) for each in controller.received()}
+        for each in (controller, other_key, *senders):
+            each.close()
+        context.destroy(0)
+        return sizes
+
+    assert asyncio.run(heard()) == {LARGEST_DATAGRAM}
