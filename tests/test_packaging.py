@@ -47,9 +47,10 @@ LAYERS = {
         {"nodes", "torch"},
     ),
     "agents": (
-        {"hyperparams", "results", "sb3_vec_env"},
+        {"hyperparams", "pickled_data", "results", "sb3_vec_env"},
         {"loop"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
+        {"normalization", "sb3_zip"},
         {"agent"},
         {"training"},
     ),
