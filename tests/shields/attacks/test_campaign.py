@@ -1,0 +1,234 @@
+"""The campaign: one adversary against every claim, in every case and mode; and twins of it that it has to win.
+
+`make test` runs a part of every case and mode, `make test-slow` the whole, by the same function. All claims that a run
+makes are compared in it; whatever is false names its claim.
+"""
+
+from collections import Counter
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym.network.contract import contract_of
+from shields import SafetyFilter, SafetyShield
+from shields.runtime import safety_filter
+from shields.runtime.backup_plans import plan_check
+from shields.runtime.guarantee import OLD_SAMPLE
+from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
+from tests.shields.attacks.cases import CASES, case
+from tests.shields.attacks.worlds import (
+    AGE,
+    ALL_TIMES,
+    BOX,
+    ERROR,
+    SAFE_SET,
+    Outcome,
+    through_estimators,
+    through_loop,
+    through_shield,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning")
+
+MODES = ("project", "switch", "boundary", "lookahead")
+# Environments and steps of the part and of the whole; networks and seeds are the first one, and all of them.
+SIZES = {"SafetyShield": ((None, 60), (None, 600)), "VectorSafetyShield": ((30, 40), (200, 300)),
+         "SafeLoop": ((1, 150), (1, 2_000))}  # fmt: skip
+SEEDS = 3
+# How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
+# than the safe set.
+CLOSE = {SAFE_SET: 0.9, BOX: 0.4, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
+SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 1.0}
+WITH_REMAINDER = [name for name in CASES if name.endswith("with remainder")]
+
+
+def attacked(name, mode, through, network, seed, is_whole=False, of=None, **world):
+    """What comes of an attack on a case, or on another one `of` its kind."""
+    count, steps = SIZES[through][is_whole]
+    target = of or case(name)
+    if through == "SafeLoop":
+        return through_loop(target, mode, network, steps, seed, **world)
+    return through_shield(target, mode, network, count, steps, seed)
+
+
+def campaign() -> list:
+    """All of case x mode x what is attacked; the part is every mode of vectors and one mode of the others."""
+    rows = []
+    for c, name in enumerate(CASES):
+        for m, mode in enumerate(MODES):
+            for t, through in enumerate(SIZES):
+                if through == "SafeLoop" and name in WITH_REMAINDER:  # only the environments have their processes
+                    continue
+                row = name, mode, through
+                if through == "VectorSafetyShield" or (c + m + t) % len(MODES) == 0:
+                    rows.append(pytest.param(*row, False, id="-".join(row)))
+                rows.append(pytest.param(*row, True, id="-".join((*row, "whole")), marks=pytest.mark.slow))
+    return rows
+
+
+@pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
+def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
+    seeds, networks = (range(SEEDS), len(case(name).networks)) if is_whole else ([len(name)], 1)
+    first = [*CASES].index(name) + MODES.index(mode)
+    outcomes = [
+        attacked(name, mode, through, first + network, seed, is_whole) for seed in seeds for network in range(networks)
+    ]
+    for outcome in outcomes:
+        assert not outcome.lost
+        false = {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0}
+        assert not false
+        if outcome.counts["guaranteed"] == outcome.counts["steps"]:  # else starts may not have been proved at all
+            far = {claim: gauge for claim, gauge in outcome.largest.items() if gauge < SHARE[through] * CLOSE[claim]}
+            assert not far
+    counts = sum((outcome.counts for outcome in outcomes), Counter())
+    assert counts["overridden"] < counts["steps"]
+    if mode != "lookahead":  # there a plan may save every proposal
+        assert counts["overridden"] > 0
+        assert counts["guaranteed"] == counts["steps"]
+    elif through == "VectorSafetyShield":
+        assert min(counts["planned"], counts["stored"], counts["outside S"]) > 0
+        assert counts["guaranteed"] > 0.3 * counts["steps"]
+
+
+@pytest.mark.parametrize(
+    ("count", "steps", "seed"),
+    [(60, 60, 0), *(pytest.param(500, 2000, seed, marks=pytest.mark.slow) for seed in range(SEEDS))],
+)
+@pytest.mark.parametrize("name", CASES)
+def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps, seed):
+    for network in range(len(case(name).networks) if steps > 100 else 1):
+        outcome, error_set, seen = through_estimators(case(name), network, count, steps, seed)
+        assert not outcome.lost
+        assert 0.9 < outcome.largest[ERROR] <= 1.0
+        assert case(name).contract is None or outcome.largest[AGE] == 1.0
+        # Shapes recur: some of each age are compared in exact arithmetic.
+        for k, (shape, age) in enumerate(sorted(seen, key=lambda each: each[1])):
+            if steps > 100 or k % 40 == 0:
+                certified = error_set.shape_at(age)
+                running = np.frombuffer(shape).reshape(certified.shape)
+                assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
+
+
+@contextmanager
+def errors_forgotten(patch):
+    """The filter takes the estimate for the state."""
+    one, many = SafetyFilter.errors_of, SafetyFilter.errors_of_many
+    patch.setattr(SafetyFilter, "errors_of", lambda shield, shape: one(shield, 1e-6 * shape))
+    patch.setattr(SafetyFilter, "errors_of_many", lambda shield, shapes: many(shield, 1e-6 * shapes))
+    yield {}
+
+
+@contextmanager
+def set_enlarged(patch, of, factor=1.5):
+    """A certificate of a larger set, which nobody verifies; episodes start where they would in the right one."""
+    right, scaled = of.certificate, None
+    if right.polytope is not None:
+        scaled = replace(right.polytope, rows=right.polytope.rows / factor)
+    wrong = replace(right, L=factor**2 * right.L, polytope=scaled)
+    for check in ("require_valid", "require_computable"):
+        patch.setattr(safety_filter, check, lambda *_: None)
+    yield {"of": replace(of, claimed=wrong, start=of.start / factor)}
+
+
+@contextmanager
+def tightened_less(patch, left_out):
+    """Plans are checked as if some of what may happen did not."""
+    tightenings = plan_check.tightenings
+
+    def less(prediction, shapes):
+        known = tightenings(prediction, shapes)
+        if left_out == "everything":
+            return known._replace(row_limits=np.ones_like(known.row_limits))
+        return known._replace(row_limits=known.row_limits + prediction.plant.disturbance.support(prediction.rows))
+
+    patch.setattr(plan_check, "tightenings", less)
+    yield {}
+
+
+@contextmanager
+def plans_turned_round(patch):
+    """What is stored is not what was certified."""
+    decide = SafetyFilter.decide
+
+    def turned(*arguments):
+        decision = decide(*arguments)
+        return decision._replace(plan=-decision.plan)
+
+    patch.setattr(SafetyFilter, "decide", turned)
+    yield {}
+
+
+def without_the_grid(name):
+    """A case whose box is certified at the sampling instants alone, and which is judged at all times."""
+    timed = case(name)
+    return replace(timed, plant=replace(timed.plant, between_samples=None), at_all_times=True)
+
+
+def tried(patch, defect, name, mode, through):
+    """Outcomes of attacks on a case with a defect, or in a world that is worse than promised."""
+    of = case(name)
+    kinds = {
+        "errors forgotten": lambda: errors_forgotten(patch),
+        "set enlarged": lambda: set_enlarged(patch, of),
+        "plans checked with nothing": lambda: tightened_less(patch, "everything"),
+        "plans checked with a disturbance less": lambda: tightened_less(patch, "a step"),
+        "plans turned round": lambda: plans_turned_round(patch),
+    }
+    worlds = {
+        "no filter": {},
+        "downlink not known": {"aware": False},
+        "disturbances twice as large": {"rough": 2.0},
+        "samples later than promised": {"late": 2},
+        "times between samples not counted": {"of": without_the_grid(name)} if "at all times" in name else {},
+    }
+    mode = "monitor" if defect == "no filter" else mode
+    for seed in range(8):
+        if defect in kinds:
+            with kinds[defect]() as world:
+                yield attacked(name, mode, through, seed, seed, **world)
+        else:
+            yield attacked(name, mode, through, seed, seed, **worlds[defect])
+
+
+VECTOR, SCALAR, LOOP = "VectorSafetyShield", "SafetyShield", "SafeLoop"
+PLANNED = ("cruise", "cart-pole", "batch reactor", "cart-pole, polytope", "batch reactor, polytope")
+BOTH_WAYS = [name for name in CASES if name.endswith("both ways")]
+LINEAR = [name for name in CASES if name not in WITH_REMAINDER]
+STATE = "of the state"
+# Which defect is found in which claim, and where it is sought; whether it counts though the guarantee was withdrawn.
+TWINS = {
+    "errors forgotten": (SAFE_SET, False, [(name, MODES[c % 3], VECTOR) for c, name in enumerate(CASES)]),
+    "set enlarged": (STATE, False, [(name, ("lookahead", *MODES[:3])[c % 4], VECTOR) for c, name in enumerate(CASES)]),
+    "no filter": (SAFE_SET, True, [(name, "monitor", SCALAR) for name in CASES]),
+    "disturbances twice as large": (STATE, True, [(name, MODES[c % 4], LOOP) for c, name in enumerate(LINEAR)]),
+    "downlink not known": (SAFE_SET, True, [(name, mode, LOOP) for name in BOTH_WAYS for mode in MODES[:3]]),
+    "samples later than promised": (AGE, True, [(name, "project", LOOP) for name in LINEAR if case(name).contract]),
+    "times between samples not counted": (ALL_TIMES, False, [(name, mode, VECTOR) for name in CASES
+                                          if "at all times" in name for mode in MODES]),
+    "plans checked with nothing": (BOX, False, [(name, "lookahead", VECTOR) for name in PLANNED]),
+    "plans checked with a disturbance less": (BOX, False, [(name, "lookahead", LOOP) for name in PLANNED]),
+    "plans turned round": (BOX, False, [(name, "lookahead", LOOP) for name in PLANNED[:3]]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("defect", "name", "mode", "through"),
+    [
+        pytest.param(defect, *row, id="-".join((defect, *row)))
+        for defect, (_, _, rows) in TWINS.items()
+        for row in rows
+    ],
+)
+def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
+    claim, anyway, _ = TWINS[defect]
+    found = Outcome()
+    for outcome in tried(monkeypatch, defect, name, mode, through):
+        found = outcome
+        gauges = found.ever if anyway else found.largest
+        if max(gauges[each] for each in ((SAFE_SET, BOX) if claim == STATE else (claim,))) > 1.0:
+            return
+    raise AssertionError(dict(found.ever))
