@@ -177,7 +177,7 @@ class Adversary:
         return self.rng.standard_normal((self.plant.n, self.count)) / self.plant.half_widths[:, None]
 
     def _against_plan(self, nominal: np.ndarray, D: np.ndarray) -> np.ndarray:
-        """For the row and the step of a plan under way with the least room; every other time for where the plan ends."""
+        """For the row and step of a plan under way with the least room; every other time for where the plan ends."""
         plant, center, power, spread = self.plant, nominal, np.eye(self.plant.n), 0.0
         if not len(self.plan):
             return self.box.push(nominal, D)

@@ -56,7 +56,7 @@ RANDOM = {
 
 
 def edges(age: int, quantization_step: float = 0.0) -> dict[str, Channel]:
-    """Channels that keep ChannelContract(age) and use all of it: late, lost as often in a row as allowed, overtaking."""
+    """Channels that keep ChannelContract(age) and use all of it: late, lost in the longest runs, overtaking."""
     same = {"quantization_step": quantization_step}
     return {
         "constant delay": Channel(delay=age, **same),
@@ -91,14 +91,24 @@ class Case:
     at_all_times: bool | None = None
     claimed: Certificate | None = None
 
+    @property
+    def uplink(self) -> Channel:
+        """Of the first network."""
+        return self.networks[0][0]
+
+    @property
+    def downlink(self) -> Channel | None:
+        """Of the first network; those of the others delay inputs as long."""
+        return self.networks[0][1]
+
     @cached_property
     def certificate(self) -> Certificate:
         """Counts the steps of both channels."""
-        contract, downlink = self.contract, self.networks[0][1]
         if self.claimed is not None:
             return self.claimed
-        if contract is not None and downlink is not None:
-            contract = replace(contract, max_age=contract.max_age + contract_of(downlink).max_age)
+        contract = self.contract
+        if contract is not None and self.downlink is not None:
+            contract = replace(contract, max_age=contract.max_age + contract_of(self.downlink).max_age)
         return certificate_of(self.plant, contract, self.safe_set)
 
 
@@ -112,12 +122,16 @@ def unstable(plant: LinearPlant, age: int = 3, step: float = 0.0, **settings: An
                 **settings)  # fmt: skip
 
 
+def behind(plant: LinearPlant, *networks: tuple[Channel, Channel], **settings: Any) -> Case:
+    """Behind both directions; episodes start well inside, since their first inputs are zero."""
+    contract = None if plant.spectral_radius < 1.0 else contract_of(networks[0][0])
+    return Case(plant=plant, networks=networks, contract=contract, start=0.3, **settings)
+
+
 def two_ways(plant: LinearPlant, age: int = 2, **settings: Any) -> Case:
     """Both directions at their edges, each in another way."""
     ways = [*edges(age).values()]
-    contract = None if plant.spectral_radius < 1.0 else ChannelContract(age)
-    networks = tuple(zip(ways, [*ways[1:], ways[0]], strict=True))
-    return Case(plant=plant, networks=networks, contract=contract, start=0.3, **settings)
+    return behind(plant, *zip(ways, [*ways[1:], ways[0]], strict=True), **settings)
 
 
 def registered(name: str, **settings: Any) -> Case:
@@ -154,6 +168,7 @@ CASES = {
     "batch reactor, both ways": lambda: two_ways(batch_reactor(), horizon=6),
     "cruise, at all times": lambda: stable(replace(TRUCKS["4000 kg"], between_samples=8), horizon=3),
     "reactor, at all times": lambda: unstable(replace(batch_reactor(), between_samples=4), safe_set="polytope"),
+    "cruise, both ways and at all times": lambda: two_ways(replace(TRUCKS["4000 kg"], between_samples=8), horizon=3),
     "cart-pole with remainder": lambda: registered("CartPoleNonlinear", horizon=6),
     "pendulum with remainder": lambda: registered("Pendulum"),
 }
@@ -163,6 +178,12 @@ CASES = {
 def case(name: str) -> Case:
     """A case by its name; made when it is first asked for."""
     return CASES[name]()
+
+
+def plan_case(name: str, channel: str) -> tuple[LinearPlant, int, Channel, ChannelContract | None]:
+    """Plant, horizon, a channel by its name, and contract of a case without downlink."""
+    plant, contract = case(name).plant, case(name).contract
+    return plant, case(name).horizon, (edges(contract.max_age) if contract else CHANNELS)[channel], contract
 
 
 def box_ellipsoid(plant: LinearPlant, share: float) -> Ellipsoid:

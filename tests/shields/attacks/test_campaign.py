@@ -7,13 +7,11 @@ makes are compared in it; whatever is false names its claim.
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym.network.contract import contract_of
 from shields import SafetyFilter, SafetyShield
 from shields.runtime import safety_filter
 from shields.runtime.backup_plans import plan_check
@@ -26,7 +24,6 @@ from tests.shields.attacks.worlds import (
     BOX,
     ERROR,
     SAFE_SET,
-    Outcome,
     through_estimators,
     through_loop,
     through_shield,
@@ -35,10 +32,12 @@ from tests.shields.attacks.worlds import (
 pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning")
 
 MODES = ("project", "switch", "boundary", "lookahead")
-# Environments and steps of the part and of the whole; networks and seeds are the first one, and all of them.
-SIZES = {"SafetyShield": ((None, 60), (None, 600)), "VectorSafetyShield": ((30, 40), (200, 300)),
-         "SafeLoop": ((1, 150), (1, 2_000))}  # fmt: skip
-SEEDS = 3
+# Environments and steps behind one network in the part, and behind each of them in the whole.
+SIZES = {
+    "SafetyShield": ((None, 60), (None, 400)),
+    "VectorSafetyShield": ((30, 40), (100, 150)),
+    "SafeLoop": ((1, 150), (1, 600)),
+}
 # How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
 # than the safe set.
 CLOSE = {SAFE_SET: 0.9, BOX: 0.4, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
@@ -72,11 +71,9 @@ def campaign() -> list:
 
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
-    seeds, networks = (range(SEEDS), len(case(name).networks)) if is_whole else ([len(name)], 1)
     first = [*CASES].index(name) + MODES.index(mode)
-    outcomes = [
-        attacked(name, mode, through, first + network, seed, is_whole) for seed in seeds for network in range(networks)
-    ]
+    networks = range(first, first + (len(case(name).networks) if is_whole else 1))
+    outcomes = [attacked(name, mode, through, network, network, is_whole) for network in networks]
     for outcome in outcomes:
         assert not outcome.lost
         false = {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0}
@@ -87,30 +84,27 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     counts = sum((outcome.counts for outcome in outcomes), Counter())
     assert counts["overridden"] < counts["steps"]
     if mode != "lookahead":  # there a plan may save every proposal
-        assert counts["overridden"] > 0
+        assert counts["overridden"] > 0 or through == "SafetyShield"  # which has few steps
         assert counts["guaranteed"] == counts["steps"]
     elif through == "VectorSafetyShield":
         assert min(counts["planned"], counts["stored"], counts["outside S"]) > 0
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
-@pytest.mark.parametrize(
-    ("count", "steps", "seed"),
-    [(60, 60, 0), *(pytest.param(500, 2000, seed, marks=pytest.mark.slow) for seed in range(SEEDS))],
-)
+@pytest.mark.parametrize(("count", "steps"), [(40, 60), pytest.param(200, 500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
-def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps, seed):
+def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
     for network in range(len(case(name).networks) if steps > 100 else 1):
-        outcome, error_set, seen = through_estimators(case(name), network, count, steps, seed)
+        outcome, error_set, seen = through_estimators(case(name), network, count, steps, network)
         assert not outcome.lost
         assert 0.9 < outcome.largest[ERROR] <= 1.0
         assert case(name).contract is None or outcome.largest[AGE] == 1.0
-        # Shapes recur: some of each age are compared in exact arithmetic.
-        for k, (shape, age) in enumerate(sorted(seen, key=lambda each: each[1])):
-            if steps > 100 or k % 40 == 0:
-                certified = error_set.shape_at(age)
-                running = np.frombuffer(shape).reshape(certified.shape)
-                assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
+        # Shapes recur: they are compared in exact arithmetic, in the part some of all ages.
+        by_age = sorted(seen, key=lambda each: each[1])
+        for shape, age in by_age if steps > 100 else by_age[:: len(by_age) // 15 + 1]:
+            certified = error_set.shape_at(age)
+            running = np.frombuffer(shape).reshape(certified.shape)
+            assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
 
 
 @contextmanager
@@ -152,13 +146,13 @@ def tightened_less(patch, left_out):
 @contextmanager
 def plans_turned_round(patch):
     """What is stored is not what was certified."""
-    decide = SafetyFilter.decide
+    decide = SafetyFilter.decide_knowing
 
     def turned(*arguments):
         decision = decide(*arguments)
-        return decision._replace(plan=-decision.plan)
+        return decision if decision.stored else decision._replace(plan=-decision.plan)
 
-    patch.setattr(SafetyFilter, "decide", turned)
+    patch.setattr(SafetyFilter, "decide_knowing", turned)
     yield {}
 
 
@@ -181,7 +175,7 @@ def tried(patch, defect, name, mode, through):
     worlds = {
         "no filter": {},
         "downlink not known": {"aware": False},
-        "disturbances twice as large": {"rough": 2.0},
+        "disturbances three times as large": {"rough": 3.0},
         "samples later than promised": {"late": 2},
         "times between samples not counted": {"of": without_the_grid(name)} if "at all times" in name else {},
     }
@@ -198,37 +192,79 @@ VECTOR, SCALAR, LOOP = "VectorSafetyShield", "SafetyShield", "SafeLoop"
 PLANNED = ("cruise", "cart-pole", "batch reactor", "cart-pole, polytope", "batch reactor, polytope")
 BOTH_WAYS = [name for name in CASES if name.endswith("both ways")]
 LINEAR = [name for name in CASES if name not in WITH_REMAINDER]
-STATE = "of the state"
-# Which defect is found in which claim, and where it is sought; whether it counts though the guarantee was withdrawn.
+PROMISED = [name for name in LINEAR if case(name).contract]
+AT_ALL_TIMES = [name for name in CASES if name.endswith("at all times")]
+ONE_STEP = MODES[:3]
+
+
+def turns(names, modes, through):
+    """Each case in one of the modes."""
+    return [(name, modes[c % len(modes)], through) for c, name in enumerate(names)]
+
+
+def each(names, modes, through):
+    return [(name, mode, through) for name in names for mode in modes]
+
+
+STATE = (SAFE_SET, BOX)
+# Which claims become false with which defect, where that is sought, whether it counts though the guarantee was
+# withdrawn, and every how many rows are tried in the part.
 TWINS = {
-    "errors forgotten": (SAFE_SET, False, [(name, MODES[c % 3], VECTOR) for c, name in enumerate(CASES)]),
-    "set enlarged": (STATE, False, [(name, ("lookahead", *MODES[:3])[c % 4], VECTOR) for c, name in enumerate(CASES)]),
-    "no filter": (SAFE_SET, True, [(name, "monitor", SCALAR) for name in CASES]),
-    "disturbances twice as large": (STATE, True, [(name, MODES[c % 4], LOOP) for c, name in enumerate(LINEAR)]),
-    "downlink not known": (SAFE_SET, True, [(name, mode, LOOP) for name in BOTH_WAYS for mode in MODES[:3]]),
-    "samples later than promised": (AGE, True, [(name, "project", LOOP) for name in LINEAR if case(name).contract]),
-    "times between samples not counted": (ALL_TIMES, False, [(name, mode, VECTOR) for name in CASES
-                                          if "at all times" in name for mode in MODES]),
-    "plans checked with nothing": (BOX, False, [(name, "lookahead", VECTOR) for name in PLANNED]),
-    "plans checked with a disturbance less": (BOX, False, [(name, "lookahead", LOOP) for name in PLANNED]),
-    "plans turned round": (BOX, False, [(name, "lookahead", LOOP) for name in PLANNED[:3]]),
-}  # fmt: skip
+    "errors forgotten": ((SAFE_SET,), turns(CASES, ONE_STEP, VECTOR), False, 1),
+    "set enlarged": (STATE, turns(CASES, ("lookahead", *ONE_STEP), VECTOR), False, 3),
+    "no filter": (STATE, turns(CASES, ["monitor"], SCALAR), True, 3),
+    "disturbances three times as large": (STATE, turns(LINEAR, MODES, LOOP), True, 3),
+    "downlink not known": ((SAFE_SET,), each(BOTH_WAYS, ONE_STEP, LOOP), True, 1),
+    "samples later than promised": ((AGE,), turns(PROMISED, MODES, LOOP), True, 3),
+    "times between samples not counted": ((ALL_TIMES,), each(AT_ALL_TIMES, MODES, VECTOR), False, 1),
+    "plans checked with nothing": ((BOX,), each(PLANNED, ["lookahead"], VECTOR), False, 1),
+    "plans checked with a disturbance less": ((BOX,), each(PLANNED, ["lookahead"], LOOP), False, 1),
+    "plans turned round": ((BOX,), each(PLANNED[:3], ["lookahead"], LOOP), False, 1),
+}
 
 
-@pytest.mark.parametrize(
-    ("defect", "name", "mode", "through"),
-    [
-        pytest.param(defect, *row, id="-".join((defect, *row)))
-        for defect, (_, _, rows) in TWINS.items()
-        for row in rows
-    ],
-)
+def twins() -> list:
+    return [
+        pytest.param(defect, *row, id="-".join((defect, *row)), marks=[pytest.mark.slow] if k % every else [])
+        for defect, (_, rows, _, every) in TWINS.items()
+        for k, row in enumerate(rows)
+    ]
+
+
+@pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
 def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
-    claim, anyway, _ = TWINS[defect]
-    found = Outcome()
+    claims, _, anyway, _ = TWINS[defect]
     for outcome in tried(monkeypatch, defect, name, mode, through):
-        found = outcome
-        gauges = found.ever if anyway else found.largest
-        if max(gauges[each] for each in ((SAFE_SET, BOX) if claim == STATE else (claim,))) > 1.0:
+        gauges = outcome.ever if anyway else outcome.largest
+        if max(gauges[claim] for claim in claims) > 1.0:
             return
-    raise AssertionError(dict(found.ever))
+    raise AssertionError(dict(gauges))
+
+
+@pytest.mark.parametrize("name", ["cruise", "cart-pole, position and angle"])
+def test_sensor_noise_larger_than_assumed_takes_errors_out_of_their_ellipsoids(name):
+    outcome, _, _ = through_estimators(case(name), 0, 40, 100, 0, rough=1.5)
+    assert outcome.ever[ERROR] > 1.0
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("name", ["cart-pole", "batch reactor"])
+def test_broken_contract_ends_the_guarantee_before_anything_is_left(name, mode):
+    outcome = attacked(name, mode, LOOP, 0, 0, is_silent=True)
+    assert max(outcome.largest[claim] for claim in STATE) <= 1.0 < outcome.ever[BOX]
+    assert outcome.lost == {OLD_SAMPLE}
+    assert 0 < outcome.counts["guaranteed"] < outcome.counts["steps"]
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("env_id", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
+def test_registered_environments_are_shielded_as_they_come(env_id, mode):
+    made = lambda: gym.make(f"ncs_gym/{env_id}-v0", disturbance="adversarial", terminate_on_violation=False)  # noqa: E731
+    rng, shielded, bare = np.random.default_rng(0), SafetyShield(made(), mode=mode), made()
+    for env, is_left in ((shielded, False), (bare, True)):
+        env.reset(seed=0)
+        for _ in range(120):
+            action = np.where(rng.random(env.action_space.shape) < 0.9, 1.0, -1.0).astype(np.float32)
+            *_, info = env.step(action)
+            assert info.get("shield_guaranteed", True)
+        assert (info["episode_violations"] > 0.0) is is_left

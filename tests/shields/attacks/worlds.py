@@ -234,7 +234,16 @@ def hostile_packets(rng: np.random.Generator, packets: list[Packet], step: int) 
 
 
 def through_loop(
-    case: Case, mode: str, network: int, steps: int, seed: int, *, aware: bool = True, late: int = 0, rough: float = 1.0
+    case: Case,
+    mode: str,
+    network: int,
+    steps: int,
+    seed: int,
+    *,
+    aware: bool = True,
+    late: int = 0,
+    is_silent: bool = False,
+    rough: float = 1.0,
 ) -> Outcome:
     """Attacks `SafeLoop` beside a plant that is written out here, with worst noise and traffic of any pattern.
 
@@ -246,6 +255,7 @@ def through_loop(
         seed: Of everything.
         aware: Whether the loop knows of its downlink.
         late: How many steps older than promised samples may be.
+        is_silent: Whether no sample arrives at all.
         rough: By how much disturbances are larger than assumed.
     """
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
@@ -285,7 +295,7 @@ def through_loop(
         x, present = nominal + adversary.disturbances(nominal, D), plant.A @ present + plant.B @ u[:, None]
         samples = [(plant.H @ x + adversary.noise(N))[:, 0], *samples[:oldest]]
         arrived = [Packet(k + 1 - age, samples[age], loop.episode) for age, _ in uplinks.arrivals(rng, k + 1)]
-        loop.receive(hostile_packets(rng, arrived, k + 1))
+        loop.receive([] if is_silent else hostile_packets(rng, arrived, k + 1))
         watch.step(x, u[:, None], np.array([loop.guaranteed]), np.array([loop.measurement_age]), loop.reason)
         counts["overridden"] += decision.intervened
         counts["planned"] += len(decision.plan) > 0
