@@ -1,14 +1,12 @@
 """The plan test against extreme errors and disturbances, sampled ones, and rational arithmetic."""
 
-from dataclasses import replace
 from decimal import Decimal, localcontext
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym import Ellipsoid, LinearPlant
 from shields import SafetyFilter
 from shields.runtime.backup_plans import PlanTest, Prediction, plan_check
 from shields.runtime.backup_plans.plan_check import Tightening
@@ -17,26 +15,22 @@ from shields.runtime.polytope_step import PolytopeTest
 from shields.runtime.safety_filter import MARGIN
 from shields.verification.rational_matrix import multiply, quadratic, rational
 from tests.certificates import certificate_of
-from tests.plants import random_plant
 from tests.shields.attacks.adversary import farthest
+from tests.shields.attacks.cases import case as attacked_case
 
 STEPS = 5
-PLANTS = {
-    "truck": (truck_trailer(mass=4000.0), None),
-    "cart-pole": (cart_pole(), ChannelContract(4)),
-    "batch reactor": (batch_reactor(), ChannelContract(3)),
-    "n=3 m=2": (replace(random_plant(1, 3, 2), u_max=1.0), None),
-    "n=6 m=2": (replace(random_plant(5, 6, 2), u_max=0.3), None),
-}
+NAMES = (
+    *("cruise", "cart-pole", "batch reactor", "n=4 m=3 p=2", "n=6 m=2 p=3"),
+    *("cart-pole, polytope", "batch reactor, polytope", "servo, polytope alone"),
+)
 
 
-@pytest.fixture(scope="module", params=[*PLANTS, *(f"{name}, polytope" for name in PLANTS)])
+@pytest.fixture(scope="module", params=NAMES)
 def case(request):
-    plant, contract = PLANTS[request.param.removesuffix(", polytope")]
-    certificate = certificate_of(plant, contract, "polytope" if request.param.endswith("polytope") else "ellipsoid")
-    first = SafetyFilter(certificate, plant).test
-    assert isinstance(first, PolytopeTest) == request.param.endswith("polytope")
-    return plant, certificate, PlanTest(Prediction(first, STEPS), MARGIN)
+    known = attacked_case(request.param)
+    first = SafetyFilter(known.certificate, known.plant).test
+    assert isinstance(first, PolytopeTest) == ("polytope" in request.param)
+    return known.plant, known.certificate, PlanTest(Prediction(first, STEPS), MARGIN)
 
 
 def situations(plant, certificate, rng, count):
@@ -60,7 +54,7 @@ def states(plant, x, plan, disturbances):
 
 
 def extreme_ends(plant, x_hat, shape, plan, directions, step):
-    """x_{step+1}, shape (k, n), if error and disturbances all push it in each of the directions (k, n), all they can."""
+    """x_{step+1}, shape (k, n), if error and disturbances push it as far as they can in directions (k, n)."""
     pulls = [directions.T]
     for _ in range(step + 1):
         pulls.append(plant.A.T @ pulls[-1])
@@ -357,7 +351,7 @@ def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thi
     plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=0.0, **QUIET)
     test, rng = PlanTest(Prediction(OneStepTest(1e4 * TILTED @ TILTED.T, plant), 2), 0.0), np.random.default_rng(0)
     nothing, plan, levels = np.zeros((1, 2)), np.zeros((1, 1, 2, 1)), []
-    for _ in range(60):
+    for _ in range(20):
         factor = TILTED @ rng.standard_normal((2, 2)) * [1.0, 0.1]
         shape = factor @ factor.T
         size = edge_of(lambda s, P=shape: test.certified(nothing, test.tightenings_of(s * P[None]), plan)[0, 0, 1], 1e3)
