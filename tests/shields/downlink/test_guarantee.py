@@ -18,7 +18,7 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
-from ncs_gym.network import CommittedInputs
+from ncs_gym.network import CommittedInputs, downlink_protocol
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
@@ -44,15 +44,13 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
-from tests.shields.attacks.extremes import ExtremalNoise
-from tests.shields.backup_plans.adversary import box_ellipsoid
-from tests.shields.downlink.adversary import Case, edges
+from tests.shields.attacks.cases import behind, box_ellipsoid, edges, harmful
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
 THIN = np.array([[1.0, -0.5], [-0.5, 0.25]])
-UNSTABLE = Case(cart_pole(), Channel(loss=0.3, delay=1, max_consecutive_losses=1), Channel(delay=2))
+UNSTABLE = behind(cart_pole(), (Channel(loss=0.3, delay=1, max_consecutive_losses=1), Channel(delay=2)))
 
 
 def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
@@ -68,7 +66,7 @@ def levels(shield, info):
 
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
 def test_every_mode_keeps_its_guarantee(mode):
-    shield = shielded(mode, kind=ExtremalNoise, disturbance="adversarial")
+    shield = shielded(mode, noise="extreme", disturbance="adversarial")
     _, info = shield.reset(seed=0)
     rng = np.random.default_rng(0)
     interventions = 0
@@ -84,7 +82,7 @@ def test_lookahead_keeps_guaranteed_states_in_the_box_under_attack():
     plan_lengths, outside = 0, 0
     for downlink in edges(2).values():
         start = {"initial_set": box_ellipsoid(PLANT, 0.95)}
-        shield = shielded("lookahead", kind=ExtremalNoise, disturbance="adversarial", downlink=downlink, **start)
+        shield = shielded("lookahead", noise="extreme", disturbance="adversarial", downlink=downlink, **start)
         for seed in range(4):
             _, info = shield.reset(seed=seed)
             held, rng = info["shield_guaranteed"], np.random.default_rng(seed)
@@ -325,7 +323,7 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
 def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_sensors_contract_allows():
     """The certificate counts the steps of both channels, the age of a sample those of its own alone."""
     shield = SafetyFilter(UNSTABLE.certificate, UNSTABLE.plant)
-    monitor = GuaranteeMonitor(shield, UNSTABLE.env(1, "random").single.downlink_protocol)
+    monitor = GuaranteeMonitor(shield, downlink_protocol(UNSTABLE.downlink, None))
     n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
     assert UNSTABLE.certificate.contract.max_age == allowed + 2
     largest = np.linalg.eigvalsh(UNSTABLE.certificate.error_shapes).max()
@@ -413,8 +411,10 @@ def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
 def test_vector_shield_keeps_its_guarantee_through_resets(mode, autoreset):
-    case = Case(PLANT, UPLINK, KEPT)
-    env = case.env(12, "outwards", max_episode_steps=9, autoreset_mode=autoreset)
+    case = behind(PLANT, (UPLINK, KEPT))
+    worst = {"noise": "extreme", "disturbance": harmful(PLANT), "initial_set": Ellipsoid(0.09 * case.certificate.L)}
+    settings = {"channel": UPLINK, "downlink": KEPT, "max_episode_steps": 9, "autoreset_mode": autoreset}
+    env = NCSVectorEnv(12, plant=PLANT, **settings, **worst)
     shield = VectorSafetyShield(env, case.certificate, mode)
     _, info = shield.reset(seed=0)
     assert info["shield_guaranteed"].all()

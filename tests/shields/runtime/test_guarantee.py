@@ -9,7 +9,7 @@ from shields import Decision, SafetyFilter
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
-from tests.shields.attacks.extremes import RANDOM, TRUCKS
+from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 
 class Reference:

@@ -14,8 +14,7 @@ from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.interruptions import interrupt, places
-from tests.shields.backup_plans.adversary import box_ellipsoid
-from tests.shields.backup_plans.adversary import case as plan_case
+from tests.shields.attacks.cases import box_ellipsoid, plan_case
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=1)

@@ -21,7 +21,7 @@ from shields.runtime.starts import first_store, starts_known
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests import arrays
 from tests.certificates import certificate_of
-from tests.shields.attacks.extremes import CHANNELS, TRUCKS, harmful
+from tests.shields.attacks.cases import CHANNELS, TRUCKS, harmful
 
 KEYS = {
     "shield_intervened",
