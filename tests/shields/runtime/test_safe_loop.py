@@ -13,7 +13,6 @@ from ncs_gym import (
     ChannelContract,
     Ellipsoid,
     Estimator,
-    NCSEnv,
     Packet,
     UnstablePlantError,
     UnusedPacketsWarning,
@@ -24,10 +23,8 @@ from ncs_gym import (
 )
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
+from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
-from shields.runtime.safety_filter import MODES
-from tests import arrays
 from tests.certificates import certificate_of
 from tests.ncs_gym.estimation.adversary import Traffic
 from tests.shields.attacks.extremes import RANDOM
@@ -53,111 +50,6 @@ def started(name="truck", mode="project", channel=None):
     loop = loop_of(name, mode, channel)
     loop.start(np.zeros(loop.filter.plant.n))
     return loop
-
-
-class Tap:
-    """Overhears what the estimator of an environment is given."""
-
-    def __init__(self, env):
-        self.estimator, self.packets = env.unwrapped.estimator, []
-        self.advance, self.estimator.advance = self.estimator.advance, self._overheard
-
-    def _overheard(self, u, packets):
-        self.packets = list(packets)
-        self.advance(u, self.packets)
-
-
-class Meddler(gym.Wrapper):
-    """Applies something else now and then."""
-
-    def step(self, action):
-        return self.env.step(-action if self.env.unwrapped.steps % 40 == 39 else action)
-
-
-def gust(rng, plant, nominal_next):
-    return (3.0 if rng.random() < 0.03 else 0.9) * plant.nominal_disturbance.sample_boundary(rng)
-
-
-def policy(name, env, rng):
-    plant, M = env.filter.plant, env.certificate.M
-    if name == "random":
-        return lambda info: rng.uniform(-1.5, 1.5, plant.m)
-    return lambda info: np.sign(plant.B.T @ M @ plant.A @ info["estimate"] + 1e-12)
-
-
-def assert_same(loop, info):
-    arrays.assert_equal(loop.estimate, info["estimate"])
-    arrays.assert_equal(loop.error_shape, info["error_shape"])
-    assert (loop.guaranteed, loop.reason) == (info["shield_guaranteed"], info["shield_reason"])
-    assert loop.measurement_age == info["measurement_age"]
-
-
-def follow(env, loop, act, steps, seed, tell=False):
-    """Steps the loop beside the wrapper with the same packets; returns reasons, and whether it intervened."""
-    tap = Tap(env)
-    _, info = env.reset(seed=seed)
-    loop.start(info["estimate"], initial_set=env.unwrapped.start)
-    assert_same(loop, info)
-    reasons, intervened = set(), []
-    for step in range(steps):
-        action, limits = act(info), loop.filter.plant.u_max
-        decision = loop.decide(limits * np.asarray(action, np.float64))
-        *_, info = env.step(action)
-        if not tell:
-            arrays.assert_equal(decision.input, info["input"])
-        assert decision.intervened == info["shield_intervened"]
-        arrays.assert_equal(decision.margin, info["shield_margin"])
-        packets = [
-            packet._replace(episode=loop.episode) for packet in tap.packets[::-1]
-        ]  # not the environment's number
-        loop.receive(packets, applied=info["input"] if tell else None)
-        assert_same(loop, info)
-        assert loop.steps == step + 1 == env.unwrapped.steps
-        reasons.add(loop.reason)
-        intervened.append(decision.intervened)
-    return reasons, intervened
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", LOOPS)
-def test_loop_decides_and_proves_what_the_wrapper_does_with_the_same_packets(name, mode):
-    plant, contract, channel = LOOPS[name]
-    certificate, rng, seen, intervened = certificate_of(plant, contract), np.random.default_rng(0), set(), []
-    for seed, act in enumerate(("random", "outwards")):
-        env = SafetyShield(NCSEnv(plant, channel, disturbance="adversarial", contract=contract), certificate, mode=mode)
-        reasons, overridden = follow(env, loop_of(name, mode), policy(act, env, rng), 80, seed)
-        seen |= reasons
-        intervened += overridden
-    assert (sum(intervened) > 0) is (mode != "lookahead" or name != "n=3 m=2 p=1")  # there a plan saves every proposal
-    assert "" in seen
-    if mode != "monitor" and name != "truck with a contract":  # that channel may break its contract
-        assert seen == {""}
-
-
-@pytest.mark.parametrize("name", ["truck", "cart-pole", "batch reactor"])
-def test_loop_doubts_what_the_wrapper_doubts(name):
-    plant, contract, _ = LOOPS[name]
-    certificate, rng = certificate_of(plant, contract), np.random.default_rng(1)
-    settings = {"disturbance": gust, "allow_assumption_violation": True, "contract": contract}
-    seen = set()
-    for seed, channel in enumerate((Channel(), Channel(loss=0.97))):
-        env = SafetyShield(NCSEnv(plant, channel, **settings), certificate)
-        reasons, _ = follow(env, loop_of(name, channel=channel), policy("random", env, rng), 120, seed)
-        seen |= reasons
-    assert ALARM in seen
-    assert (OLD_SAMPLE in seen) == (name in UNSTABLE)
-    inside_out = Ellipsoid(1.3 * certificate.L)
-    env = SafetyShield(NCSEnv(plant, Channel(), initial_set=inside_out, contract=contract), certificate)
-    start = {follow(env, loop_of(name, channel=Channel()), policy("random", env, rng), 1, s)[0].pop() for s in range(9)}
-    assert "" in start
-
-
-def test_input_that_the_actuator_reports_ends_the_guarantee_as_in_the_wrapper():
-    plant, _, channel = LOOPS["truck"]
-    env = SafetyShield(Meddler(NCSEnv(plant, channel)), certificate_of(plant))
-    act = policy("random", env, np.random.default_rng(0))
-    reasons, _ = follow(env, loop_of("truck"), act, 100, 0, tell=True)
-    assert reasons == {"", OTHER_INPUT}
 
 
 class Plant:
