@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -181,6 +182,10 @@ class LoopBeside:
         self.sent = info["packets"]
         self.assert_same(info)
 
+    def pickle(self) -> None:
+        """Goes on as a loop that was pickled and loaded."""
+        self.loop = self.loops[self.loop.channel] = pickle.loads(pickle.dumps(self.loop))
+
     def decide(self, action: np.ndarray, *, ask: bool) -> None:
         """Decides about the action that the shield is about to be given."""
         self.decision = self.loop.decide(self.loop.filter.plant.u_max * np.asarray(action, np.float64), ask=ask)
@@ -277,6 +282,8 @@ def compare(
             _, infos = outer.reset(options=(options or {}) | {"reset_mask": chosen})
             for index in np.flatnonzero(chosen).tolist():
                 begin(index, infos)
+            if shielded:
+                loops[-1].pickle()
         actions = rng.uniform(-0.1 if held else -1.2, 0.1 if held else 1.2, many.action_space.shape)
         actions += infos["estimate"] @ gain.T if held else 0.0
         if shielded and not held and number % 2:

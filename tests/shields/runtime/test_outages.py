@@ -119,14 +119,6 @@ def test_what_the_loop_says_is_conditional_where_nothing_is_echoed():
     assert (condition in str(told), condition in str(untold)) == (False, True)
 
 
-@pytest.mark.parametrize("echo", [None, 5, ("1", 0, b"", 0), (1, 0, "", 0), (1, 0)])
-def test_what_is_no_echo_is_refused(echo):
-    loop = loop_with()
-    loop.start(np.zeros(4))
-    with pytest.raises(ValueError, match=r"an echo is what Actuator.echo says"):
-        loop.receive(echoes=[echo])
-
-
 @pytest.mark.parametrize("input_delay", [0, 2, 5])
 def test_wild_stamps_and_inputs_do_not_stop_an_actuator(input_delay):
     actuator = Actuator(input_delay, 1, 10.0)
@@ -147,12 +139,6 @@ def test_command_that_comes_early_is_kept_for_its_step():
     actuator.receive([Command(0, np.array([[0.0], [1.0]])), Command(1, np.array([[1.0], [2.0]]))])
     assert [actuator.apply(step).tolist() for step in range(4)] == [[0.0], [1.0], [2.0], [0.0]]
     assert (actuator.missing, actuator.echo.missing) == (True, 1)
-
-
-@pytest.mark.parametrize("u_max", [-1.0, [1.0, 2.0], "10", np.nan])
-def test_limits_of_an_actuator_are_sizes(u_max):
-    with pytest.raises(ValueError, match="u_max must be a size"):
-        Actuator(1, 1, u_max)
 
 
 def far_out(plant, seed):
@@ -189,10 +175,6 @@ def test_wrong_first_estimate_that_is_claimed_to_be_known_is_no_longer_the_only_
     assert loop.guaranteed  # a claim, which may be wrong
     loop.start(np.zeros(4), known=False)
     assert not loop.guaranteed
-    with pytest.raises(ValueError, match="initial_set says what is known"):
-        loop.start(np.zeros(4), np.zeros(4), known=False)
-    with pytest.raises(ValueError, match="known must be"):
-        loop.start(np.zeros(4), known="yes")
 
 
 @pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False), truck_trailer()])

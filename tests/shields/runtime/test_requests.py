@@ -1,6 +1,5 @@
 """Samples on request behind shields and in loops without Gymnasium: the same requests, the same guarantee."""
 
-
 import numpy as np
 import pytest
 
@@ -8,7 +7,6 @@ from ncs_gym import (
     Actuator,
     Channel,
     ChannelContract,
-    Command,
     NCSVectorEnv,
     Packet,
     cart_pole,
@@ -74,24 +72,6 @@ def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, con
             packets |= {} if lost else {step + 1 + late.delay: [sample]}
     assert max(ages) == contract.max_age
     assert len(ages) > 50
-
-
-def test_unused_requests_are_refused_in_one_sentence():
-    plant = truck_trailer(mass=4000.0)
-    loop = SafeLoop(certificate_of(plant), plant, Channel())
-    loop.start(np.zeros(2))
-    loop.receive()
-    with pytest.raises(ValueError, match="on_request=True"):
-        loop.decide(0.0, ask=True)
-    loop.decide(0.0)  # the refused call changed nothing
-    with pytest.raises(ValueError, match="on_request=True"):
-        _ = loop.request
-    loop = SafeLoop(certificate_of(plant), plant, Channel(on_request=True))
-    loop.start(np.zeros(2))
-    with pytest.raises(RuntimeError, match="call decide before request"):
-        _ = loop.request
-    with pytest.raises(ValueError, match="as many requests or none"):
-        Actuator(1, 1).receive([Command(0, np.zeros((2, 1)), 0, (True,))])
 
 
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])

@@ -7,7 +7,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from agents import LoopConfig, SafetyCallback
+from agents import SafetyCallback
 from agents.loop import CostPenalty
 from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
@@ -46,11 +46,6 @@ def test_batches_and_tensors_handed_to_a_filter_are_told_of(certificate, estimat
     with pytest.warns(UserWarning, match=words):
         decision = shield.decide(estimate, certificate.Sigma, proposed)
     assert decision.reason == "invalid"
-
-
-def test_unknown_ids_are_refused_where_a_loop_is_described():
-    with pytest.raises(ValueError, match="'ncs_gym/Nothing-v0' is no registered environment"):
-        LoopConfig(env="ncs_gym/Nothing-v0")
 
 
 def test_infos_without_cost_are_named():
@@ -96,12 +91,6 @@ def test_packets_without_the_number_of_a_later_episode_are_named_once(certificat
         loop.step(0.0, [Packet(2, np.zeros(2))])
     loop.step(0.0, [Packet(3, np.zeros(2))])
     assert loop.discarded.other_episode == 3
-
-
-@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
-def test_settings_of_the_channel_say_where_they_belong(make):
-    with pytest.raises(ValueError, match=r"delay is a setting of the channel: give channel=Channel\(delay=...\)"):
-        make("ncs_gym/TruckTrailerCruise-v0", delay="a", loss=0.1)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

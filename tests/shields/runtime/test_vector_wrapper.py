@@ -3,11 +3,11 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
+from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, Decision, SafetyShield, VectorSafetyShield
+from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor
+from shields import Decision, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
     OLD_SAMPLE,
@@ -265,34 +265,6 @@ def test_works_under_gymnasiums_vector_wrappers():
         episodes += int(info.get("_episode", np.zeros(3)).sum())
         assert info["shield_guaranteed"].all()
     assert episodes == 6
-
-
-def test_wrong_uses_are_refused():
-    class Scaled(VectorActionWrapper):
-        def actions(self, actions):
-            return 0.5 * actions
-
-    class Plain(VectorObservationWrapper):
-        def observations(self, observations):
-            return observations
-
-    env = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2)
-    with pytest.raises(ValueError, match="inside Scaled"):
-        VectorSafetyShield(Scaled(env))
-    with pytest.raises(ValueError, match="inside VectorSafetyShield"):
-        VectorSafetyShield(VectorSafetyShield(env))
-    with pytest.raises(ValueError, match="wrappers="):
-        VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2, vectorization_mode="sync"))
-    with pytest.raises(ValueError, match="mode must be"):
-        VectorSafetyShield(env, mode="off")
-    with pytest.raises(ValueError, match="penalty"):
-        VectorSafetyShield(env, penalty=-1.0)
-    with pytest.raises(ValueError, match="certificate must be"):
-        VectorSafetyShield(env, certificate=7)
-    with pytest.raises(CertificateError):
-        VectorSafetyShield(env, certificate_of(truck_trailer()))
-    with pytest.raises(gym.error.ResetNeeded):
-        VectorSafetyShield(Plain(env)).step(np.zeros((2, 1)))
 
 
 def test_scalar_shields_in_gymnasiums_sync_environment_still_work():
