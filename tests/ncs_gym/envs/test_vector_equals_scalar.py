@@ -152,7 +152,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("most", [1 << 17, 60])
+@pytest.mark.parametrize("most", [pytest.param(1 << 17, marks=pytest.mark.slow), 60])
 @pytest.mark.parametrize("kind", KINDS)
 def test_environments_that_share_a_graph_do_not_notice_each_other(kind, most, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", most)
@@ -181,7 +181,7 @@ def test_a_copy_made_in_the_middle_of_an_episode_goes_on_like_the_original(kind,
     assert_equal(steps_of(twin, 60, seed=1), wanted)
 
 
-@pytest.mark.parametrize("most", [1 << 17, 300])
+@pytest.mark.parametrize("most", [pytest.param(1 << 17, marks=pytest.mark.slow), 300])
 def test_threads_share_a_graph(most, monkeypatch):
     settings = {"plant": truck_trailer(), "channel": Channel(loss=0.3, jitter=3, delay=1)}
 
@@ -214,7 +214,8 @@ def test_threads_share_a_graph(most, monkeypatch):
     ("plant", "channel", "most"),
     [
         (truck_trailer(), Channel(loss=0.3, delay=100, jitter=500), 1 << 22),  # a history takes 20 kB
-        (random_plant(5, 12, 1, p=1), Channel(loss=0.3, jitter=5), 1 << 21),  # statistics take 3 kB and hardly recur
+        # Statistics take 3 kB and hardly recur.
+        pytest.param(random_plant(5, 12, 1, p=1), Channel(loss=0.3, jitter=5), 1 << 21, marks=pytest.mark.slow),
     ],
 )
 def test_graphs_of_long_buffers_and_large_plants_hold_fewer_histories(plant, channel, most, monkeypatch):

@@ -249,7 +249,7 @@ def test_message_recorded_from_a_waiting_sensor_does_not_silence_one_that_is_not
     """A sensor that may be silent for longer than others are is not taken over meanwhile."""
     plant = truck_trailer(mass=4000.0)
     uplink = replace(CHANNEL, on_request=True)
-    world = World(plant, certificate_of(plant, ChannelContract(30)), uplink=uplink, mischief=0.0)
+    world = World(plant, certificate_of(plant), uplink=uplink, mischief=0.0)
     world.run(PRELUDE + 60)
     waiting = [each for each in world.air.recorded if each[1] is world.at_sensor][:3]
     episode, push = world.controller.episode, lambda estimate: plant.u_max * (1.0 if estimate[0] < 0 else -1.0)

@@ -54,7 +54,10 @@ def test_loop_asks_in_every_step_while_the_state_is_not_known():
     assert not asked[-1]
 
 
-@pytest.mark.parametrize(("plant", "contract"), [(PLANT, CONTRACT), (lane_keeping(), ChannelContract(8, 1e-4))])
+@pytest.mark.parametrize(
+    ("plant", "contract"),
+    [(PLANT, CONTRACT), pytest.param(lane_keeping(), ChannelContract(8, 1e-4), marks=pytest.mark.slow)],
+)
 def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, contract):
     late = Channel(0.5, delay=4, max_consecutive_losses=1, quantization_step=1e-4, on_request=True)
     loop = SafeLoop(certificate_of(plant, contract), plant, late, on_unproved="ignore")

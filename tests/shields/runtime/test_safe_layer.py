@@ -5,19 +5,21 @@ import pytest
 import torch
 
 from ncs_gym import truck_trailer
-from shields import SafetyFilter, synthesize
+from shields import SafetyFilter
 from shields.torch import SafeLayer
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 
-@pytest.fixture(scope="module", params=["one input", "two inputs", "three inputs", "polytope"])
+@pytest.fixture(
+    scope="module", params=["one input", "two inputs", "polytope", pytest.param("three inputs", marks=pytest.mark.slow)]
+)
 def setting(request):
     """A plant, its certificate, estimates, inputs and error shapes where many proposals are projected."""
     plant = {"one input": truck_trailer(mass=4000.0)}.get(request.param)
     if plant is None:
         plant = random_plant(0, 4, 3 if request.param == "three inputs" else 2)
-    certificate = synthesize(plant, safe_set="polytope") if request.param == "polytope" else certificate_of(plant)
+    certificate = certificate_of(plant, safe_set="polytope" if request.param == "polytope" else "ellipsoid")
     rng = np.random.default_rng(0)
     estimates = 0.95 * certificate.ellipsoid.sample(rng, 60)
     if request.param == "polytope":

@@ -23,7 +23,7 @@ from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from tests.certificates import certificate_of
 from tests.ncs_gym.estimation.adversary import Traffic
-from tests.shields.attacks.extremes import RANDOM
+from tests.shields.attacks.extremes import RANDOM, TRUCKS
 
 LATE = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=2)
 # Plant, contract, channel.
@@ -210,7 +210,7 @@ def test_what_the_caller_keeps_is_its_own():
 
 
 def test_measurement_of_one_output_may_be_a_number():
-    plant = truck_trailer(H=[[1.0, 0.0]])
+    plant = TRUCKS["4000 kg, position only"]
     loops = [SafeLoop(certificate_of(plant), plant, Channel()) for _ in range(2)]
     for loop, measurement in zip(loops, (0.03, [0.03]), strict=True):
         loop.start([0.0, 0.0])
@@ -294,7 +294,7 @@ def test_memory_does_not_grow(name):
         rng = np.random.default_rng(0)
         state, x = ChannelState(channel, rng), np.zeros(plant.n)
         loop.start(x)
-        for step in range(1, 6_001):
+        for step in range(1, 1_501):
             x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
             loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
         assert loop.guaranteed

@@ -9,8 +9,8 @@ from stable_baselines3.common.monitor import Monitor
 
 from agents import SafetyCallback
 from agents.loop import CostPenalty
-from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
+from ncs_gym import Channel, LinearPlant, NCSEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
+from shields import SafeLoop, SafetyFilter, SafetyShield, synthesize
 from tests.certificates import certificate_of
 
 PLANT = truck_trailer(mass=4000.0)
@@ -117,21 +117,3 @@ def test_monitor_has_the_share_of_guaranteed_states(certificate):
     while not (result := shield.step([0.1]))[3]:
         pass
     assert result[4]["episode"]["episode_guaranteed"] == 8 / 20
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_vector_has_the_same_share(certificate, mode):
-    env = NCSVectorEnv(3, plant=PLANT, max_episode_steps=19, autoreset_mode=mode)
-    shield = VectorSafetyShield(env, certificate, on_unproved="ignore")
-    shield.reset(seed=0)
-    for step in range(45):
-        if step == 7:
-            env._estimator.alarm[1] = True
-        *_, truncated, info = shield.step(np.full((3, 1), 0.1))
-        share = info["final_info"]["episode_guaranteed"] if "final_info" in info else info["episode_guaranteed"]
-        if truncated.any():
-            np.testing.assert_allclose(share, [1.0, 8 / 20 if step < 20 else 1.0, 1.0])
-        elif step == 10:
-            np.testing.assert_allclose(share, [1.0, 8 / 12, 1.0])
-    info = shield.reset(options={"reset_mask": np.array([True, False, False])})[1]
-    assert info["episode_guaranteed"].tolist() == [1.0, 1.0, 1.0]

@@ -76,23 +76,24 @@ def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
     np.testing.assert_array_equal(actions, [[0.25], [1.0]])
 
 
-@pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
+@pytest.mark.parametrize(
+    ("mode", "channel"), [("switch", "bursts"), ("boundary", "overtaking"), *(("project", each) for each in CHANNELS)]
+)
 def test_no_policy_leaves_the_safe_set(mode, channel):
     plant = TRUCKS["4000 kg"]
-    env = NCSVectorEnv(500, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=100)
+    env = NCSVectorEnv(200, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=100)
     shield = VectorSafetyShield(env, certificate_of(plant), mode)
     _, info = shield.reset(seed=0)
     rng, levels, overridden = np.random.default_rng(0), [], 0
     for step in range(200):
         outwards = np.sign(info["estimate"] @ (shield.certificate.M @ plant.B))
-        actions = outwards if step % 2 else rng.uniform(-1, 1, (500, 1))
+        actions = outwards if step % 2 else rng.uniform(-1, 1, (200, 1))
         _, _, _, _, info = shield.step(actions)
         levels.append(np.einsum("ei,ij,ej->e", info["state"], shield.certificate.M, info["state"]).max())
         assert info["shield_guaranteed"].all()
         overridden += int(info["shield_intervened"].sum())
     assert 0.5 < max(levels) <= 1.0
-    assert 0 < overridden < 200 * 500
+    assert 0 < overridden < 200 * 200
 
 
 def test_same_step_autoreset_reports_the_last_step_in_final_info():

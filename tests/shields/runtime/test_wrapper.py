@@ -27,8 +27,8 @@ from shields.runtime.guarantee import (
     OTHER_STEPS,
 )
 from shields.runtime.safety_filter import SafetyFilter
-from tests.certificates import with_proof
-from tests.plants import random_plant
+from tests.certificates import certificate_of, with_proof
+from tests.shields.attacks.extremes import RANDOM
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 KEYS = {
@@ -384,12 +384,22 @@ def test_writing_into_the_infos_changes_no_decision(certificate):
     np.testing.assert_array_equal(*runs)
 
 
+def forge(env):
+    """Adds something to what the packets of an environment carry from now on; returns what took them before."""
+    estimator = env.unwrapped.estimator
+    honest = estimator.advance
+
+    def forged(u, packets):
+        honest(u, [packet._replace(measurement=packet.measurement + 0.6) for packet in packets])
+
+    estimator.advance = forged
+    return honest
+
+
 def test_forged_packet_is_noticed(certificate):
     env = shielded(certificate, channel=Channel())
     env.reset(seed=0)
-    process = env.unwrapped._process
-    honest = process.measure
-    process.measure = lambda rng, state: honest(rng, state) + 0.6
+    forge(env)
     assert env.step(full(None))[4]["shield_reason"] == ALARM
 
 
@@ -464,7 +474,7 @@ def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, rewr
             np.testing.assert_array_equal(one[key], other[key])
         np.testing.assert_array_equal(plain.unwrapped.known.applied, forged.unwrapped.known.applied)
     assert one["shield_guaranteed"]
-    assert one["episode_violations"] == forged.unwrapped._violations == 0.0
+    assert one["episode_violations"] == 0.0
 
 
 def test_interrupted_step_is_noticed(certificate):
@@ -507,22 +517,22 @@ def test_step_before_reset_is_refused(certificate):
 
 def test_alarm_is_cleared_by_a_new_episode(certificate):
     env = shielded(certificate, channel=Channel())
-    process = env.unwrapped._process
     env.reset(seed=0)
-    honest = process.measure
-    process.measure = lambda rng, state: honest(rng, state) + 0.6
+    honest = forge(env)
     env.step(full(None))
-    process.measure = honest
+    env.unwrapped.estimator.advance = honest
     assert env.reset()[1]["shield_guaranteed"]
 
 
 def test_several_inputs_with_partial_measurements_are_shielded():
-    plant = random_plant(1, 3, 2, p=2)
+    plant = RANDOM["n=3 m=2 p=1"]
     channel = Channel(loss=0.4, quantization_step=0.01, delay=1, jitter=2)
     rng = np.random.default_rng(0)
     for mode in ("project", "switch"):
         env = SafetyShield(
-            gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance="adversarial"), mode=mode
+            gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance="adversarial"),
+            certificate_of(plant),
+            mode,
         )
         infos = play(env, lambda info: np.sign(rng.standard_normal(2)).astype(np.float32), seed=0)
         assert all(info["shield_guaranteed"] for info in infos)
