@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from numpy._core._multiarray_umath import __cpu_features__
 
@@ -59,6 +61,14 @@ def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certi
     proofs = list(certificate.proofs)
     proofs[age] = replace(proofs[age], **changes)
     return replace(certificate, proofs=tuple(proofs))
+
+
+@contextmanager
+def feasible_bounds_not_sought() -> Iterator[None]:
+    """Where nothing is asked of the message of `Infeasible`: that search takes longer than the synthesis."""
+    unchanged = mock.Mock(side_effect=lambda infeasible, *others, **more: infeasible)
+    with mock.patch("shields.synthesis.certification.with_feasible_bounds", unchanged):
+        yield
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None, safe_set: str) -> Certificate:
