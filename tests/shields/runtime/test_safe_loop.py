@@ -22,7 +22,7 @@ from shields import SafeLoop
 from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from tests.certificates import certificate_of
-from tests.shields.attacks.cases import RANDOM
+from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 LATE = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=2)
 # Plant, contract, channel.

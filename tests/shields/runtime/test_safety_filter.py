@@ -13,7 +13,7 @@ from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS
 from tests.certificates import certificate_of
 from tests.plants import random_plant
-from tests.shields.attacks.extremes import RANDOM
+from tests.shields.attacks.cases import RANDOM
 
 TWO_STATES = random_plant(3, 2, 1)
 # Actions are so coarse that float32 steps are visible in the test.

@@ -25,7 +25,7 @@ from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant
-from tests.shields.attacks.extremes import RANDOM
+from tests.shields.attacks.cases import RANDOM
 
 TRUCK, CART, REACTOR = truck_trailer(mass=4000.0), cart_pole(), batch_reactor()
 BOUNDS = {"box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "sensor_bound": 0.001, "initial_bound": 0.001}

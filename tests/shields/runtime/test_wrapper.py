@@ -28,7 +28,7 @@ from shields.runtime.guarantee import (
 )
 from shields.runtime.safety_filter import SafetyFilter
 from tests.certificates import certificate_of, with_proof
-from tests.shields.attacks.extremes import RANDOM
+from tests.shields.attacks.cases import RANDOM
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 KEYS = {
