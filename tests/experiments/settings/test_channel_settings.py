@@ -1,10 +1,11 @@
-"""Periods that `ncs channel` cannot read a record by."""
+"""Settings of a channel in words, and periods that `ncs channel` cannot read a record by."""
 
 from pathlib import Path
 
 import pytest
 
 from experiments.settings import ChannelSettings
+from ncs_gym import Channel
 
 
 @pytest.mark.parametrize("period", [0.0, -0.02, float("nan"), float("inf")])
