@@ -102,6 +102,8 @@ TRAINING = {
     "single_file_sac.py",
     "your_gym_env.py",
 }
+# They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
+LONG = {"both_directions.py", "lost_hour.py", "unstable_plant_loop.py"}
 # Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},
@@ -141,7 +143,7 @@ def test_versions_of_foreign_packages_are_those_that_the_page_names():
         assert all(version in row for version in packages.values() if version)
 
 
-@pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - FOREIGN.keys()))
+@pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - LONG - FOREIGN.keys()))
 def test_example_prints_what_it_is_about(name):
     assert_expected(name, output_of_file(ROOT / "examples" / name, *RUNS[name][0]))
 

@@ -22,7 +22,7 @@ class _Executor(Executor):
     """Executes at once what is submitted; arguments and results are pickled as on their way to a process and back."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        monte_carlo_batch._shields.cache_clear()  # a new process has prepared none
+        pass
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future:
         future: Future = Future()

@@ -11,7 +11,7 @@ from experiments.study.figures import study_figures
 from experiments.study.study import quoted, results_page, results_tables
 from experiments.study.tables import tables_by_name
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 STORED = ROOT / "docs" / "results.json"
 
 

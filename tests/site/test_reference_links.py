@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.site_hooks import site_hook
+from tests.site.hooks import site_hook
 
 
 @pytest.fixture(scope="module")

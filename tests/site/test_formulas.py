@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.site_hooks import site_hook
+from tests.site.hooks import site_hook
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 # Backslashes before punctuation are Markdown's on GitHub, signs of order look like HTML, and what is broken over two

@@ -6,7 +6,7 @@ import importlib.util
 from pathlib import Path
 from types import ModuleType
 
-HOOKS = Path(__file__).resolve().parent.parent / "docs" / "hooks"
+HOOKS = Path(__file__).resolve().parents[2] / "docs" / "hooks"
 
 
 def site_hook(name: str) -> ModuleType:
