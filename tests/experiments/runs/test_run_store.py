@@ -8,6 +8,7 @@ from agents.loop import LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
 from experiments.errors import ResultsError
+from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run
@@ -114,8 +115,9 @@ def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, run, 
 
 
 def test_changed_source_is_another_key(run, monkeypatch):
-    before = run.key
-    monkeypatch.setattr("experiments.runs.provenance._source_digest", lambda: "changed")
+    before, changed = run.key, versions() | {"source": "changed"}
+    assert changed != versions()
+    monkeypatch.setattr("experiments.runs.training_run.versions", lambda: changed)
     assert run.key != before
 
 
