@@ -37,11 +37,7 @@ def summary_of_episodes(episodes):
 def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
     episodes = [episode(level) for level in (0.2, 1.0, 1.0 + 1e-9, 7.0, float("nan"))]
     summary = gaussian_summary(0.25, 200, {"shielded": summary_of_episodes(episodes)})
-    assert summary["arms"]["shielded"] == {
-        "episodes": 5,
-        "episodes_outside_set": 3,
-        "rate_ci95": clopper_pearson(3, 5),
-    }
+    assert summary["arms"]["shielded"] == {"episodes": 5, "episodes_outside_set": 3, "rate_ci95": clopper_pearson(3, 5)}
     (sentence,) = gaussian_sentences(summary)
     assert "3 of 5 evaluation episodes [14.66, 94.73 %]" in sentence
     assert "at most 0.25 for an episode of 200 steps" in sentence

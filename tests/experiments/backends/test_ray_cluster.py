@@ -95,10 +95,7 @@ def test_interruption_leaves_what_is_submitted_to_the_executor(run):
 
 
 def test_worker_returns_what_the_run_returns_here(run):
-    result, expected = (
-        portable_task()(versions(), pickle.dumps(run)),
-        run.execute(lambda steps: None),
-    )
+    result, expected = (portable_task()(versions(), pickle.dumps(run)), run.execute(lambda steps: None))
     assert result.episodes == expected.episodes
     assert (result.trajectory.states == expected.trajectory.states).all()
 

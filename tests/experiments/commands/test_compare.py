@@ -219,12 +219,7 @@ def test_results_are_grouped_by_arm_in_the_order_of_runs():
 def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "figures").mkdir()
-    for name in (
-        "summary.json",
-        "report.html",
-        "episodes.parquet",
-        "figures/episode.png",
-    ):
+    for name in ("summary.json", "report.html", "episodes.parquet", "figures/episode.png"):
         (tmp_path / name).write_text("{}")
     with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
         assert not any((tmp_path / "figures").iterdir())

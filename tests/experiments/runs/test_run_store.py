@@ -42,8 +42,7 @@ def test_stored_result_comes_back_exactly(store, run, result):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"certificate_basis": "another plant"}],
+    "change", [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"certificate_basis": "another plant"}]
 )
 def test_result_of_other_settings_is_not_taken(store, run, change):
     assert store.load(replace(run, **change)) is None
