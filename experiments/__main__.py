@@ -69,7 +69,7 @@ def main() -> None:
         if sys.argv[1:] == ["--version"]:
             print(f"ncs-gym {__version__}")
             return
-        settings = _parse(sys.argv[1:])
+        settings = parse(sys.argv[1:])
         with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
             _run(settings)
     except KeyboardInterrupt as interrupt:
@@ -83,7 +83,7 @@ def main() -> None:
         sys.exit(_complain(_sentence(error), _ERROR))
 
 
-def _parse(arguments: list[str]) -> object:
+def parse(arguments: list[str]) -> object:
     """Returns the settings of the chosen command; those of a file given by `--config` replace the defaults."""
     import tyro
 

@@ -183,11 +183,7 @@ def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificat
 def wrapped_outside_monitor(keywords, **settings):
     """What rl-zoo3 does with its env_wrapper and monitor_kwargs."""
     return make_vec_env(
-        CRUISE,
-        seed=0,
-        wrapper_class=SafetyShield,
-        wrapper_kwargs=settings,
-        monitor_kwargs={"info_keywords": keywords},
+        CRUISE, seed=0, wrapper_class=SafetyShield, wrapper_kwargs=settings, monitor_kwargs={"info_keywords": keywords}
     )
 
 

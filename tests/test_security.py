@@ -16,7 +16,7 @@ from agents.agent import Agent
 from agents.agent_file import AgentError
 from agents.loop import LoopConfig
 from agents.training import untrained
-from experiments.__main__ import _parse
+from experiments.__main__ import parse
 from experiments.settings import CompareSettings, StudySettings, config_defaults, save_settings, settings_json
 from shields import Certificate, CertificateError
 from shields.json_documents import digest
@@ -198,7 +198,7 @@ def test_settings_may_name_the_folder_that_they_lie_in(tmp_path, monkeypatch):
     elsewhere.mkdir()
     save_settings(tmp_path / "settings.json", "compare", CompareSettings(out=tmp_path))
     monkeypatch.chdir(elsewhere)
-    assert _parse(["compare", "--config", str(tmp_path / "settings.json")]).out == tmp_path
+    assert parse(["compare", "--config", str(tmp_path / "settings.json")]).out == tmp_path
 
 
 @pytest.mark.parametrize("change", [{"page": "mine.md"}, {"quote": ["mine.md"]}])
@@ -228,8 +228,7 @@ def agent(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["../evil.pth", "/{root}/evil.pth", "..\\evil.pth", "C:\\evil.pth", "x" * 300, "e.pth", "../data", "x\0y"],
+    "name", ["../evil.pth", "/{root}/evil.pth", "..\\evil.pth", "C:\\evil.pth", "x" * 300, "e.pth", "../data", "x\0y"]
 )
 def test_members_of_the_weights_of_others_are_not_unpacked(name, agent, tmp_path):
     data = io.BytesIO()

@@ -62,7 +62,7 @@ def compare(settings: CompareSettings) -> None:
         results = results_of(runs, settings.out, settings)
         episodes = episodes_table(results)
         summary = _summary(settings, loop, certificate, runs, episodes)
-        findings = _findings(summary)
+        findings = findings_of(summary)
         if "gaussian_noise" in summary:
             findings += gaussian_sentences(summary["gaussian_noise"])
         figures = comparison_figures(plant, certificate, summary, by_arm(results))
@@ -117,7 +117,7 @@ def _summary(
     arms = arm_summaries(episodes, settings.mode)
     gaussian = {}
     if settings.noise == "gaussian":
-        gaussian["gaussian_noise"] = _gaussian_noise(loop, certificate, arms)
+        gaussian["gaussian_noise"] = gaussian_noise_of(loop, certificate, arms)
     baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
     compared = episodes[episodes["arm"].isin(settings.arms)]
     return {
@@ -127,7 +127,7 @@ def _summary(
     } | (gaussian | experiment_provenance(settings, loop, certificate, runs))
 
 
-def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+def gaussian_noise_of(loop: LoopConfig, certificate: Certificate, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
 
     The bound is about episodes that begin in the safe set, and behind a downlink stay there until the first decision
@@ -145,7 +145,8 @@ def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[st
     return gaussian_summary(bound, steps, claimed)
 
 
-def _findings(summary: dict[str, Any]) -> list[str]:
+def findings_of(summary: dict[str, Any]) -> list[str]:
+    """Returns what a comparison shows, in sentences."""
     findings = [
         f"{name} is not enough: {arm['train_violation_steps']:,} violating steps in training, "
         f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes in evaluation."

@@ -43,20 +43,20 @@ def sweep(settings: SweepSettings) -> None:
     """Runs `ncs sweep`."""
     ends = {name: tuple(dict.fromkeys((side[0], side[-1]))) for name in _SIDES if (side := getattr(settings, name))}
     settings = short_version(settings, **_SMOKE, **ends)
-    points = _grid_points(settings)
+    points = grid_points(settings)
     for name in ("loss", "delay", "burst_length"):
         if settings.channel.get(name) is not None:
             raise ValueError(f"--channel {name} is a side of the grid: give its values there")
     for name in settings.arms:
         Arm.of(name, settings.mode)
-    loops = [_loop(settings, point) for point in points]
+    loops = [loop_at(settings, point) for point in points]
     require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         runs = [
-            run_of_arm(settings, loop, certificate, name, index, grid_point=_name(point))
+            run_of_arm(settings, loop, certificate, name, index, grid_point=name_of(point))
             for point, loop, certificate in zip(points, loops, certificates, strict=True)
             for index in range(settings.seeds)
             for name in settings.arms
@@ -87,7 +87,8 @@ def sweep(settings: SweepSettings) -> None:
         print(f"files: {settings.out}")
 
 
-def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
+def grid_points(settings: SweepSettings) -> list[_GridPoint]:
+    """Returns the points of the grid; raises ValueError if a side is empty or has a value twice."""
     own_unless_given = ("quantization_steps", "mass_factors", "downlink_losses")
     sides = {name: getattr(settings, name) or ((None,) if name in own_unless_given else ()) for name in _SIDES}
     for name, side in (sides | {"arms": settings.arms}).items():
@@ -96,12 +97,14 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
     return [dict(zip(_SIDES.values(), point, strict=True)) for point in product(*sides.values())]
 
 
-def _name(point: _GridPoint) -> str:
+def name_of(point: _GridPoint) -> str:
+    """Returns the name of a point, a part of the names of its runs."""
     short = {"quantization_step": "q", "burst_length": "burst", "mass_factor": "mass", "downlink_loss": "down"}
     return "-".join(f"{short.get(name, name)}{value}" for name, value in point.items() if value is not None)
 
 
-def _loop(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
+def loop_at(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
+    """Returns the control loop at a point."""
     changes = {name: point[name] for name in ("loss", "delay", "quantization_step") if point[name] is not None}
     if point["burst_length"] and point["loss"]:
         changes["burst_length"] = point["burst_length"]

@@ -40,7 +40,7 @@ _SIZES, _WIDTHS = (12.0, 7.5), (2.6, 1.2)
 _FEW_POINTS = 5
 # The rate of interventions is averaged over this many steps, an episode of 200 in each of 64 environments: it rises and
 # falls with the episodes, which start together.
-_RATE_WINDOW = 64 * 200
+RATE_WINDOW = 64 * 200
 # Largest number of panels side by side.
 _COLUMNS = 4
 # The view is the projection of box and safe set, enlarged by this factor; states farther away are left out.
@@ -143,7 +143,7 @@ def _training_caption(arms: ResultsByArm, is_watched: bool) -> str:
     band = f"Lines are means over {runs} runs per arm, bands reach from the lowest to the highest run."
     text = f"Training. {band if runs > 1 else 'One run per arm, so there is no band.'}"
     if is_watched:
-        text += f" Interventions are rates over the last {_RATE_WINDOW:,} steps (over all, before there are as many)."
+        text += f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many)."
     if "monitor" in arms:
         text += " The monitor's are what the shield would have overridden; its agent is the unshielded one."
     penalized = [name for name in arms if Arm.of(name).penalizes_interventions or Arm.of(name).penalizes_violations]
@@ -167,8 +167,8 @@ def _histories(results: Sequence[RunResult]) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _rates(steps: np.ndarray, totals: np.ndarray) -> np.ndarray:
-    """Returns events per step over the last `_RATE_WINDOW` steps from totals so far, each of shape (runs, points)."""
-    past = np.maximum(steps - _RATE_WINDOW, 0.0)
+    """Returns events per step over the last `RATE_WINDOW` steps from totals so far, each of shape (runs, points)."""
+    past = np.maximum(steps - RATE_WINDOW, 0.0)
     before = np.array([np.interp(past, [0.0, *steps], [0.0, *row]) for row in totals])
     return (totals - before) / (steps - past)
 

@@ -50,7 +50,7 @@ class _Quantity(NamedTuple):
 _VIOLATIONS = "Violations: fraction of evaluation episodes in which the true state violates, over all runs of an arm."
 _RETURN = "Return: mean of the evaluation episodes, without penalties; one color scale for all arms."
 _INTERVENTIONS = "Interventions: fraction of the agent's actions in evaluation that the shield overrides."
-_QUANTITIES = {
+QUANTITIES = {
     "violations": _Quantity("eval_violation_rate", "violating episodes [%]", "OrRd", 0.0, 10.0, _VIOLATIONS),
     "return": _Quantity("eval_return_mean", "mean return", "cividis", None, None, _RETURN, factor=1.0),
     "interventions": _Quantity(
@@ -62,15 +62,15 @@ _QUANTITIES = {
 def sweep_figures(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
     """Returns caption and PNG file of every figure by name; without an arm that has a shield, none of interventions."""
     figures = {}
-    for name, quantity in _QUANTITIES.items():
+    for name, quantity in QUANTITIES.items():
         shown = [arm for arm in arms if not quantity.of_shields or Arm.of(arm).mode is not None]
         if shown:
-            figure = _heatmap(summary["cells"], shown, quantity)
+            figure = sweep_map(summary["cells"], shown, quantity)
             figures[name] = (figure.caption, figure.png)
     return figures
 
 
-def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
+def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
     """Returns one quantity: a panel per arm and combination of what the axes do not show."""
     side = "delay" if all(cell.get("downlink_loss") is None for cell in cells) else "downlink_loss"
     losses, values = (sorted({cell[each] for cell in cells}) for each in ("loss", side))

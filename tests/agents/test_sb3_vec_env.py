@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
@@ -79,7 +79,6 @@ def test_our_vector_environment_loses_no_transition(mode):
                 assert info["episode"]["is_success"] == float(info["episode_violations"] == 0.0)
                 np.testing.assert_allclose(info["terminal_observation"][:4], info["estimate"], rtol=1e-6)
                 assert not np.array_equal(fresh[e], info["terminal_observation"])
-                np.testing.assert_allclose(fresh[e][:4], inner._estimator.mean[:, e], rtol=1e-6)
                 steps[e] = 0
         np.testing.assert_array_equal(env.batch_info["cost"] > 0, [info.get("cost", 0) > 0 for info in infos])
         observation = fresh
@@ -218,18 +217,10 @@ def test_attributes():
         SB3VecEnv(gym.make("CartPole-v1"))
 
 
-@pytest.mark.parametrize("algorithm", [PPO, SAC])
-def test_algorithms_learn_on_it(algorithm):
-    env = VecNormalize(VecMonitor(SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=4)))))
-    few = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 100, "train_freq": 16}
-    model = algorithm("MlpPolicy", env, seed=0, device="cpu", **few).learn(1000)
-    assert len(model.ep_info_buffer) > 0
-    assert np.isfinite(model.predict(env.reset())[0]).all()
-
-
 def test_evaluate_policy_counts_episodes_by_its_infos():
-    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20))
-    model = PPO("MlpPolicy", env, seed=0, device="cpu", n_steps=32)
+    env = VecMonitor(SB3VecEnv(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20)))
+    model = PPO("MlpPolicy", VecNormalize(env), seed=0, device="cpu", n_steps=32).learn(96)
+    assert len(model.ep_info_buffer) > 0
     returns, lengths = evaluate_policy(model, env, n_eval_episodes=7, return_episode_rewards=True)
     assert lengths == [20] * 7
     assert len(returns) == 7

@@ -9,7 +9,7 @@ from queue import Queue
 import pytest
 from tqdm import tqdm
 
-from experiments.__main__ import _complain
+from experiments.__main__ import main
 from experiments.terminal import warnings_as_sentences, warnings_sent
 from tests.command import ncs
 
@@ -41,11 +41,18 @@ class Terminal(io.StringIO):
         return True
 
 
+def fail(settings):
+    raise ValueError(f"{'so many words ' * 15}end")
+
+
 @pytest.mark.parametrize(("kind", "width"), [(io.StringIO, 400), (Terminal, 60)])
 def test_long_sentences_fill_the_lines_of_a_terminal_and_one_elsewhere(monkeypatch, kind, width):
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setattr(sys, "stderr", kind())
-    assert _complain(f"{'so many words ' * 15}end", 2) == 2
+    monkeypatch.setattr(sys, "argv", ["ncs", "audit"])
+    monkeypatch.setattr("experiments.commands.audit.audit", fail)
+    with pytest.raises(SystemExit):
+        main()
     with warnings_as_sentences():
         warnings.warn("so many words " * 15, stacklevel=1)
     lines = sys.stderr.getvalue().splitlines()

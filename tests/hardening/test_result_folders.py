@@ -17,7 +17,6 @@ from experiments.errors import ResultsError
 from experiments.report.text_tables import summary_text
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import _agent_of
 from experiments.settings import AttackSettings, CompareSettings
 from shields.json_documents import document_of
 from tests.command import assert_one_sentence, ncs
@@ -26,19 +25,8 @@ from tests.fuzz import JSON_VALUES, examples
 
 # Names that lead out of a folder on some system, and names that are only wrong.
 NAMES = ["../x.py", "../../x.py", "/{root}/x.py", "sub/x.py", "..\\x.py", "C:\\x.py", "C:x.py", "\\\\host\\share\\x"]
-NAMES += [
-    "",
-    ".",
-    "..",
-    "x\0y",
-    "x" * 300,
-    "model.zip\0",
-    "model.zip/",
-    "./model.zip",
-    "MODEL.ZIP",
-    "README.md",
-    "\ud800",
-]
+NAMES += ["", ".", "..", "x\0y", "x" * 300, "model.zip\0", "model.zip/", "./model.zip", "MODEL.ZIP", "README.md"]
+NAMES += ["\ud800"]
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +89,9 @@ def test_files_of_other_names_are_not_written(name, run, result, tmp_path, monke
     store = RunStore(inside)
     monkeypatch.setattr("tempfile.tempdir", str(inside))
     before = everything_in(tmp_path)
+    other = replace(run, policy_kind="untrained", agent_files={**result.files, name: b"print('mine')"})
     with pytest.raises(AgentError, match="an agent has no file of the name"):
-        _agent_of(replace(run, agent_files={**result.files, name: b"print('mine')"}))
+        other.execute(lambda steps: None)
     with pytest.raises(AgentError, match="an agent has no file of the name"):
         store.save(run, replace(result, files={name: b"print('mine')", **result.files}))
     assert everything_in(tmp_path) == before

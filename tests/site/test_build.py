@@ -41,10 +41,7 @@ def test_page_has_formulas_notes_and_names_on_one_line(tmp_path):
     assert "cdn" not in page
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["[no page](none.md)", "[no anchor](other.md#none)", "[not here](#none)", r"$\frak{$"],
-)
+@pytest.mark.parametrize("text", ["[no page](none.md)", "[no anchor](other.md#none)", "[not here](#none)", r"$\frak{$"])
 def test_broken_page_ends_the_build(tmp_path, text):
     assert built(tmp_path, text).returncode != 0
 

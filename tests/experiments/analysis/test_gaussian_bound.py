@@ -8,7 +8,7 @@ import pytest
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summaries, arm_summary, episodes_table
 from experiments.analysis.statistics import clopper_pearson, gaussian_sentences, gaussian_summary, rounded_up
-from experiments.commands.compare import _findings, _gaussian_noise
+from experiments.commands.compare import findings_of, gaussian_noise_of
 from experiments.runs.experiment import certificate_of, run_of_arm
 from experiments.runs.loops import loop_config
 from experiments.runs.training_run import RunResult
@@ -37,11 +37,7 @@ def summary_of_episodes(episodes):
 def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
     episodes = [episode(level) for level in (0.2, 1.0, 1.0 + 1e-9, 7.0, float("nan"))]
     summary = gaussian_summary(0.25, 200, {"shielded": summary_of_episodes(episodes)})
-    assert summary["arms"]["shielded"] == {
-        "episodes": 5,
-        "episodes_outside_set": 3,
-        "rate_ci95": clopper_pearson(3, 5),
-    }
+    assert summary["arms"]["shielded"] == {"episodes": 5, "episodes_outside_set": 3, "rate_ci95": clopper_pearson(3, 5)}
     (sentence,) = gaussian_sentences(summary)
     assert "3 of 5 evaluation episodes [14.66, 94.73 %]" in sentence
     assert "at most 0.25 for an episode of 200 steps" in sentence
@@ -70,7 +66,7 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     assert run.key != bounded.key
     result = run.execute(lambda steps: None)
     arms = arm_summaries(episodes_table([result, replace(result, arm="monitor")]), "project")
-    summary = _gaussian_noise(*setup, arms)
+    summary = gaussian_noise_of(*setup, arms)
     assert (
         summary["bound_violation_probability"]
         == bound_violation_probability(PLANT, CHANNEL, STEPS)
@@ -87,5 +83,5 @@ def test_proof_is_not_said_to_have_held_under_gaussian_noise():
     arm |= {"mode": "project", "largest_level": 1.2, "eval_violating_episodes": 0, "intervention_rate": 0.1}
     arm["train_intervention_rate"] = 0.1
     summary = {"arms": {"shielded": arm}, "references": {}, "paired_differences": {"baseline": "", "arms": {}}}
-    assert "the proof held in 3 of 4" in _findings(summary)[0]
-    assert "no broken assumption was seen in 3 of 4" in _findings(summary | {"gaussian_noise": {}})[0]
+    assert "the proof held in 3 of 4" in findings_of(summary)[0]
+    assert "no broken assumption was seen in 3 of 4" in findings_of(summary | {"gaussian_noise": {}})[0]

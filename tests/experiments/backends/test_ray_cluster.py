@@ -11,7 +11,7 @@ import pytest
 
 from experiments.backends import execution
 from experiments.backends.execution import execute, results_of
-from experiments.backends.ray_cluster import _execute_on_node, portable_task, require_answer
+from experiments.backends.ray_cluster import portable_task, require_answer
 from experiments.errors import ClusterError, RunError
 from experiments.runs.provenance import versions
 from experiments.settings import BackendSettings
@@ -95,10 +95,7 @@ def test_interruption_leaves_what_is_submitted_to_the_executor(run):
 
 
 def test_worker_returns_what_the_run_returns_here(run):
-    result, expected = (
-        _execute_on_node(versions(), pickle.dumps(run)),
-        run.execute(lambda steps: None),
-    )
+    result, expected = (portable_task()(versions(), pickle.dumps(run)), run.execute(lambda steps: None))
     assert result.episodes == expected.episodes
     assert (result.trajectory.states == expected.trajectory.states).all()
 
@@ -114,14 +111,14 @@ def test_worker_returns_what_the_run_returns_here(run):
 )
 def test_worker_with_other_versions_refuses_before_it_reads_the_run(change, words):
     with pytest.raises(ClusterError, match=words):
-        _execute_on_node(versions() | change, b"no run")
+        portable_task()(versions() | change, b"no run")
 
 
 def test_worker_with_a_package_that_the_driver_lacks_refuses():
     expected = versions()
     del expected["torch"]
     with pytest.raises(ClusterError, match="where the driver has none"):
-        _execute_on_node(expected, b"no run")
+        portable_task()(expected, b"no run")
 
 
 def test_node_without_this_package_says_so(monkeypatch):

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.commands.audit import _text
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from tests.command import ROOT, ncs
@@ -88,9 +87,15 @@ def test_defects_are_counted_once(claims):
     assert defects([claim for claim in claims if claim.verdict != FAILS]) == {}
 
 
+def text_at(claims, width, monkeypatch):
+    """What the command prints on a terminal of a width."""
+    monkeypatch.setattr("experiments.commands.audit.audited_claims", lambda example: iter(claims))
+    return ncs("audit", COLUMNS=str(width)).stdout
+
+
 @pytest.mark.parametrize("width", [60, 80, 100])
-def test_text_fits_the_terminal_and_is_complete(claims, width):
-    text = _text(claims, width)
+def test_text_fits_the_terminal_and_is_complete(claims, width, monkeypatch):
+    text = text_at(claims, width, monkeypatch)
     assert max(map(len, text.splitlines())) <= width
     flat = " ".join(text.split())
     for claim in claims:
@@ -100,22 +105,17 @@ def test_text_fits_the_terminal_and_is_complete(claims, width):
         assert formula in text  # on one line
 
 
-def test_summary_counts_rows_and_distinct_defects(claims):
-    summary = " ".join(_text(claims, 100).split("\n\n")[-1].split())
+def test_summary_counts_rows_and_distinct_defects(claims, monkeypatch):
+    summary = " ".join(text_at(claims, 100, monkeypatch).split("\n\n")[-1].split())
     assert "Of 18 rows 4 hold (2 of them but for rounding), 10 do not hold, 2 are undecided" in summary
     assert "6 distinct defects" in summary
     assert "(rows 5, 6, 12)" in summary
 
 
 def test_text_takes_the_width_of_the_terminal(claims, monkeypatch):
-    monkeypatch.setattr("experiments.commands.audit.audited_claims", lambda example: iter(claims))
-    widths = {columns: _longest_line(ncs("audit", COLUMNS=str(columns)).stdout) for columns in (70, 300)}
-    assert 60 < widths[70] <= 70
-    assert 90 < widths[300] <= 100
-
-
-def _longest_line(text):
-    return max(map(len, text.splitlines()))
+    longest = [max(map(len, text_at(claims, width, monkeypatch).splitlines())) for width in (70, 300)]
+    assert 60 < longest[0] <= 70
+    assert 90 < longest[1] <= 100
 
 
 def test_command_prints_json_and_writes_it(audit):

@@ -8,9 +8,10 @@ from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
-from experiments.commands.compare import _findings, _training_runs
+from experiments.commands.compare import findings_of
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import by_arm
+from experiments.runs.experiment import run_of_arm
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
@@ -22,7 +23,9 @@ CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def runs_of(certificate, **change):
-    return _training_runs(CompareSettings(**change), LoopConfig(env=CRUISE), certificate)
+    settings, loop = CompareSettings(**change), LoopConfig(env=CRUISE)
+    names = settings.arms + settings.baselines
+    return [run_of_arm(settings, loop, certificate, name, i) for i in range(settings.seeds) for name in names]
 
 
 def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(certificate):
@@ -174,7 +177,7 @@ def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(train
     others = {name: arm | {"shielded": False, "train_violation_steps": 0} for name in ("unshielded", "zero input")}
     others["zero input"]["eval_return_mean"] = -60.0
     summary = {"arms": {"unshielded": others["unshielded"], "shielded": arm}, "references": others}
-    findings = _findings(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
+    findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
     nothing = [line for line in findings if "shielded: nothing was overridden" in line]
     assert len(nothing) == (trained == evaluated == 0.0)
     assert any("times the safe set" in line for line in findings) == (not nothing)
@@ -216,12 +219,7 @@ def test_results_are_grouped_by_arm_in_the_order_of_runs():
 def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "figures").mkdir()
-    for name in (
-        "summary.json",
-        "report.html",
-        "episodes.parquet",
-        "figures/episode.png",
-    ):
+    for name in ("summary.json", "report.html", "episodes.parquet", "figures/episode.png"):
         (tmp_path / name).write_text("{}")
     with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
         assert not any((tmp_path / "figures").iterdir())

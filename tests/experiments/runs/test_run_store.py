@@ -8,6 +8,7 @@ from agents.loop import LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
 from experiments.errors import ResultsError
+from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run
@@ -41,8 +42,7 @@ def test_stored_result_comes_back_exactly(store, run, result):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"certificate_basis": "another plant"}],
+    "change", [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"certificate_basis": "another plant"}]
 )
 def test_result_of_other_settings_is_not_taken(store, run, change):
     assert store.load(replace(run, **change)) is None
@@ -114,8 +114,9 @@ def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, run, 
 
 
 def test_changed_source_is_another_key(run, monkeypatch):
-    before = run.key
-    monkeypatch.setattr("experiments.runs.provenance._source_digest", lambda: "changed")
+    before, changed = run.key, versions() | {"source": "changed"}
+    assert changed != versions()
+    monkeypatch.setattr("experiments.runs.training_run.versions", lambda: changed)
     assert run.key != before
 
 

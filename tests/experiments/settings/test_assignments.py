@@ -2,11 +2,11 @@
 
 import pytest
 
-from experiments.__main__ import _parse
+from experiments.__main__ import parse
 
 
 def channel_of(*arguments):
-    return _parse(["compare", *arguments]).channel
+    return parse(["compare", *arguments]).channel
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,12 @@ import sys
 
 import pytest
 
-from experiments.__main__ import COMMANDS, _run
+from experiments.__main__ import COMMANDS
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
 from experiments.settings.learning import CompareSettings, SweepSettings
+from tests.command import assert_one_sentence, ncs
 
 
 @pytest.mark.parametrize("address", ["local", "auto", "head:6379", "my-head.example:6379", "[::1]:1"])
@@ -14,11 +15,11 @@ def test_addresses_of_clusters_are_taken(address):
     assert BackendSettings(engine="ray", ray_address=address, gpus_per_run=0.25, cpus_per_run=0.5).jobs == 2
 
 
-@pytest.mark.parametrize("kind", [CompareSettings, SweepSettings])
-def test_ray_missing_is_one_sentence_that_says_what_to_install(kind, monkeypatch, tmp_path):
+@pytest.mark.parametrize("command", ["compare", "sweep"])
+def test_ray_missing_is_one_sentence_that_says_what_to_install(command, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
-    with pytest.raises(ModuleNotFoundError, match=r"this command needs ray: .* pip install -e '.\[ray\]'"):
-        _run(kind(engine="ray", out=tmp_path / "out"))
+    run = ncs(command, "--engine", "ray", "--out", tmp_path / "out")
+    assert_one_sentence(run, "this command needs ray: ", "pip install -e '.[ray]'")
     assert not (tmp_path / "out").exists()
 
 

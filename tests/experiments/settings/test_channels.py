@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.commands.sweep import _grid_points, _loop, _name
+from experiments.commands.sweep import grid_points, loop_at, name_of
 from experiments.runs.experiment import certificate_of, run_of_arm
-from experiments.runs.loops import _bursts, changed_channel
+from experiments.runs.loops import changed_channel
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
@@ -48,26 +48,28 @@ def test_bursts_need_a_loss_probability():
     own = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5))
     with pytest.raises(ValueError, match="--channel burst_length needs loss"):
         changed_channel(own, {"burst_length": 3.0})
-    assert changed_channel(own, {"burst_length": 3.0, "loss": 0.2}).loss == _bursts(0.2, 3.0, 1)
-    assert changed_channel(OWN, {"burst_length": 3.0}).loss == _bursts(0.3, 3.0, 2)
+    given = {"burst_length": 3.0, "loss": 0.2}
+    assert changed_channel(own, given).loss == changed_channel(Channel(), given).loss
+    assert changed_channel(OWN, {"burst_length": 3.0}).loss == changed_channel(OWN, given | {"loss": 0.3}).loss
 
 
 def test_grid_is_the_product_of_its_sides():
     settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(0.0, 3.0))
-    points = _grid_points(settings)
-    assert len(points) == len({_name(point) for point in points}) == 8
+    points = grid_points(settings)
+    assert len(points) == len({name_of(point) for point in points}) == 8
     lossless, *_, last = points
     own = replace(settings, channel={"jitter": 1})
-    assert _loop(own, lossless).channel == Channel(0.0, 0.1, send_period=2, delay=1, jitter=1)
-    assert _loop(settings, last).channel == Channel(_bursts(0.5, 3.0, 2), 0.2, send_period=2, delay=1)
+    assert loop_at(own, lossless).channel == Channel(0.0, 0.1, send_period=2, delay=1, jitter=1)
+    bursts = changed_channel(OWN, {"loss": 0.5, "burst_length": 3.0}).loss
+    assert loop_at(settings, last).channel == Channel(bursts, 0.2, send_period=2, delay=1)
 
 
 def test_masses_are_a_side_of_the_grid():
     settings = SweepSettings(losses=(0.3,), delays=(0,), mass_factors=(0.9, 1.0, 1.1))
-    points = _grid_points(settings)
+    points = grid_points(settings)
     assert [point["mass_factor"] for point in points] == [0.9, 1.0, 1.1]
-    assert len({_name(point) for point in points}) == 3
-    loop = _loop(replace(settings, env="ncs_gym/Pendulum-v0"), points[0])
+    assert len({name_of(point) for point in points}) == 3
+    loop = loop_at(replace(settings, env="ncs_gym/Pendulum-v0"), points[0])
     run = run_of_arm(settings.completed, loop, certificate_of(loop), "shielded", 0)
     assert ncs_env(run.loop.single()).process == PendulumProcess(mass=0.9)
     assert (
@@ -76,5 +78,5 @@ def test_masses_are_a_side_of_the_grid():
 
 
 def test_points_that_print_alike_have_names_of_their_own():
-    points = _grid_points(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
-    assert len({_name(point) for point in points}) == 2
+    points = grid_points(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
+    assert len({name_of(point) for point in points}) == 2

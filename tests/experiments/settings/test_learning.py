@@ -6,7 +6,7 @@ import pytest
 
 from agents import tuned_hyperparams, tuned_steps
 from agents.hyperparams import DEFAULTS, complete_hyperparams
-from experiments.__main__ import _parse
+from experiments.__main__ import parse
 from experiments.runs.experiment import require_trainable
 from experiments.runs.loops import loop_config
 from experiments.settings import CompareSettings, SweepSettings, TrainSettings, save_settings
@@ -57,7 +57,7 @@ def test_steps_are_a_hyperparameter_of_a_file_too():
 def test_what_is_given_wins_over_the_tuned_value_also_if_it_equals_the_default():
     default, tuned = DEFAULTS["PPO"]["gamma"], tuned_hyperparams(CART_POLE)
     assert tuned["gamma"] != default
-    settings = _parse(["compare", "--env", CART_POLE, "--hyperparams", f"gamma={default}"])
+    settings = parse(["compare", "--env", CART_POLE, "--hyperparams", f"gamma={default}"])
     assert settings.all_hyperparams == tuned | {"gamma": default}
     assert f"tuned for {CART_POLE}, as given gamma: " in settings.agent_line
 
@@ -67,7 +67,7 @@ def test_what_is_given_wins_over_the_file_and_the_file_over_the_tuned_values(tmp
         f"{CART_POLE}:\n  n_timesteps: 5000\n  gamma: 0.5\n  n_steps: 8\n  policy_kwargs: dict(net_arch=[8])\n"
     )
     given = ["--conf-file", str(tmp_path / "mine.yml"), "--hyperparams", "gamma=0.7"]
-    settings, tuned = _parse(["train", "--env", CART_POLE, *given]), tuned_hyperparams(CART_POLE)
+    settings, tuned = parse(["train", "--env", CART_POLE, *given]), tuned_hyperparams(CART_POLE)
     networks = tuned["policy_kwargs"] | {"net_arch": [8]}
     expected = tuned | {"gamma": 0.7, "n_steps": 8, "policy_kwargs": networks}
     assert settings.all_hyperparams == expected
@@ -83,7 +83,7 @@ def test_completed_settings_come_back_whatever_is_tuned_later(tmp_path, monkeypa
     save_settings(tmp_path / "s.json", "compare", completed)
     later = complete_hyperparams("PPO", {"n_epochs": 1, "vf_coef": 0.1, "policy_kwargs": {"log_std_init": 1.0}})
     monkeypatch.setattr("experiments.settings.learning.tuned_hyperparams", lambda *_: later)
-    read = _parse(["compare", "--config", str(tmp_path / "s.json")])
+    read = parse(["compare", "--config", str(tmp_path / "s.json")])
     assert read == completed
     assert read.all_hyperparams == found
     assert "hyperparameters as given: " in read.agent_line
@@ -91,7 +91,7 @@ def test_completed_settings_come_back_whatever_is_tuned_later(tmp_path, monkeypa
 
 def test_file_that_gives_an_environment_alone_gets_its_tuned_hyperparameters(tmp_path):
     save_settings(tmp_path / "s.json", "compare", CompareSettings(env=CART_POLE))
-    read = _parse(["compare", "--config", str(tmp_path / "s.json")])
+    read = parse(["compare", "--config", str(tmp_path / "s.json")])
     assert read.all_hyperparams == tuned_hyperparams(CART_POLE)
 
 

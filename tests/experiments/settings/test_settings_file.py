@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.__main__ import _parse
+from experiments.__main__ import parse
 from experiments.errors import SettingsError
 from experiments.settings import CompareSettings, SweepSettings, config_defaults, save_settings
 
@@ -31,13 +31,13 @@ from experiments.settings import CompareSettings, SweepSettings, config_defaults
 )
 def test_settings_come_back_exactly(command, settings, tmp_path):
     save_settings(tmp_path / "s.json", command, settings)
-    assert _parse([command, "--config", str(tmp_path / "s.json")]) == settings
+    assert parse([command, "--config", str(tmp_path / "s.json")]) == settings
 
 
 def test_flags_of_the_user_win(tmp_path):
     save_settings(tmp_path / "s.json", "compare", CompareSettings(steps=7, arms=("monitor",), smoke=True))
     own = ["compare", "--steps", "9", f"--config={tmp_path / 's.json'}", "--arms", "shielded", "--no-smoke"]
-    read = _parse(own)
+    read = parse(own)
     assert (read.steps, read.arms, read.smoke) == (9, ("shielded",), False)
 
 
@@ -45,7 +45,7 @@ def test_assignments_of_the_user_stand_beside_those_of_the_file(tmp_path):
     kept = CompareSettings(hyperparams={"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}, channel={"delay": 2})
     save_settings(tmp_path / "s.json", "compare", kept)
     given = ["--hyperparams", "policy_kwargs=dict(log_std_init=-1.0)", "--channel", "loss=0.5"]
-    read = _parse(["compare", "--config", str(tmp_path / "s.json"), *given])
+    read = parse(["compare", "--config", str(tmp_path / "s.json"), *given])
     networks = {"net_arch": [8], "log_std_init": -1.0}
     assert read == replace(kept, hyperparams={"gamma": 0.9, "policy_kwargs": networks}, channel=dict(delay=2, loss=0.5))
 
@@ -54,14 +54,14 @@ def test_assignments_of_the_user_stand_beside_those_of_the_file(tmp_path):
 def test_hyperparameters_of_the_file_give_way_to_another_algorithm_and_to_their_own_file(given, tmp_path):
     save_settings(tmp_path / "s.json", "compare", CompareSettings(hyperparams={"n_epochs": 3}))
     config = ["compare", "--config", str(tmp_path / "s.json"), *given]
-    assert _parse(config).hyperparams == {}
-    assert _parse([*config, "--hyperparams", "gamma=0.8"]).hyperparams == {"gamma": 0.8}
+    assert parse(config).hyperparams == {}
+    assert parse([*config, "--hyperparams", "gamma=0.8"]).hyperparams == {"gamma": 0.8}
 
 
 def test_without_config_nothing_changes():
     for arguments in ([], ["--help"], ["--steps", "9"]):
         assert config_defaults(arguments, "compare", CompareSettings) == (None, arguments)
-    assert _parse(["compare", "--steps", "9"]) == CompareSettings(steps=9)
+    assert parse(["compare", "--steps", "9"]) == CompareSettings(steps=9)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_damaged_and_foreign_files_are_one_sentence(content, words, tmp_path):
     if content is not None:
         (tmp_path / "s.json").write_text(content)
     with pytest.raises(SettingsError, match=words) as caught:
-        _parse(["compare", "--config", str(tmp_path / "s.json")])
+        parse(["compare", "--config", str(tmp_path / "s.json")])
     assert "\n" not in str(caught.value)
 
 
@@ -87,14 +87,14 @@ def test_config_is_given_once_and_with_a_file(tmp_path):
     twice = ["compare", "--config", str(tmp_path / "s.json"), "--config", "other.json"]
     for arguments, words in ((twice, "2 times"), (["compare", "--config"], "needs a file")):
         with pytest.raises(SettingsError, match=words):
-            _parse(arguments)
+            parse(arguments)
 
 
 @pytest.mark.parametrize("values", [{"arms": ["shielded", "--seed", "9"]}, {"env": "--help"}])
 def test_values_in_a_file_are_no_flags(values, tmp_path):
     path = written(tmp_path, values)
     name, value = next(iter(values.items()))
-    read = _parse(["compare", "--config", path])
+    read = parse(["compare", "--config", path])
     assert read == replace(CompareSettings(), **{name: tuple(value) if isinstance(value, list) else value})
 
 
@@ -114,7 +114,7 @@ def test_values_in_a_file_are_no_flags(values, tmp_path):
 )
 def test_wrong_values_in_a_file_are_named(values, words, tmp_path):
     with pytest.raises(SettingsError, match=r"hold what ncs compare does not take: ") as caught:
-        _parse(["compare", "--config", written(tmp_path, values)])
+        parse(["compare", "--config", written(tmp_path, values)])
     assert words in str(caught.value)
 
 
