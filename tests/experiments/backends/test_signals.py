@@ -20,18 +20,20 @@ MOMENTS += [(2.0, 0.05), (3.0, 0.15)]
 PATIENCE = 60.0
 
 
+# Ctrl-C is ignored where tests run in the background.
+TAKEN = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+
+
+def started(code, *arguments):
+    """A program in a session of its own, as a terminal starts it."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment()}
+    return subprocess.Popen([sys.executable, "-c", code, *arguments], start_new_session=True, **pipes)
+
+
 def begun(*arguments):
-    """The command in a session of its own, as a terminal starts it, once it begins to start its workers."""
-    taken = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"  # ignored in the background
-    code = f"{taken}; import runpy; runpy.run_module('tests.experiments.backends.endless_runs', run_name='__main__')"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment(),
-        start_new_session=True,
-    )
+    """The command, once it begins to start its workers."""
+    module = "tests.experiments.backends.endless_runs"
+    process = started(f"{TAKEN}; import runpy; runpy.run_module('{module}', run_name='__main__')", *arguments)
     assert process.stdout.readline() == "begins\n"
     return process
 
@@ -114,3 +116,21 @@ def test_workers_end_when_their_parent_is_killed():
     code, errors = ended(process)
     assert code == -signal.SIGKILL
     assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_loop_over_a_network_ends_with_its_processes(number, tmp_path):
+    command = ["loop", "--env", "ncs_gym/LaneKeeping-v0", "--steps", "1000000", "--port", "47810", "--live", "no"]
+    code = (
+        f"{TAKEN}; from experiments.__main__ import main; sys.argv[1:] = {[*command, '--out', str(tmp_path)]}; main()"
+    )
+    process = started(code)
+    deadline = time.monotonic() + PATIENCE
+    while not (tmp_path / "plant-000.csv").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for wait in (0.3, 0.05):
+        time.sleep(wait)
+        send(process, number)
+    _, errors = ended(process)
+    for word in ("Traceback", "Exception", "leaked"):
+        assert word not in errors, errors
