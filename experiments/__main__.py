@@ -58,7 +58,10 @@ def main() -> None:
 
         from experiments.terminal import warnings_as_sentences
 
-        signal.signal(signal.SIGTERM, _interrupt)
+        interruption = _Interruption()
+        signal.signal(signal.SIGTERM, interruption)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # in the background it may be ignored
+            signal.signal(signal.SIGINT, interruption)
         # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         with warnings.catch_warnings(action="ignore"):  # what it would say is an error here
@@ -115,9 +118,25 @@ def _run(settings: object) -> None:
     getattr(import_module(module), function)(settings)
 
 
-def _interrupt(number: int, frame: object) -> None:
-    """Ends on SIGTERM as on Ctrl-C: workers are stopped, finished runs are kept."""
-    raise KeyboardInterrupt
+class _Interruption:
+    """What SIGTERM and Ctrl-C do: the first stops workers and keeps finished runs, another one ends all at once."""
+
+    def __init__(self) -> None:
+        self._is_told = False
+
+    def __call__(self, number: int, frame: object) -> None:
+        if not self._is_told:
+            self._is_told = True
+            raise KeyboardInterrupt
+        if (processes := sys.modules.get("multiprocessing")) is not None:
+            for each in processes.active_children():
+                each.kill()
+        os.write(2, b"" if _said else b"\nncs: interrupted\n")
+        os._exit(_INTERRUPTED)
+
+
+# What was complained of, so that it is said once.
+_said: list[str] = []
 
 
 def _sentence(error: Exception) -> str:
@@ -144,7 +163,8 @@ def _complain(sentence: str, code: int) -> int:
         from experiments.terminal import wrapped
 
         text = wrapped(text, indent=5)
-    print(text, file=sys.stderr)
+    _said.append(sentence)
+    print(text, file=sys.stderr, flush=True)
     return code
 
 

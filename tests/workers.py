@@ -7,58 +7,48 @@ from __future__ import annotations
 
 import contextlib
 import pickle
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
-from queue import Queue
-from threading import Event
+from collections.abc import Iterator
+from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
 from experiments.attack import monte_carlo_batch
+from experiments.backends.execution import LocalWorkers
+from experiments.backends.worker import execute_here
 from experiments.commands import attack
 
 
-class _Executor(Executor):
-    """Executes at once what is submitted; arguments and results are pickled as on their way to a process and back."""
+class _Here(LocalWorkers):
+    """Executes at once what is submitted; runs and results are pickled as on their way to a process and back."""
 
-    def __init__(self, *arguments: Any, **settings: Any) -> None:
-        pass
+    def __init__(self, log_folder: Path | None) -> None:
+        super().__init__(log_folder)
+        self._folder, self._sent = log_folder, []
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future:
+    def submit(self, run: Any) -> Future:
         future: Future = Future()
-        sent = [each if isinstance(each, Queue | Event) else pickle.loads(pickle.dumps(each)) for each in arguments]
         try:
-            future.set_result(pickle.loads(pickle.dumps(function(*sent))))
+            result = execute_here(pickle.loads(pickle.dumps(run)), self._sent.append, lambda: False, self._folder)
+            future.set_result(pickle.loads(pickle.dumps(result)))
         except Exception as error:
             future.set_exception(error)
         return future
 
+    def reports(self) -> Iterator[int | str]:
+        while self._sent:
+            yield self._sent.pop(0)
 
-class _Manager:
-    """Makes queues and events of this process."""
 
-    Queue, Event = Queue, Event
-
-    def __init__(self, **settings: Any) -> None:
-        pass
-
-    def start(self, initializer: Callable[[], None]) -> None:
-        pass
-
-    def __enter__(self) -> _Manager:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
+@contextlib.contextmanager
+def _here(workers: int, log_folder: Path | None = None) -> Iterator[_Here]:
+    yield _Here(log_folder)
 
 
 @contextlib.contextmanager
 def no_worker_processes() -> Iterator[None]:
     """Commands execute their training runs and batches in this process."""
-    with (
-        mock.patch("experiments.backends.execution.ProcessPoolExecutor", _Executor),
-        mock.patch("experiments.backends.execution.SyncManager", _Manager),
-    ):
+    with mock.patch("experiments.backends.execution.local_workers", _here):
         yield
 
 

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
-from multiprocessing.managers import SyncManager
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from queue import Empty, Queue
+from queue import Empty, Queue, SimpleQueue
 from typing import Any, Protocol
 
 from tqdm import tqdm
 
-from experiments.backends.worker_init import initialize_worker
+from experiments.backends.worker import Outcome, signals_blocked, work
 from experiments.errors import RunError, RunStopped
 from experiments.runs.run_store import Run, RunStore
 from experiments.settings import BackendSettings
-from experiments.terminal import warnings_sent
 
 # Period of the progress bar on a terminal and in a file [s].
 _TERMINAL_PERIOD, _FILE_PERIOD = 0.5, 20.0
@@ -144,60 +145,94 @@ def _without_files(result: Any) -> Any:
     return replace(result, files={}) if result.files else result
 
 
-# Smallest number of steps that a worker reports at a time.
-_REPORTED_STEPS = 1000
-
-
 @contextmanager
-def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[_LocalWorkers]:
+def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[LocalWorkers]:
     """Yields worker processes, an `Executor`."""
-    context = multiprocessing.get_context("spawn")
-    manager = SyncManager(ctx=context)
-    manager.start(initialize_worker)
-    with manager, ProcessPoolExecutor(workers, mp_context=context, initializer=initialize_worker) as pool:
-        reports, stop = manager.Queue(), manager.Event()
-        try:
-            yield _LocalWorkers(pool, reports, stop, log_folder)
-        except BaseException as error:
-            stop.set()
-            if isinstance(error, KeyboardInterrupt):
-                print("stopping what runs; Ctrl-C again ends it at once", file=sys.stderr, flush=True)
-            pool.shutdown(cancel_futures=True)
-            raise
+    pool = LocalWorkers(log_folder)
+    try:
+        pool.start(workers)
+        yield pool
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            print("stopping what runs; Ctrl-C again ends it at once", file=sys.stderr, flush=True)
+        pool.stop()
+        raise
+    finally:
+        pool.kill()
 
 
-class _LocalWorkers:
-    """Worker processes, the queue that they report to, and the event that tells them to give up."""
+class LocalWorkers:
+    """Worker processes, each with a thread here that hands it runs, one after the other, and takes what it sends.
 
-    def __init__(self, pool: ProcessPoolExecutor, reports: Any, stop: Any, log_folder: Path | None) -> None:
-        self._pool, self._reports, self._stop, self._log_folder = pool, reports, stop, log_folder
+    Processes and threads are daemons: no end of this process waits for one.
+
+    Args:
+        log_folder: Folder in which runs leave TensorBoard's events; None for none.
+    """
+
+    def __init__(self, log_folder: Path | None) -> None:
+        self._log_folder = log_folder
+        self._submitted: SimpleQueue[tuple[Run, Future[Any]]] = SimpleQueue()
+        self._reports: SimpleQueue[int | str] = SimpleQueue()
+        self._processes: list[BaseProcess] = []
+
+    def start(self, workers: int) -> None:
+        """Starts worker processes."""
+        context = multiprocessing.get_context("spawn")
+        told, self._not_told = context.Pipe(duplex=False)  # closed at this end, it tells all of them to stop
+        with told:
+            for _ in range(workers):
+                here, there = context.Pipe()
+                process = context.Process(target=work, args=(there, told, self._log_folder), daemon=True)
+                with there, signals_blocked():
+                    process.start()
+                    self._processes.append(process)
+                threading.Thread(target=self._serve, args=(here,), daemon=True).start()
 
     def submit(self, run: Run) -> Future[Any]:
-        return self._pool.submit(_execute_here, run, self._reports, self._stop, self._log_folder)
+        """Returns the future result of a run."""
+        future: Future[Any] = Future()
+        self._submitted.put((run, future))
+        return future
 
     def reports(self) -> Iterator[int | str]:
+        """Yields what came since the last call."""
         with suppress(Empty):
             while True:
                 yield self._reports.get_nowait()
 
     def failure(self, run: Run, error: BaseException) -> BaseException:
-        return error if isinstance(error, BrokenExecutor | RunStopped) else RunError.of(run.name, error)
+        """Returns the error of a run, with its name."""
+        return error if isinstance(error, RunError | RunStopped) else RunError.of(run.name, error)
 
+    def stop(self) -> None:
+        """Returns when all that is executed has given up, which it does at its next report, or has ended."""
+        if self._processes:
+            self._not_told.close()
+        for process in self._processes:
+            process.join()
 
-def _execute_here(run: Run, reports: Any, stop: Any, log_folder: Path | None) -> Any:
-    """Executes a run in a worker process; it gives up at its next report (of 0 steps, say) after `stop` is set."""
-    unreported = 0
+    def kill(self) -> None:
+        """Ends all processes at once."""
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.join()
 
-    def report(steps: int) -> None:
-        nonlocal unreported
-        unreported += steps
-        if unreported >= _REPORTED_STEPS or not steps:
-            if stop.is_set():
-                raise RunStopped(f"{run.name} gave up: another run failed, or the user interrupted")
-            reports.put(unreported)
-            unreported = 0
-
-    with warnings_sent(reports.put):
-        result = run.execute(report, log_folder)
-    reports.put(unreported)
-    return result
+    def _serve(self, worker: Connection) -> None:
+        while True:
+            run, future = self._submitted.get()
+            try:
+                worker.send(run)
+                while not isinstance(sent := worker.recv(), Outcome):
+                    self._reports.put(sent)
+            except (EOFError, OSError):
+                future.set_exception(RunError(f"run {run.name}: its worker process ended by itself"))
+                return
+            except Exception as error:  # what cannot be sent, or read
+                future.set_exception(error)
+            else:
+                if sent.error is None:
+                    future.set_result(sent.result)
+                else:
+                    future.set_exception(sent.error)

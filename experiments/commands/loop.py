@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.backends.worker import initialize_worker, signals_blocked
 from experiments.commands import short_version
 from experiments.network_loop.log import rows_of
 from experiments.network_loop.processes import (
@@ -36,7 +37,7 @@ from shields.verification import require_valid
 # Budget of `--smoke`.
 _SMOKE = {"steps": 100}
 # Seconds that a process may take to end, and between two lines of the view.
-_PATIENCE, _PERIOD = 10.0, 1.0
+_PATIENCE, _PERIOD = 1.0, 1.0
 
 
 def loop(settings: LoopSettings) -> None:
@@ -49,10 +50,11 @@ def loop(settings: LoopSettings) -> None:
     network_loop = _network_loop(settings, env)
     others = {"all": (run_plant, run_network), "plant": (run_plant, run_network), "controller": ()}[settings.role]
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=_in_process, args=(run, network_loop)) for run in others]
-    for process in processes:
-        process.start()
+    processes = [context.Process(target=_in_process, args=(run, network_loop), daemon=True) for run in others]
     try:
+        for process in processes:
+            with signals_blocked():
+                process.start()
         if settings.role == "plant":
             print(f"the plant waits for a controller at {settings.host}, port {settings.port}; end it with Ctrl-C")
             with suppress(KeyboardInterrupt):  # which ends both processes, too
@@ -66,12 +68,12 @@ def loop(settings: LoopSettings) -> None:
             if not was_told and alone():
                 raise ChildProcessError("a process of the loop ended by itself; its message is above")
     finally:
-        for process in processes:
+        started = [process for process in processes if process.pid is not None]
+        for process in started:
             process.terminate()
-        for process in processes:
+        for process in started:
             process.join(_PATIENCE)
-            if process.is_alive():
-                process.kill()
+            process.kill()
     summary = summary_of(settings.out)
     write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
     width = max(map(len, summary))
@@ -80,6 +82,7 @@ def loop(settings: LoopSettings) -> None:
 
 def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop) -> None:
     """Runs a process of the loop; the module that registers the environment is imported in each."""
+    initialize_worker()
     try:
         run(network_loop)
     except OSError as error:

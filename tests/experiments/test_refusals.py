@@ -168,7 +168,7 @@ ONE_SENTENCE = [
     (f"loop --env {CRUISE} --channel lag=3", "--channel lag: a channel has no such setting"),
     (f"loop --env {CRUISE} --downlink delay=0", "--downlink: what is sent at each step arrives at the next at best"),
     ("loop --env ncs_gym/Nothing-v0", "ncs_gym/Nothing-v0"),
-    (f"loop --env {CRUISE} --key-file /dev/null --role plant", "must hold at least 16 bytes"),
+    (f"loop --env {CRUISE} --key-file /dev/null --role plant", "not a regular file"),
 ]  # fmt: skip
 
 # There are a file `file` and a folder `here`.

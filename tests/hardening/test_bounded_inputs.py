@@ -285,6 +285,15 @@ def test_key_file_is_a_file(endless, tmp_path):
         loop(LoopSettings(role="plant", key_file=Path(endless), out=tmp_path / "out"))
 
 
+def test_key_that_is_too_short_or_too_long_is_refused(write, tmp_path):
+    from experiments.commands.loop import loop
+    from experiments.settings import LoopSettings
+
+    for key, reason in ((b"short", "at least 16 bytes"), (bytes(5000), "more than 4,096 bytes")):
+        with pytest.raises((ValueError, OSError), match=reason):
+            loop(LoopSettings(role="plant", key_file=write("key", key), out=tmp_path / "out"))
+
+
 def test_log_of_a_loop_with_one_long_line_is_read_in_pieces(write, tmp_path):
     from experiments.network_loop.log import rows_of
 

@@ -1,13 +1,12 @@
 """Worker processes: what becomes of the others when one fails."""
 
-import threading
 import time
 from dataclasses import replace
-from queue import Queue
 
 import pytest
 
-from experiments.backends.execution import _execute_here, execute, local_workers, results_of
+from experiments.backends.execution import execute, local_workers, results_of
+from experiments.backends.worker import execute_here
 from experiments.errors import RunStopped
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run
@@ -20,11 +19,10 @@ def endless(certificate):
 
 
 def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
-    reports, stop = Queue(), threading.Event()
-    stop.set()
+    reports = []
     with pytest.raises(RunStopped, match="zero-input-0"):
-        _execute_here(endless, reports, stop, None)
-    assert reports.empty()
+        execute_here(endless, reports.append, lambda: True, None)
+    assert reports == []
 
 
 def test_a_run_told_to_stop_gives_up_where_it_reports_no_steps():
@@ -34,11 +32,9 @@ def test_a_run_told_to_stop_gives_up_where_it_reports_no_steps():
         def execute(self, on_progress, log_folder=None):
             on_progress(0)
 
-    stop = threading.Event()
-    _execute_here(Asking(), Queue(), stop, None)
-    stop.set()
+    execute_here(Asking(), print, lambda: False, None)
     with pytest.raises(RunStopped, match="asking"):
-        _execute_here(Asking(), Queue(), stop, None)
+        execute_here(Asking(), print, lambda: True, None)
 
 
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
