@@ -168,15 +168,6 @@ def test_observation_is_the_estimate_and_the_tasks_entries():
     assert observation.shape == (3,)
 
 
-def test_observation_is_clipped_but_the_estimate_is_not():
-    env = make(IDS[0])
-    far = np.array([50.0, 0.0])
-    observation, info = env.reset(options={"state": far})
-    assert observation in env.observation_space
-    assert observation[0] < 3.0
-    assert info["estimate"][0] == pytest.approx(50.0, abs=0.1)
-
-
 def test_full_throttle_under_the_worst_disturbance_stays_in_the_observation_space():
     env = make(IDS[1], disturbance="adversarial")
     for sign in (1.0, -1.0):

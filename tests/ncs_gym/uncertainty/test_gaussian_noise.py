@@ -1,6 +1,5 @@
 """Noise without a bound: what is untruncated and what stays bounded, and the probability that a bound is left."""
 
-import json
 from fractions import Fraction
 
 import gymnasium as gym
@@ -15,13 +14,10 @@ from ncs_gym import (
     NCSEnv,
     NCSVectorEnv,
     bound_violation_probability,
-    cart_pole,
     truck_trailer,
 )
-from ncs_gym.registration import registered_ids
-from tests.plants import random_plant
 
-IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor")
+IDS = ("TruckTrailer", "CartPole")
 DELTA = 0.2
 CALM = {"A": [[0.5]], "B": [[1.0]], "box": [[1.0]], "u_max": 1.0, "dt": 0.1, "delta": DELTA}
 
@@ -63,10 +59,7 @@ def test_gaussian_noise_is_that_of_the_covariances_and_truncated_noise_is_not(ma
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_registered_environments_take_it_and_their_spec_is_json(name):
-    env = gym.make(f"ncs_gym/{name}-v0", noise="gaussian")
-    again = gym.make(type(env.spec).from_json(env.spec.to_json()))
-    assert json.loads(env.spec.to_json())["kwargs"]["noise"] == again.unwrapped.noise == "gaussian"
+def test_errors_of_registered_environments_leave_their_bounds(name):
     many = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=64, noise="gaussian", max_episode_steps=None)
     escaped = False
     _, info = many.reset(seed=0)
@@ -75,7 +68,6 @@ def test_registered_environments_take_it_and_their_spec_is_json(name):
         escaped |= bool((np.einsum("ki,ki->k", errors, np.linalg.solve(shapes, errors[..., None])[..., 0]) > 1.0).any())
         *_, info = many.step(np.zeros(many.action_space.shape, np.float32))
     assert escaped  # at delta = 0.05 some of 64 first errors alone lie outside their bound
-    assert f"ncs_gym/{name}-v0" in registered_ids()
 
 
 def test_what_is_bounded_by_declaration_stays_inside_its_bound():
@@ -90,14 +82,6 @@ def test_what_is_bounded_by_declaration_stays_inside_its_bound():
             moved, measured, errors = draws_of(env, 1000)
             sizes = {"disturbance_bound": moved, "sensor_bound": measured, "initial_bound": errors}
             assert 0.9 * bounds[kept] < np.abs(sizes[kept]).max() <= bounds[kept] * (1.0 + 1e-9)
-
-
-def test_plant_that_declares_bounds_only_is_refused():
-    plant = LinearPlant(**CALM, gamma=0.01, sensor_bound=0.1, initial_bound=0.1)
-    for make in (lambda: NCSEnv(plant, noise="gaussian"), lambda: NCSVectorEnv(2, plant=plant, noise="gaussian")):
-        with pytest.raises(ValueError, match="needs a covariance"):
-            make()
-    assert bound_violation_probability(plant, Channel(), 10**6) == 0.0
 
 
 class OwnBall(BallDisturbance):
@@ -161,6 +145,8 @@ def test_bound_violation_probability_counts_only_what_is_gaussian():
             **CALM | {"delta": 1e-4}, gamma=0.1, sensor_bound=0.1, initial_bound=0.1, **{name: [[1e-3]]}
         )
         assert bound_violation_probability(plant, channel, 100) == pytest.approx(draws * 1e-4, rel=1e-9)
+    bounded = LinearPlant(**CALM, gamma=0.01, sensor_bound=0.1, initial_bound=0.1)
+    assert bound_violation_probability(bounded, channel, 10**6) == 0.0
     assert bound_violation_probability(truck_trailer(), channel, 10**6) == 1.0
     assert bound_violation_probability(truck_trailer(delta=1e-3), channel, 0) == pytest.approx(1e-3, rel=1e-9)
 
@@ -181,18 +167,6 @@ def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
             escaped |= plant.sensor_noise.bound.gauge(env._process.measure(rng, zero).T) > 1.0
     bound = bound_violation_probability(plant, channel, steps)
     assert 0.8 * bound < escaped.mean() < bound
-
-
-@pytest.mark.parametrize(
-    ("plant", "channel"), [(random_plant(3, 3, 2, p=2), Channel(loss=0.3, jitter=2)), (cart_pole(delta=0.5), Channel())]
-)
-def test_environments_with_the_same_seed_are_the_same(plant, channel):
-    runs = []
-    for _ in range(2):
-        env = NCSEnv(plant, channel, noise="gaussian")
-        infos = [env.reset(seed=3)[1]] + [env.step(np.zeros(plant.m, np.float32))[4] for _ in range(50)]
-        runs.append(np.array([info["state"] for info in infos]))
-    np.testing.assert_array_equal(*runs)
 
 
 def test_extreme_noise_lies_on_the_bounds_in_scalar_and_vector_environments():
