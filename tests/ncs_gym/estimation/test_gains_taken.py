@@ -1,21 +1,8 @@
 """How often the gain that the estimator takes is the Kalman gain, as the pages say."""
 
-import numpy as np
 import pytest
 
-from benchmarks.kalman_gain import KINDS, gains_taken, kalman_gain
-from ncs_gym import Channel, Estimator, truck_trailer
-from ncs_gym.estimation.kalman_filter import ErrorRecursion
-
-
-def test_kalman_gain_of_the_count_is_filterpys():
-    plant, q = truck_trailer(), 0.05
-    recursion = ErrorRecursion(plant, q, Estimator(plant, Channel()).error_set)
-    covariance = np.array([[2e-3, 1e-4], [1e-4, 1e-3]])
-    sensor = plant.kalman_covariances[1] + q**2 / 12.0 * np.eye(2)
-    np.testing.assert_allclose(
-        kalman_gain(plant, covariance, sensor), recursion._kalman_update(covariance)[0], rtol=1e-12
-    )
+from benchmarks.kalman_gain import KINDS, gains_taken
 
 
 @pytest.mark.parametrize(
