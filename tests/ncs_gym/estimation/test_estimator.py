@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.kalman_gain import KINDS, gains_taken
 from ncs_gym import (
     Channel,
     ChannelContract,
@@ -374,3 +375,19 @@ def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bo
             passed[share] += residual @ inverse @ residual <= 1.0
     assert passed[1] == 0
     assert passed[0] == 60 or condition > 1e4  # what is not vouched for goes to the exact test
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "least"),
+    [
+        ("TruckTrailer", "Kalman", 1.0),
+        ("TruckTrailerCruise", "Kalman", 1.0),
+        ("CartPole", "set-membership", 0.99),
+        ("BatchReactor", "certified", 0.95),
+    ],
+)
+def test_gain_taken_is_the_kalman_gain_on_the_trucks_and_almost_never_on_the_unstable_plants(name, kind, least):
+    counts = gains_taken(f"ncs_gym/{name}-v0", episodes=1)
+    assert set(counts) <= set(KINDS)
+    assert sum(counts.values()) > 50
+    assert counts[kind] >= least * sum(counts.values())

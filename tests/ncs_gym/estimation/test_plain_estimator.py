@@ -77,7 +77,7 @@ def assert_equal(estimator, plain, step):
 
 
 def compare(plant, channel, error_set, seed, steps):
-    """Runs both; returns the ages and how often the alarm was raised."""
+    """Runs both, the first one twice as a copy of itself; returns the ages and how often the alarm was raised."""
     rng = np.random.default_rng(seed)
     histories = histories_of(plant, channel, error_set)
     one = Estimator(plant, channel, histories=histories)
@@ -90,6 +90,7 @@ def compare(plant, channel, error_set, seed, steps):
         for step, (u, packets) in enumerate(traffic(plant, channel, rng, steps // (episode + 1)), 1):
             own = [packet._replace(episode=episode) for packet in packets]
             foreign = [each._replace(episode=1 - episode, measurement=each.measurement + 1e-3) for each in own]
+            one = copy.deepcopy(one) if step == 17 else pickle.loads(pickle.dumps(one)) if step == 34 else one
             one.advance(u, [*foreign, *own])
             other.advance(u, packets)
             assert_equal(one, other, step)
@@ -151,21 +152,3 @@ def test_estimator_equals_the_plain_one_for_long_also_where_it_forgets_in_the_mi
     assert alarms > 0
     assert len(forgotten) >= 5
     assert max(forgotten) < 60
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_a_copy_goes_on_like_the_original(name):
-    plant, channel, contract = CASES[name]
-    error_set, rng = certified_error_set(plant, contract), np.random.default_rng(2)
-    one = Estimator(plant, channel, histories=histories_of(plant, channel, error_set))
-    steps = list(traffic(plant, channel, rng, 120))
-    for u, packets in steps[:60]:
-        one.advance(u, packets)
-    copies = [copy.deepcopy(one), pickle.loads(pickle.dumps(one)), pickle.loads(pickle.dumps(copy.deepcopy(one)))]
-    for step, (u, packets) in enumerate(steps[60:]):
-        for each in (one, *copies):
-            each.advance(u, packets)
-        for each in copies:
-            for value, wanted in zip(each.estimate, one.estimate, strict=True):
-                arrays.assert_equal(value, wanted, f"step {step}")
-            assert (each.age, each.alarm) == (one.age, one.alarm)

@@ -192,28 +192,11 @@ def test_long_outages_end_no_episode_with_an_exception(outage):
         contract = ChannelContract(2)
         estimator = Estimator(plant, Channel(), certified_error_set(plant, contract))
         estimator.reset(np.zeros(plant.n))
-        for step in range(1, outage + 50):
-            packets = [] if step < outage else [Packet(step, np.zeros(plant.p))]
-            estimator.advance(np.zeros(plant.m), packets)
+        with np.errstate(all="raise", under="ignore"):
+            for step in range(1, outage + 50):
+                packets = [] if step < outage else [Packet(step, np.zeros(plant.p))]
+                estimator.advance(np.zeros(plant.m), packets)
         assert np.isfinite(estimator.estimate.mean).all()
-
-
-def test_observation_box_holds_estimates_of_every_age_and_is_finite():
-    plant = LinearPlant(
-        A=np.diag([1.05, 0.01]),
-        B=np.ones((2, 1)),
-        box=np.eye(2),
-        u_max=1.0,
-        dt=0.1,
-        gamma=1e-6,
-        initial_cov=0.01 * np.eye(2),
-    )
-    env = NCSEnv(plant, Channel(delay=4))
-    for seed in range(100):
-        observation, info = env.reset(seed=seed)
-        np.testing.assert_array_equal(observation, info["estimate"].astype(np.float32))
-    fast = NCSEnv(LinearPlant(A=[[2.0]], B=[[1.0]], box=[[1.0]], u_max=3.0, dt=0.1, gamma=1e-6), Channel())
-    assert np.isfinite(fast.observation_space.high).all()
 
 
 def test_prediction_falls_back_to_the_certified_set(monkeypatch):

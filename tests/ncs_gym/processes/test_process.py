@@ -199,6 +199,7 @@ def test_remainder_is_left_to_the_process():
     left_out = Remainder(Ellipsoid(0.01 * np.eye(2)), True, "an example")
     whole = plant(disturbance_bound=0.0, remainder=left_out)
     np.testing.assert_allclose(whole.disturbance.shape_matrix, 0.01 * np.eye(2), rtol=1e-6)
+    assert whole.without_remainder.fingerprint == plant(disturbance_bound=0.0).fingerprint != whole.fingerprint
     for process, moves in ((LinearProcess(), True), (FunctionProcess(linear), False)):
         env = NCSEnv(whole, process=process, disturbance="sphere")
         _, info = env.reset(seed=0)
@@ -222,18 +223,6 @@ def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many, lo
         np.testing.assert_array_equal(info["assumption_violated"], [True, False] if many else True)
     _, info = env.reset()
     assert not np.any(info["assumption_violated"])
-
-
-def test_file_of_a_plant_keeps_its_remainder(tmp_path):
-    whole = plant(remainder=Remainder(Ellipsoid(0.01 * np.eye(2)), False, "an example"))
-    whole.save(tmp_path / "plant.json")
-    twin = LinearPlant.load(tmp_path / "plant.json")
-    assert twin.fingerprint == whole.fingerprint != whole.without_remainder.fingerprint
-    assert twin.assumptions == whole.assumptions
-    assert any(
-        "is assumed to lie in its bound while the state is in the box: an example" in s for s in twin.assumptions
-    )
-    assert whole.without_remainder.fingerprint == plant().fingerprint
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

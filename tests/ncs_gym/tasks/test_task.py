@@ -90,7 +90,7 @@ def test_change_of_the_input_has_its_price_and_the_last_input_is_observed(plant)
     )
 
 
-def test_targets_beyond_every_equilibrium_are_refused():
+def test_farthest_equilibrium_is_where_full_throttle_holds_the_coupling():
     plant = truck_trailer()
     farthest = farthest_equilibrium(plant, np.array([1.0, 0.0]))
     assert farthest == pytest.approx(1000.0 * 4.0 / 4500.0)  # the coupling's pull at full throttle
