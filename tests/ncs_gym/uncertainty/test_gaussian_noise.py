@@ -16,6 +16,7 @@ from ncs_gym import (
     bound_violation_probability,
     truck_trailer,
 )
+from ncs_gym.processes.plant_step import PlantSimulation
 
 IDS = ("TruckTrailer", "CartPole")
 DELTA = 0.2
@@ -27,9 +28,15 @@ def energies(covariance, draws):
     return np.einsum("ki,ij,kj->k", draws, np.linalg.inv(covariance), draws)
 
 
+def simulation_of(env):
+    """What moves one environment or many."""
+    size = env.num_envs if isinstance(env, NCSVectorEnv) else None
+    return PlantSimulation(env.plant, env.disturbance, env.allow_assumption_violation, size, noise=env.noise)
+
+
 def draws_of(env, count):
     """Process noise plus disturbance, sensor noise and first errors, by what moves one environment or many."""
-    rng, process, plant = np.random.default_rng(0), env._process, env.plant
+    rng, process, plant = np.random.default_rng(0), simulation_of(env), env.plant
     shape = (plant.n,) if process.size is None else (plant.n, process.size)
     memory = process.begin(rng, process.size)
     zero, steps = np.zeros(shape), 0 if process.size is None else np.zeros(process.size, np.int64)
@@ -139,17 +146,14 @@ def test_bound_violation_probability_counts_only_what_is_gaussian():
 def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
     # Escapes counted where they happen, draw by draw: with independent draws the union bound is nearly attained.
     plant, channel, steps, count = truck_trailer(gamma=0.0, delta=5e-4), Channel(send_period=2), 200, 2000
-    env = NCSVectorEnv(count, plant=plant, channel=channel, noise="gaussian")
-    rng, escaped = (
-        np.random.default_rng(1),
-        plant.initial_noise.bound.gauge(env._process.first_error(np.random.default_rng(0), count).T) > 1.0,
-    )
-    zero, none = np.zeros((2, count)), np.zeros(count, np.int64)
-    memory = env._process.begin(rng, count)
+    process = simulation_of(NCSVectorEnv(count, plant=plant, channel=channel, noise="gaussian"))
+    rng, zero, none = np.random.default_rng(1), np.zeros((2, count)), np.zeros(count, np.int64)
+    escaped = plant.initial_noise.bound.gauge(process.first_error(np.random.default_rng(0), count).T) > 1.0
+    memory = process.begin(rng, count)
     for step in range(1, steps + 1):
-        escaped |= plant.process_noise.bound.gauge(env._process.draw_disturbance(rng, zero, none, memory).T) > 1.0
+        escaped |= plant.process_noise.bound.gauge(process.draw_disturbance(rng, zero, none, memory).T) > 1.0
         if step % channel.send_period == 0:
-            escaped |= plant.sensor_noise.bound.gauge(env._process.measure(rng, zero).T) > 1.0
+            escaped |= plant.sensor_noise.bound.gauge(process.measure(rng, zero).T) > 1.0
     bound = bound_violation_probability(plant, channel, steps)
     assert 0.8 * bound < escaped.mean() < bound
 
@@ -159,5 +163,5 @@ def test_extreme_noise_lies_on_the_bounds_in_scalar_and_vector_environments():
     for env in both(plant, noise="extreme"):
         _, info = env.reset(seed=3)
         np.testing.assert_allclose(np.abs(info["estimation_error"]), 0.2, rtol=1e-9)
-        measured = env.unwrapped._process.measure(env.unwrapped.np_random, 0.0 * np.atleast_1d(info["state"]).T)
+        measured = simulation_of(env).measure(np.random.default_rng(0), 0.0 * np.atleast_1d(info["state"]).T)
         np.testing.assert_allclose(np.abs(measured), 0.1, rtol=1e-9)
