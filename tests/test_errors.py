@@ -35,11 +35,14 @@ def test_every_message_is_one_sentence():
 
 
 def test_every_class_of_ours_is_expected_by_a_test():
+    """Beside `pytest.raises` or `pytest.warns`, or in a row of a table of refusals."""
     expected = set()
     for path in Path(__file__).parent.rglob("test_*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("pytest.raises", "pytest.warns"):
-                expected |= {name.id for name in ast.walk(node.args[0]) if isinstance(name, ast.Name)}
+        text = path.read_text()
+        for beside in re.findall(r"pytest\.(?:raises|warns)\((\([^)]*\)|[\w.]+)", text):
+            expected |= set(re.findall(r"\w+", beside))
+        if path.name == "test_refusals.py":
+            expected |= set(re.findall(r"\w+Error\b", text.split("\n\n\n", 1)[1]))
     assert {name for _, name in exceptions()} - expected == set()
 
 

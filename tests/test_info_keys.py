@@ -64,9 +64,11 @@ def test_page_names_every_key_once():
 
 
 @pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
-def test_docstrings_have_every_key_of_one_environment(loop, mode):
+def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env_id, certificate = loop
-    env = gym.make(env_id) if mode is None else SafetyShield(gym.make(env_id), certificate, mode)
+    env, envs = gym.make(env_id), gym.make_vec(env_id, num_envs=NUMBER)
+    if mode is not None:
+        env, envs = SafetyShield(env, certificate, mode), VectorSafetyShield(envs, certificate, mode)
     expected = kinds(mode)
     for info in infos(env, 4):
         assert set(info) == set(expected)
@@ -74,14 +76,6 @@ def test_docstrings_have_every_key_of_one_environment(loop, mode):
             assert_is(info[key], kind, env.unwrapped.plant)
         if env.unwrapped.downlink is None:  # else the estimate is that of a later state
             np.testing.assert_array_equal(info["estimation_error"], info["estimate"] - info["state"])
-
-
-@pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
-def test_docstrings_have_every_key_of_many_environments(loop, mode):
-    env_id, certificate = loop
-    envs = gym.make_vec(env_id, num_envs=NUMBER)
-    envs = envs if mode is None else VectorSafetyShield(envs, certificate, mode)
-    expected = kinds(mode)
     for info in infos(envs, 4):
         assert set(info) == set(expected)
         for key, kind in expected.items():

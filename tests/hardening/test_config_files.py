@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.settings import CompareSettings, SweepSettings
-from experiments.settings.settings_file import _OF_THE_MACHINE, FORMAT, settings_json
+from experiments.settings.settings_file import FORMAT, settings_json
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import JSON_VALUES as JSON
 from tests.fuzz import examples
 
+OF_THE_MACHINE = ("engine", "ray_address", "ray_wait", "cpus_per_run", "gpus_per_run")  # which are not read
 GOOD = {"compare": CompareSettings(), "sweep": SweepSettings()}
 NAMES = sorted(
     {*settings_json("compare", CompareSettings())["settings"], "no-smoke", "smoke=", "x", "hyperparams.gamma", "--seed"}
@@ -62,7 +63,7 @@ def assert_means(given, read):
 def assert_refused_or_meant(values, folder):
     read = outcome(document(values), folder)
     if read is not None:
-        paths = ("out", "certificate", "config", *_OF_THE_MACHINE)  # those of the machine are not read
+        paths = ("out", "certificate", "config", *OF_THE_MACHINE)
         whole = settings_json("compare", read)["settings"]
         assert_means({name: value for name, value in values.items() if name not in paths}, whole)
         untouched = settings_json("compare", CompareSettings())["settings"]

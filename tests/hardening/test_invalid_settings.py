@@ -99,6 +99,7 @@ REFUSED = {
         "send_period": POSITIVE_COUNTS,
         **dict.fromkeys(("delay", "jitter"), NOT_DELAYS),
         "max_consecutive_losses": COUNTS,
+        "on_request": FLAGS,
     },
     ChannelContract: {"max_age": [*COUNTS, None, 1001]},
     Regulation: {"state_cost": NOT_COSTS},
@@ -123,6 +124,7 @@ REFUSED = {
         "disturbance": NOT_DISTURBANCES,
         **dict.fromkeys(("terminate_on_violation", "allow_assumption_violation"), FLAGS),
         "render_mode": [*WRONG, "cinema"],
+        "noise": [*WRONG, "Gaussian"],
         "horizon": [*POSITIVE_COUNTS, 100_001],
     },
     vector: {

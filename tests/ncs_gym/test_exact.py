@@ -56,10 +56,8 @@ def test_tie_between_two_floats_goes_to_the_even_one_and_what_is_unknown_is_an_e
         exact.nearest(lambda: [arb("inf")])
 
 
-def test_model_that_explodes_within_a_step_is_one_sentence():
+def test_model_that_comes_to_rest_within_a_step_is_sampled():
     for size in (1e3, 1e13, 1e20):
-        with pytest.raises(ValueError, match="grows beyond all numbers within a step of 1 s: give a smaller dt"):
-            zero_order_hold(np.array([[size]]), np.array([[1.0]]), 1.0)
         A, B = zero_order_hold(np.array([[-size]]), np.array([[1.0]]), 1.0)
         assert (A.item(), B.item()) == (0.0, 1.0 / size)  # as rational numbers these would fill the memory
 

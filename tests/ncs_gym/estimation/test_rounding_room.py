@@ -33,6 +33,27 @@ def plant_with(sensor_radius):
     )
 
 
+def sets_for_age_zero(plant, newest, older, rate, gain, mu, noise=None):
+    """Sets of one state for samples that are never late."""
+    sets = ErrorSetsByAge(
+        contract=ChannelContract(0),
+        shapes=np.array([[[newest]], [[older]]]),
+        rates=np.array([rate]),
+        gains=np.array([gain]),
+        multipliers=np.array([mu]),
+        noise=plant.sensor_error_with(0.0).shape_matrix if noise is None else noise,
+    )
+    return ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
+
+
+def rounded_away(gain, matched, estimate, sample):
+    """How far float64 moves an update of an estimate away from the exact one."""
+    computed = estimate + gain @ (sample - matched @ estimate)
+    start, end = (Fraction(float(value[0])) for value in (estimate, computed))
+    numbers = zip(gain[0].tolist(), sample.tolist(), matched[:, 0].tolist(), strict=True)
+    return abs(float(end - start - sum(Fraction(t) * (Fraction(y) - Fraction(h) * start) for t, y, h in numbers)))
+
+
 def sets_that_just_hold(room):
     """A plant and error sets for age 0 for which (C0), (C1) and (C2) hold, (C2) with the room or with none."""
     carried = RATE * RADIUS
@@ -44,15 +65,8 @@ def sets_that_just_hold(room):
     noise = (1.0 - SLACK) * (allowed**0.5 - kept) / GAIN  # radius of N: kept + GAIN noise is the radius of the result
     inflation = plant_with(1e-9).sensor_error.shape_matrix[0, 0] / 1e-18
     plant = plant_with(noise / inflation**0.5)
-    sets = ErrorSetsByAge(
-        contract=ChannelContract(0),
-        shapes=np.array([[[newest]], [[older]]]),
-        rates=np.array([carried / (carried + disturbance**0.5)]),
-        gains=np.array([[[GAIN]]]),
-        multipliers=np.array([kept / allowed**0.5]),
-        noise=plant.sensor_error_with(0.0).shape_matrix,
-    )
-    return plant, ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
+    rate = carried / (carried + disturbance**0.5)
+    return plant, sets_for_age_zero(plant, newest, older, rate, [[GAIN]], kept / allowed**0.5)
 
 
 def largest_gauge_after_an_update(plant, error_set):
@@ -118,14 +132,7 @@ def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_inflation_and_the_room(gain):
     plant = plant_with(1.0)
-    sets = ErrorSetsByAge(
-        contract=ChannelContract(0),
-        shapes=np.array([[[1.0]], [[1.0]]]),
-        rates=np.array([0.5]),
-        gains=np.array([[[gain]]]),
-        multipliers=np.array([0.5]),
-        noise=np.array([[1.0]]),
-    )
+    sets = sets_for_age_zero(plant, 1.0, 1.0, 0.5, [[gain]], 0.5, noise=np.ones((1, 1))).ages
     ((_, inner, _),) = sets.needs(plant)["(C2)"]
     assert inner.item() == pytest.approx(2.0 * INFLATION, rel=1e-10)
     room = sets._rounding_of_update(plant, 0)
@@ -174,15 +181,7 @@ def sets_of_two_sensors_whose_noise_is_nearly_common():
         kept, noisy = abs(1.0 - (gain @ matched).item()) * older**0.5, (gain @ noise @ gain.T).item() ** 0.5
         found.append((kept + noisy, kept / (kept + noisy), gain))
     _, mu, gain = min(found, key=lambda each: each[0])
-    sets = ErrorSetsByAge(
-        contract=ChannelContract(0),
-        shapes=np.array([[[radius**2]], [[older]]]),
-        rates=np.array([rate * radius / (rate * radius + push)]),
-        gains=np.array([gain]),
-        multipliers=np.array([mu]),
-        noise=noise,
-    )
-    return plant, ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
+    return plant, sets_for_age_zero(plant, radius**2, older, rate * radius / (rate * radius + push), gain, mu, noise)
 
 
 def test_room_grows_with_the_gain_and_sets_without_it_are_refused():
@@ -198,11 +197,7 @@ def test_room_grows_with_the_gain_and_sets_without_it_are_refused():
     for _ in range(300):
         estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 0.97)])
         sample = plant.H @ estimate + 1e-4 * rng.uniform(0.9, 1.1, 2)
-        computed = estimate + gain @ (sample - plant.H @ estimate)
-        start, end = (Fraction(float(value[0])) for value in (estimate, computed))
-        numbers = zip(gain[0].tolist(), sample.tolist(), plant.H[:, 0].tolist(), strict=True)
-        terms = [Fraction(t) * (Fraction(y) - Fraction(h) * start) for t, y, h in numbers]
-        moved = max(moved, abs(float(end - start - sum(terms))))
+        moved = max(moved, rounded_away(gain, plant.H, estimate, sample))
     assert moved > 4.0 * np.finfo(float).eps * SIMULATED_REACH
     with pytest.raises(ValueError, match=r"\(C2\)"):
         Estimator(plant, Channel(), error_set)
@@ -219,23 +214,11 @@ def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(
     own = Ellipsoid(noise**2 * matched @ matched.T + 1e-12 * np.eye(2))  # the gain does not see what is common to both
     settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "initial_bound": 0.0}
     plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)
-    sets = ErrorSetsByAge(
-        contract=ChannelContract(0),
-        shapes=np.array([[[1.0]], [[error**2]]]),
-        rates=np.array([0.5]),
-        gains=np.array([gain]),
-        multipliers=np.array([0.5]),
-        noise=plant.sensor_error_with(0.0).shape_matrix,
-    )
+    sets = sets_for_age_zero(plant, 1.0, error**2, 0.5, gain, 0.5).ages
     rng, moved = np.random.default_rng(0), 0.0
     for _ in range(300):
         estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 1.0)])
         sample = matched @ (estimate + error * rng.uniform(-1.0, 1.0)) + noise * rng.uniform(-1.0, 1.0) * matched[:, 0]
-        start, end = (
-            Fraction(float(value[0])) for value in (estimate, estimate + gain @ (sample - matched @ estimate))
-        )
-        numbers = zip(gain[0].tolist(), sample.tolist(), matched[:, 0].tolist(), strict=True)
-        terms = [Fraction(t) * (Fraction(y) - Fraction(h) * start) for t, y, h in numbers]
-        moved = max(moved, abs(float(end - start - sum(terms))))
+        moved = max(moved, rounded_away(gain, matched, estimate, sample))
     room = sets._rounding_of_update(plant, 0).item()
     assert 0.02 < moved / (room * (INFLATION - 1.0) / 2.0) ** 0.5 < 1.0

@@ -16,18 +16,12 @@ def transmit(channel: Channel, steps: int, seed: int = 0) -> dict[int, list[int]
     return arrivals
 
 
-def test_perfect_channel_delivers_every_sample_at_once():
-    assert transmit(Channel(), 20) == {step: [step] for step in range(1, 21)}
-
-
-def test_fixed_delay_shifts_every_packet():
-    arrivals = transmit(Channel(delay=3), 20)
-    assert arrivals == {step: [step - 3] if step > 3 else [] for step in range(1, 21)}
-
-
-def test_send_period_rations_samples():
-    arrivals = transmit(Channel(send_period=4), 20)
-    assert [step for step, stamps in arrivals.items() if stamps] == [4, 8, 12, 16, 20]
+@pytest.mark.parametrize("delay", [0, 3])
+@pytest.mark.parametrize("period", [1, 4])
+def test_without_losses_every_sample_arrives_after_its_delay(delay, period):
+    arrivals = transmit(Channel(delay=delay, send_period=period), 20)
+    sent = range(period, 21, period)
+    assert arrivals == {step: [step - delay] if step - delay in sent else [] for step in range(1, 21)}
 
 
 def test_loss_has_the_asked_rate():

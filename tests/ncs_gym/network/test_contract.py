@@ -14,7 +14,6 @@ from ncs_gym import (
     LinearPlant,
     NCSEnv,
     Packet,
-    SetpointTracking,
     batch_reactor,
     cart_pole,
     certified_error_set,
@@ -65,15 +64,6 @@ def test_channel_keeps_the_contract_derived_from_it_and_no_better_one(channel):
         newest = max([newest, *(packet.stamp for packet in link.exchange(rng, step, sample))])
         oldest = max(oldest, step - newest)
     assert oldest == contract.max_age
-
-
-@pytest.mark.parametrize("most", [0, 1, 3])
-def test_channel_never_loses_more_in_a_row_than_it_promises(most):
-    channel, rng = Channel(loss=0.9, max_consecutive_losses=most), np.random.default_rng(1)
-    link = ChannelState(channel, rng)
-    arrived = [bool(link.exchange(rng, step, np.zeros(1))) for step in range(1, 3000)]
-    runs = "".join("1" if here else "0" for here in arrived).split("1")
-    assert max(map(len, runs)) == most
 
 
 def test_channel_that_may_lose_for_ever_promises_nothing():
@@ -186,35 +176,6 @@ def test_one_step_beyond_the_contract_the_error_can_leave_the_certified_set():
         assert worst > 1.01
 
 
-def test_exact_discretization_of_the_unstable_plants():
-    # By another route: fine Euler steps of the continuous equations.
-    for plant, rates in ((cart_pole(), [(3, 2, 1.1 * 9.81 / 0.5), (1, 2, -0.1 * 9.81)]),):
-        x, u, steps = np.array([0.1, -0.2, 0.05, 0.3]), 2.0, 20_000
-        expected = plant.A @ x + plant.B @ [u]
-        h = plant.dt / steps
-        for _ in range(steps):
-            slope = np.array([x[1], u, x[3], -u / 0.5])
-            for row, column, rate in rates:
-                slope[row] += rate * x[column]
-            x = x + h * slope
-        np.testing.assert_allclose(x, expected, atol=1e-6)
-    assert batch_reactor().spectral_radius == pytest.approx(1.1047, abs=1e-4)
-
-
-def test_setpoint_tracking_pays_for_being_close():
-    task, plant = SetpointTracking(output=(1.0, 0.0), reach=1.0, width=0.5, change_probability=1.0), truck_trailer()
-    rng = np.random.default_rng(0)
-    target = task.begin(rng, plant)
-    assert task.reward(plant, target, np.array([target, 9.0]), np.zeros(1)) == 1.0
-    assert task.reward(plant, target, np.array([target + 0.25, 0.0]), np.zeros(1)) == pytest.approx(0.5)
-    assert task.reward(plant, target, np.array([target - 3.0, 0.0]), np.zeros(1)) == 0.0
-    targets = {task.advance(rng, plant, target, np.zeros(1)) for _ in range(50)}
-    assert len(targets) == 50
-    assert max(map(abs, targets)) <= 1.0
-    np.testing.assert_array_equal(task.observe(target), [target])
-    assert "shape (4,)" in task.check(cart_pole())
-
-
 @pytest.mark.parametrize("outage", [150, pytest.param(1500, marks=pytest.mark.slow)])
 def test_long_outages_end_no_episode_with_an_exception(outage):
     twice = LinearPlant(
@@ -231,28 +192,11 @@ def test_long_outages_end_no_episode_with_an_exception(outage):
         contract = ChannelContract(2)
         estimator = Estimator(plant, Channel(), certified_error_set(plant, contract))
         estimator.reset(np.zeros(plant.n))
-        for step in range(1, outage + 50):
-            packets = [] if step < outage else [Packet(step, np.zeros(plant.p))]
-            estimator.advance(np.zeros(plant.m), packets)
+        with np.errstate(all="raise", under="ignore"):
+            for step in range(1, outage + 50):
+                packets = [] if step < outage else [Packet(step, np.zeros(plant.p))]
+                estimator.advance(np.zeros(plant.m), packets)
         assert np.isfinite(estimator.estimate.mean).all()
-
-
-def test_observation_box_holds_estimates_of_every_age_and_is_finite():
-    plant = LinearPlant(
-        A=np.diag([1.05, 0.01]),
-        B=np.ones((2, 1)),
-        box=np.eye(2),
-        u_max=1.0,
-        dt=0.1,
-        gamma=1e-6,
-        initial_cov=0.01 * np.eye(2),
-    )
-    env = NCSEnv(plant, Channel(delay=4))
-    for seed in range(100):
-        observation, info = env.reset(seed=seed)
-        np.testing.assert_array_equal(observation, info["estimate"].astype(np.float32))
-    fast = NCSEnv(LinearPlant(A=[[2.0]], B=[[1.0]], box=[[1.0]], u_max=3.0, dt=0.1, gamma=1e-6), Channel())
-    assert np.isfinite(fast.observation_space.high).all()
 
 
 def test_prediction_falls_back_to_the_certified_set(monkeypatch):

@@ -56,10 +56,6 @@ def test_sensor_bound_with_quantizer_holds_corners_of_the_rounding_box():
     assert not bound.contains(1.01 * extreme)
 
 
-def test_quantile_is_of_the_kept_mass_not_of_the_removed_one():
-    assert truncation_energy(0.05, 2) == pytest.approx(-2.0 * np.log(0.05), rel=1e-15)
-
-
 @pytest.mark.parametrize("degrees", [1, 2, 3, 7])
 @pytest.mark.parametrize("delta", [0.999, 0.5, 0.05, 1e-9, 1e-12])
 def test_truncation_energy_is_the_quantile_of_scipy_stats(delta, degrees):

@@ -1,7 +1,5 @@
 """Bounds of a plant: what is declared in plain terms adds to gamma and to the truncated covariances."""
 
-import copy
-import pickle
 import warnings
 from dataclasses import replace
 
@@ -14,7 +12,6 @@ from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, LinearPlant, NoNoiseWa
 from ncs_gym.plants import linear_plant
 from ncs_gym.processes import inverted_pendulum, nonlinear_cart_pole, pendulum
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
-from ncs_gym.uncertainty.ellipsoid import sum_gauge
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
 BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}
@@ -90,16 +87,10 @@ def test_registered_plants_keep_their_fingerprints(make):
     assert not any(replace(plant, dt=2.0 * plant.dt, remainder=None).has_fingerprint(each) for each in known)
 
 
-def test_every_bound_changes_the_fingerprint():
-    plants = [plain(), *(plain(**{name: 0.04}) for name in BOUNDS)]
-    assert len({plant.fingerprint for plant in plants}) == 4
-
-
-def test_bounds_survive_replace_copies_and_pickles():
+def test_bounds_survive_replace_and_belong_to_the_fingerprint():
     plant = plain(disturbance_bound=([[1.0], [0.5]], 0.1))
-    twins = [replace(plant), copy.deepcopy(plant), pickle.loads(pickle.dumps(plant)), replace(plant, A=plant.A)]
-    assert {twin.fingerprint for twin in twins} == {plant.fingerprint}
-    assert not pickle.loads(pickle.dumps(plant)).disturbance_bound.shape_matrix.flags.writeable
+    assert replace(plant, A=plant.A).fingerprint == replace(plant).fingerprint == plant.fingerprint
+    assert len({plain().fingerprint, *(plain(**{name: 0.04}).fingerprint for name in BOUNDS)}) == 4
     assert replace(plant, A=0.6 * np.eye(2)).fingerprint != plant.fingerprint
 
 
@@ -120,23 +111,9 @@ def test_every_disturbance_uses_the_declared_bound_and_stays_inside(name, kind, 
     assert beyond_gamma > 0.4 * np.linalg.norm(axis)
 
 
-def test_unknown_disturbances_stay_in_the_sum_of_ball_and_bound():
-    plant = plain(gamma=1e-3, disturbance_bound=KINDS["ellipsoid"], process_noise_cov=1e-3 * np.eye(2))
-    ball, bound, rng = plant.gamma * np.eye(2), plant.disturbance_bound.shape_matrix, np.random.default_rng(1)
-    for name in ("ball", "box", "sinusoid"):
-        source = as_disturbance(name, plant, False)
-        memory = source.begin(rng, plant)
-        draws = [source.draw(rng, plant, np.zeros(2), k, memory) for k in range(60)]
-        assert all(sum_gauge((1 - 1e-9) * d, ball, bound) <= 1.0 for d in draws)
-
-
-def test_box_disturbance_of_the_declared_half_widths_is_accepted_and_a_larger_one_refused():
+def test_box_disturbance_of_the_declared_half_widths_is_accepted():
     plant = plain(disturbance_bound=[0.05, 0.002])
     assert as_disturbance(BoxDisturbance([0.05, 0.002]), plant, False)
-    with pytest.raises(ValueError, match=r"the box is 1\.02 times as large"):
-        as_disturbance(BoxDisturbance([0.051, 0.00204]), plant, False)
-    with pytest.raises(ValueError, match="squared length"):
-        as_disturbance(BoxDisturbance([0.05, 0.002]), plain(disturbance_bound=0.0), False)
 
 
 @pytest.mark.parametrize("name", BY_NAME)
@@ -145,18 +122,18 @@ def test_loop_keeps_every_error_in_its_set_and_raises_no_alarm(name):
     plant = truck_trailer(4000.0, gamma=0.0, **bounds)
     channel = ncs_gym.Channel(loss=0.3, quantization_step=0.02, delay=1)
     env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance=name)
-    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=50, plant=plant, channel=channel, disturbance=name)
+    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=20, plant=plant, channel=channel, disturbance=name)
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=1)
     _, infos = many.reset(seed=1)
-    for _ in range(60):
+    for _ in range(40):
         assert Ellipsoid(info["error_shape"]).gauge(info["estimation_error"]) <= 1.0
         inverses = np.linalg.inv(infos["error_shape"])
         assert np.einsum("ki,kij,kj->k", infos["estimation_error"], inverses, infos["estimation_error"]).max() <= 1.0
         assert not info["assumption_violated"]
         assert not infos["assumption_violated"].any()
         info = env.step(rng.uniform(-1, 1, 1).astype(np.float32))[-1]
-        infos = many.step(rng.uniform(-1, 1, (50, 1)).astype(np.float32))[-1]
+        infos = many.step(rng.uniform(-1, 1, (20, 1)).astype(np.float32))[-1]
 
 
 @pytest.mark.parametrize(
@@ -168,16 +145,6 @@ def test_noise_is_drawn_from_the_declared_bound_up_to_its_edge(bound, sample):
     gauges = getattr(plant, bound).gauge(getattr(plant, sample)(rng, 2000))
     assert 0.99 < gauges.max() <= 1.0 + 1e-12
     assert getattr(plant, sample)(rng).shape == (2,)
-
-
-def test_first_estimates_of_both_environments_are_off_by_the_declared_error():
-    plant = plain(initial_bound=[0.2, 0.01])
-    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=500, plant=plant)
-    errors = many.reset(seed=0)[1]["estimation_error"]
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant)
-    singles = np.array([env.reset(seed=seed)[1]["estimation_error"] for seed in range(100)])
-    for each in (errors, singles):
-        assert 0.8 < plant.initial_bound.gauge(each).max() <= 1.0 + 1e-9
 
 
 def test_estimator_picks_useful_gains_from_declared_bounds_alone():
@@ -227,7 +194,7 @@ def test_assumptions_name_what_is_zero_and_what_is_truncated():
 
 
 def test_first_error_along_an_oblique_line_is_held_in_rational_arithmetic():
-    for ratio in np.random.default_rng(0).uniform(-2.0, 2.0, 200):
+    for ratio in np.random.default_rng(0).uniform(-2.0, 2.0, 40):
         bound = plain(initial_bound=([[1.0], [ratio]], 1.0)).initial_error
         line = rational(np.array([[1.0], [ratio]]))
         assert is_positive_semidefinite(

@@ -75,13 +75,6 @@ def test_limits_without_an_operating_point_are_around_zero():
         plant.fingerprint
         == LinearPlant.from_statespace((A, B, C, D), box=[0.5, 1.0], u_max=2.0, **settings).fingerprint
     )
-    outside = {"state_limits": ([0.0, -1.0], [3.0, 1.0]), "input_limits": (-2.0, 3.0)}
-    with pytest.raises(ValueError, match=r"state_limits must have the operating point \[0.0, 0.0\] strictly between"):
-        LinearPlant.from_statespace((A, B, C, D), **outside, **settings)
-    with pytest.raises(
-        ValueError, match=r"^input_limits is given alone: give state_limits and input_limits, or box and u_"
-    ):
-        LinearPlant.from_statespace((A, B, C, D), input_limits=(-2.0, 3.0), **settings)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])

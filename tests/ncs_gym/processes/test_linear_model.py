@@ -129,13 +129,13 @@ def test_ellipsoid_around_points_holds_them_and_is_nearly_the_smallest():
     assert np.linalg.det(shape) < 1.05 * np.linalg.det(root @ root.T)
 
 
-@pytest.mark.parametrize("mass", [1.0, 0.7, 1.4634146])
+@pytest.mark.parametrize("mass", [1.0, 1.4634146])
 def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
     """A float32 torque times 3 / (m l^2) is a float32: gain, torque and product round at the edge of the box."""
     plant = pendulum(mass=mass)
     inner = PendulumProcess(mass=mass).opened(plant, None)
     rng, largest = np.random.default_rng(0), 0.0
-    for u in rng.uniform(1.0, TORQUE, 3_000):
+    for u in rng.uniform(1.0, TORQUE, 1_000):
         state = np.array([-0.25, 0.0])
         for torque in (u, -u):
             x_next = inner.step(plant, inner.write(state), np.array([torque]))

