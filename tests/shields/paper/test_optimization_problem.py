@@ -8,7 +8,7 @@ from shields.paper.bounds import PaperModel
 from shields.paper.optimization_problem import OptimizationProblem
 
 SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
-POINTS = [(k, 1.0 + (1.0 / k - 1.0) * s) for k in (0.8, 0.86, 0.9, 0.94, 0.98) for s in (0.0, 0.05, 0.3, 0.8)]
+POINTS = [(k, 1.0 + (1.0 / k - 1.0) * s) for k in (0.8, 0.9, 0.98) for s in (0.0, 0.3, 0.8)]
 
 
 def reduced(plant, bounds):
@@ -88,12 +88,6 @@ def test_grid_walks_as_printed_and_skips_where_the_bound_is_infinite():
     assert points == [(0.75, 1.0), (0.5, 1.0), (0.5, 1.5), *[(0.25, 1.0 + 0.5 * j) for j in range(6)]]
 
 
-@pytest.mark.parametrize("steps", [(0.0, 0.1), (0.1, -1.0), (np.nan, 0.1), (0.1, 0.0)])
-def test_steps_that_do_not_move_are_refused(steps):
-    with pytest.raises(ValueError, match="must be a number > 0"):
-        next(kappa_rho_grid(*steps))
-
-
 def test_first_feasible_pair_wins():
     first = search_grid(SMALL).bounds
     model, problem = PaperModel(SMALL), OptimizationProblem(SMALL)
@@ -106,7 +100,7 @@ def test_first_feasible_pair_wins():
 
 def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_grid():
     plant = truck_trailer(gamma=1e-5, process_noise_cov=np.zeros((2, 2)))
-    grid = {"dkappa": 0.03, "drho": 0.08}
+    grid = {"dkappa": 0.06, "drho": 0.15}
     first, largest = search_grid(plant, **grid), search_grid(plant, search="largest", **grid)
     assert largest.log_det > first.log_det + 0.1
     model, problem = PaperModel(plant), OptimizationProblem(plant)
@@ -129,11 +123,6 @@ def test_what_is_monotone():
     for rho in (1.0, 1.02, 1.05):
         eigenvalues = [eigenvalue(model.at(kappa, rho)) for kappa in np.linspace(0.8, 0.94, 8)]
         assert (np.diff(eigenvalues) >= -1e-6).all()
-
-
-def test_unknown_search_is_refused():
-    with pytest.raises(ValueError, match="search must be"):
-        search_grid(SMALL, search="best")
 
 
 def test_set_without_the_margin_exists_where_op_has_none():

@@ -103,6 +103,7 @@ PENDULUM = {"A": [[1.1, 0.1], [0.1, 1.0]], "B": [[0.0], [0.1]], "box": [0.3, 1.0
 SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound": (np.eye(2), [1e-3, 1e-3])}
 
 
+@pytest.mark.slow
 def test_largest_gamma_and_age_are_what_synthesis_accepts():
     bounds = {"gamma": 1e-2, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
     plant = LinearPlant(**PENDULUM | bounds)
@@ -126,14 +127,20 @@ def test_largest_gamma_and_age_are_what_synthesis_accepts():
     assert max_margin_gain(problem, problem.covering_error_shape).margin < 1.0 + 1e-4
 
 
-@pytest.mark.parametrize("safe_set", ["ellipsoid", "polytope"])
+TOO_LARGE = {
+    "disturbance_bound": [0.05, 0.3],
+    "sensor_bound": 0.2,
+    "initial_bound": (np.eye(2), [0.2, 0.2]),
+    "process_noise_cov": 1e-3 * np.eye(2),
+}
+
+
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "value", "safe_set"),
     [
-        ("disturbance_bound", [0.05, 0.3]),
-        ("sensor_bound", 0.2),
-        ("initial_bound", (np.eye(2), [0.2, 0.2])),
-        ("process_noise_cov", 1e-3 * np.eye(2)),
+        ("disturbance_bound", TOO_LARGE["disturbance_bound"], "polytope"),
+        *(slow(name, value, "ellipsoid") for name, value in TOO_LARGE.items()),
+        *(slow(name, value, "polytope") for name, value in TOO_LARGE.items()),
     ],
 )
 def test_message_names_what_was_declared_and_the_largest_factor_that_works(name, value, safe_set):
@@ -156,6 +163,7 @@ def test_message_names_what_was_declared_and_the_largest_factor_that_works(name,
         synthesize(scaled(1.05 * factor), contract=ChannelContract(0), safe_set=safe_set)
 
 
+@pytest.mark.slow
 def test_bounds_of_a_stable_plant_are_named_without_a_contract_too():
     plant = truck_trailer(gamma=0.0, disturbance_bound=2.0, process_noise_cov=np.zeros((2, 2)), sensor_bound=0.01)
     largest = r"times the given disturbance_bound or less.*finds none with a smaller sensor_bound "

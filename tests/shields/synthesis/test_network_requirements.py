@@ -65,6 +65,7 @@ def test_largest_age_is_followed_by_one_for_which_none_was_found(found):
         assert nearby_certificate(plant, contract) is not None
 
 
+@pytest.mark.slow
 def test_known_largest_age_of_the_pendulum():
     (largest,) = requirements(pendulum(), losses=[7]).largest_ages
     assert largest.certified is not None
@@ -106,7 +107,7 @@ def test_tolerated_factor_certifies():
     assert point.tolerance is not None
     assert point.tolerance > 1.0
     plant = with_radii(servo(), disturbance=point.tolerance, noise=point.tolerance)
-    assert synthesize(plant, contract=ChannelContract(0)) is not None
+    assert synthesize(plant, contract=ChannelContract(0), safe_set="ellipsoid") is not None
 
 
 def test_stable_plant_may_lose_everything_and_an_unstable_one_may_not():
@@ -135,23 +136,15 @@ def test_resampled_plant_is_the_model_sampled_at_that_period():
     assert servo().resampled(0.01).fingerprint == servo().fingerprint
 
 
-def test_plant_without_a_continuous_model_cannot_be_resampled():
+def test_plant_without_a_continuous_model_may_be_a_function_of_the_period():
     plant = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, disturbance_bound=0.0)
-    with pytest.raises(ValueError, match="from_statespace"):
-        requirements(plant, sampling_periods=[0.5])
     found = requirements(lambda dt: replace(plant, dt=dt), sampling_periods=[0.5, 1.0])
     assert [point.network.sampling_period for point in found.points] == [0.5, 1.0]
     # A stable plant that is disturbed so little needs no samples.
     assert [largest.certified for largest in found.largest_ages] == [np.inf, np.inf]
 
 
-@pytest.mark.parametrize("wrong", [{"losses": []}, {"delays": [1, 1]}, {"losses": [-1]}, {"disturbances": [0.0]}])
-def test_impossible_values_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"different values|losses|disturbance"):
-        requirements(servo(), **wrong)
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6))])
 def test_certificate_of_a_tighter_problem_is_a_candidate_of_a_looser_one(seed):
     """Random pairs of input limits, boxes and bounds of a stable plant."""
     rng = np.random.default_rng(seed)
@@ -185,6 +178,7 @@ def test_certificate_of_a_looser_problem_is_no_candidate_of_a_tighter_one():
     assert carried_over(loose, with_radii(plant, disturbance=50.0, noise=1.0), ChannelContract(0)) is None
 
 
+@pytest.mark.slow
 def test_infeasible_names_the_limits_that_would_be_enough():
     plant = servo(u_max=0.5, disturbance_bound=[0.0, 0.3])
     with pytest.raises(Infeasible, match=r"times the limit of u1 or more") as caught:
@@ -212,14 +206,14 @@ def test_infeasible_names_a_pair_where_no_change_alone_is_enough(monkeypatch):
 
 
 def test_search_for_the_largest_age_asks_before_every_age_whether_it_should_end():
-    plant = pendulum()
+    plant = servo()
     search = BoundarySearch(
         name="beyond",
         title="",
         plant=plant,
         quantization_step=0.0,
         ages=(0, 4),
-        start=synthesize(plant, contract=ChannelContract(0)),
+        start=nearby_certificate(plant, ChannelContract(0)),
     )
     reported = []
     answers = search(reported.append)

@@ -31,7 +31,7 @@ def test_every_stage_says_what_is_sought_and_the_volume_reached(loaded):
     assert lines[-1] == f"exact verification: {volume:.4f} of the box ellipsoid's volume"
 
 
-@pytest.mark.parametrize("stage", ["initial design 2", "alternation 1", "exact verification"])
+@pytest.mark.parametrize("stage", ["initial design 2", "exact verification"])
 def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, stage):
     with pytest.raises(
         SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the safe box.s volume, "
@@ -62,10 +62,17 @@ def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
 
 @pytest.mark.parametrize(
     ("seed", "n", "m", "volume"),
-    [(0, 4, 2, 0.979989), (2, 4, 2, 0.922852), (1, 6, 2, 0.810750), (2, 6, 2, 0.958635)],
+    [
+        (2, 4, 2, 0.922852),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in [(0, 4, 2, 0.979989), (1, 6, 2, 0.810750), (2, 6, 2, 0.958635)]
+        ),
+    ],
 )
 def test_volumes_of_random_plants_stay_what_they_are(seed, n, m, volume):
-    assert synthesize(random_plant(seed, n, m)).provenance["volume_of_box_ellipsoid"] == pytest.approx(volume, abs=1e-3)
+    found = synthesize(random_plant(seed, n, m), safe_set="ellipsoid").provenance["volume_of_box_ellipsoid"]
+    assert found == pytest.approx(volume, abs=1e-3)
 
 
 def test_solution_of_the_program_meets_the_conditions():

@@ -6,22 +6,13 @@ import numpy as np
 import pytest
 
 from experiments.runs.experiment import certificate_line
-from ncs_gym import LinearPlant, cart_pole, truck_trailer
+from ncs_gym import cart_pole, truck_trailer
 from ncs_gym.plants.linear_plant import inputs_under_way
 from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
 from tests.certificates import certificate_of
-from tests.plants import random_plant
-
-# A continuous-time oscillator with delayed inputs.
-RATE, PUSH, SEEN = [[0.0, 1.0], [-0.2, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]]
-BOUNDS = {"disturbance_bound": [0.0005, 0.003], "sensor_bound": 0.01, "initial_bound": 0.02}
-
-
-def delayed(steps):
-    settings = {"box": [1.0, 1.5], "u_max": 0.8, "dt": 0.1}
-    return LinearPlant.from_statespace((RATE, PUSH, SEEN, None), input_delay=steps, **settings, **BOUNDS)
+from tests.plants import delayed, random_plant
 
 
 def counted(C, L, reach):
@@ -64,7 +55,7 @@ def test_too_many_corners_are_a_reason_not_a_number(certificate):
     assert "%" not in size_of(record)
 
 
-@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("steps", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way(steps):
     plant = delayed(steps)
     assert inputs_under_way(plant) == steps

@@ -1,0 +1,183 @@
+"""What synthesis, verification and certificates refuse, and in which words: one row per refusal."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, LinearPlant, truck_trailer
+from shields import (
+    Certificate,
+    CertificateError,
+    Infeasible,
+    linear_feedback_tolerance,
+    requirements,
+    synthesize,
+    verify,
+)
+from shields.certificate import Proof
+from shields.json_documents import document_of
+from shields.paper.algorithm import kappa_rho_grid, search_grid
+from shields.paper.bounds import covariance_bound, safety_margin, state_error_bound, uplink_error_bound
+from tests.certificates import certificate_of
+from tests.plants import named, servo, small
+
+Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
+SHARES = {"shares": np.array([0.9, 0.05, 0.05]), "inputs": np.array([0.5])}
+PAPER = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2}
+FIXED = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, disturbance_bound=0.0)
+
+
+def plant():
+    return named("stable")[0]
+
+
+@cache
+def kept(name="stable", safe_set="ellipsoid"):
+    """A certificate, by the name of its plant."""
+    return certificate_of(*named(name), safe_set)
+
+
+def paper():
+    return Certificate(L=np.eye(2), K=np.ones((1, 2)), method="paper", fingerprint="0", **PAPER)
+
+
+def synthesized(box):
+    noise = {"gamma": 1e-4, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
+    return synthesize(LinearPlant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
+
+
+def with_proofs(name, **changes):
+    """The certificate with other fields in its last proof."""
+    *others, last = kept(name, "polytope").proofs
+    return replace(kept(name, "polytope"), proofs=(*others, replace(last, **changes)))
+
+
+def read(**changes):
+    """A certificate read from a document with other entries, whose checksum fits."""
+    content = json.loads(json.dumps(kept("stable", "polytope").document["certificate"]))
+    return Certificate.read(document_of("certificate", "ncs-gym certificate 2", content | changes))
+
+
+def read_multipliers(first):
+    """A certificate read from a document with other multipliers of the first row of its polytope."""
+    polytope = kept("stable", "polytope").document["certificate"]["polytope"]
+    return read(polytope=polytope | {"multipliers": [first, *polytope["multipliers"][1:]]})
+
+
+REFUSED = [
+    (lambda: synthesize(plant(), method="magic"), ValueError, "method must be"),
+    (lambda: synthesize(plant(), safe_set="Polytope"), ValueError, "safe_set must be"),
+    (lambda: synthesize(plant(), safe_set=0), ValueError, "safe_set must be"),
+    (lambda: synthesize(plant(), safe_set=["polytope"]), ValueError, "safe_set must be"),
+    (lambda: synthesize(plant(), "paper", safe_set="polytope"), ValueError, "='polytope' is for method 'certified'"),
+    (lambda: synthesize(plant(), safe_set="ellipsoid", search_gain=True), ValueError, "search_gain is for polytopes"),
+    *(
+        (
+            lambda name=name: synthesize(replace(plant(), **{name: 1e-4}), method="paper"),
+            ValueError,
+            f"method 'paper' knows gamma and covariances alone, not {name}",
+        )
+        for name in ("disturbance_bound", "sensor_bound", "initial_bound")
+    ),
+    (lambda: synthesized([[0.5, 0.0]]), Infeasible, "unbounded"),
+    (lambda: synthesize(truck_trailer(box=[[0.5, 0.0]]), method="paper"), Infeasible, "unbounded"),
+    (
+        lambda: synthesized([1.0, np.inf]),
+        Infeasible,
+        r"leaves 1 of 2 directions unbounded \(of x2\): add rows to box with generous limits",
+    ),
+    (
+        lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]),
+        Infeasible,
+        r"the safe box is flat, \de\+\d+ times longer in one direction .*: add rows to box that limit the long one",
+    ),
+    (
+        lambda: synthesized([1.0, 1e7]),
+        Infeasible,
+        "too ill-conditioned for .* give states units in which the half-widths of the box are of similar size",
+    ),
+    (lambda: requirements(servo(), losses=[]), ValueError, "different values"),
+    (lambda: requirements(servo(), delays=[1, 1]), ValueError, "different values"),
+    (lambda: requirements(servo(), losses=[-1]), ValueError, "losses"),
+    (lambda: requirements(servo(), disturbances=[0.0]), ValueError, "disturbance"),
+    (lambda: requirements(FIXED, sampling_periods=[0.5]), ValueError, "from_statespace"),
+    (lambda: linear_feedback_tolerance(servo(), ChannelContract(1), horizon=0), ValueError, "at least one step"),
+    *(
+        (
+            lambda engine=engine: verify(kept(), plant(), engine=engine),
+            ValueError,
+            "engine must be 'rational' or 'flint'",
+        )
+        for engine in ("float", None, 3, [])
+    ),
+    (lambda: verify(plant(), kept()), ValueError, "verify takes a Certificate and a LinearPlant"),
+    # Fields of certificates.
+    (lambda: replace(paper(), proofs=kept().proofs, D=np.eye(2)), CertificateError, "proofs, D"),
+    (lambda: replace(kept(), kappa=0.9), CertificateError, "kappa"),
+    (lambda: replace(kept(), proofs=()), CertificateError, "proofs"),
+    (lambda: replace(kept("unstable"), proofs=kept("unstable").proofs[:1]), CertificateError, "must have 2 proofs"),
+    (lambda: replace(paper(), method="magic"), CertificateError, "method must be"),
+    (lambda: replace(kept(), between_samples="8"), CertificateError, "between_samples must be"),
+    (lambda: kept().constants(), CertificateError, "'certified' has no constants"),
+    (lambda: paper().disturbances(), CertificateError, "'paper' has no error set"),
+    (
+        lambda: replace(kept("servo", "polytope"), polytope=None),
+        CertificateError,
+        r"no multipliers of \(I\), and it has no polytope",
+    ),
+    (lambda: with_proofs("servo", **SHARES), CertificateError, "either all of its proofs"),
+    (lambda: Proof(Sigma=np.eye(2), rate=0.5, shares=SHARES["shares"]), CertificateError, "both be given, or neither"),
+    (lambda: with_proofs("stable", rate="x"), CertificateError, "rate of an error set must be numbers"),
+    (lambda: with_proofs("stable", inputs=0.5), CertificateError, r"multipliers of \(U\) must be numbers"),
+    (lambda: with_proofs("stable", inputs=None), CertificateError, "both be given, or neither"),
+    (lambda: with_proofs("stable", shares=[None, 0.1, 0.1]), CertificateError, r"multipliers of \(I\) must be numbers"),
+    # Files whose checksum fits.
+    (lambda: read(L=[[float("nan"), 0.0], [0.0, 1.0]]), CertificateError, ""),
+    (lambda: read(K="no"), CertificateError, ""),
+    (lambda: read(Sigma=[[1.0]]), CertificateError, ""),
+    (lambda: read(multipliers={}), CertificateError, ""),
+    (lambda: read(multipliers=3), CertificateError, ""),
+    *(
+        (lambda entry=entry: read_multipliers(entry), CertificateError, "")
+        for entry in (
+            *([[0, "1"]], [[0.5, 1.0]], [[-1, 1.0]], [[10**6, 1.0]], [[0]], "x", None),
+            *([[0, 10**400]], [[0, True]], [[0, 1.0], [0, 0.5]], [[0, 0.0]]),
+        )
+    ),
+    # Too many rows are refused before they take memory.
+    (lambda: read(polytope={"rows": [[]] * 200_000, "multipliers": [[]] * 200_000}), CertificateError, ""),
+    (lambda: read(polytope={"rows": [[1.0]] * 500, "multipliers": [[]] * 501}), CertificateError, ""),
+    # Formulas of the paper.
+    (lambda: uplink_error_bound(-1e-9, Q, P0, 0.05, 0.9), ValueError, "gamma"),
+    (lambda: uplink_error_bound(5e-4, -Q, P0, 0.05, 0.9), ValueError, "process_noise_cov"),
+    (lambda: uplink_error_bound(5e-4, [[np.nan, 0], [0, 1]], P0, 0.05, 0.5), ValueError, "process_noise_cov"),
+    (lambda: uplink_error_bound(5e-4, Q, [[1, 2], [2, 1]], 0.05, 0.9), ValueError, "initial_cov"),
+    (lambda: uplink_error_bound(5e-4, Q, np.eye(3), 0.05, 0.9), ValueError, "initial_cov"),
+    (lambda: uplink_error_bound(5e-4, Q, P0, 0.0, 0.9), ValueError, "delta"),
+    (lambda: uplink_error_bound(5e-4, Q, P0, 1.0, 0.9), ValueError, "delta"),
+    (lambda: uplink_error_bound(5e-4, Q, P0, 0.05, 1.0), ValueError, "g2"),
+    (lambda: state_error_bound(np.eye(2), -0.1, 1.0), ValueError, "g2"),
+    (lambda: state_error_bound([[np.nan, 0.0], [0.0, 1.0]], 0.5, 1.0), ValueError, "A must be finite"),
+    (lambda: state_error_bound([1.0, 2.0], 0.5, 1.0), ValueError, "A must have shape"),
+    (lambda: safety_margin(5e-4, 0.1, 0.0), ValueError, "kappa"),
+    (lambda: covariance_bound(-1, 1.0, 0.5, 1.0), ValueError, "k must be"),
+    (lambda: covariance_bound(1, 1.0, -0.5, 1.0), ValueError, "g2"),
+    (lambda: covariance_bound(2000, 1.0, 10.0, 1.0), ValueError, "too large"),
+    *(
+        (lambda steps=steps: next(kappa_rho_grid(*steps)), ValueError, "must be a number > 0")
+        for steps in ((0.0, 0.1), (0.1, -1.0), (np.nan, 0.1), (0.1, 0.0))
+    ),
+    (lambda: search_grid(small([[0.5, 0.0], [0.0, 0.5]]), search="best"), ValueError, "search must be"),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "words"), REFUSED)
+def test_what_is_wrong_is_refused_in_one_sentence(call, error, words):
+    with pytest.raises(error, match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)
