@@ -85,7 +85,7 @@ def test_lookahead_keeps_guaranteed_states_in_the_box_under_attack():
     for downlink in edges(2).values():
         start = {"initial_set": box_ellipsoid(PLANT, 0.95)}
         shield = shielded("lookahead", kind=ExtremalNoise, disturbance="adversarial", downlink=downlink, **start)
-        for seed in range(4):
+        for seed in range(2):
             _, info = shield.reset(seed=seed)
             held, rng = info["shield_guaranteed"], np.random.default_rng(seed)
             for _ in range(60):
@@ -153,20 +153,21 @@ def test_no_state_outside_is_guaranteed_wherever_an_episode_starts():
     assert late > 0
 
 
-@pytest.mark.parametrize("input_delay", [1, 3])
-def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_steps(input_delay):
+@pytest.mark.parametrize(("input_delay", "size"), [(1, 1.001), (1, 1.1), (3, 1.001), (3, 1.2)])
+def test_a_guarantee_that_is_regained_is_one_about_the_present_and_every_step_until_the_next_input(input_delay, size):
     shield = shielded(downlink=Channel(delay=input_delay), disturbance="sphere", start=1e-3)
-    # Just outside S, drifting back in: known from the estimate of step c on, c steps later for the present.
-    direction = np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
-    _, info = shield.reset(seed=0, options={"state": 1.001 * direction})
-    assert info["shield_reason"] == NOT_KNOWN_INSIDE
-    known, guaranteed = [], []
-    for _ in range(30):
-        known.append(shield.filter.knows_inside(info["estimate"], info["error_shape"]))
+    # Outside S, drifting back in: an estimate is that of c steps later.
+    start = size * np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
+    _, info = shield.reset(seed=0, options={"state": start})
+    inside, guaranteed = [each.in_safe_set for each in starts_known(shield.filter, start, input_delay)], []
+    for step in range(30):
+        known = shield.filter.knows_inside(info["estimate"], info["error_shape"])
+        inside = [*inside, known] if step else [*inside[:-1], inside[-1] or known]
         guaranteed.append(info["shield_guaranteed"])
+        assert levels(shield, info) <= 1.0 or not guaranteed[-1]
         *_, info = shield.step(np.zeros(1))
-    assert guaranteed.index(True) == known.index(True) + input_delay
-    assert all(guaranteed[guaranteed.index(True) :])
+    assert guaranteed == [all(inside[step : step + input_delay + 1]) for step in range(30)]
+    assert 0 < guaranteed.index(True) < 5
 
 
 def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
@@ -207,7 +208,7 @@ def test_a_given_start_is_followed_under_zero_input():
     assert left > 5
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [16, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 1e7, 1e11])
 def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size, count):
     # Starts that A annihilates, but for the rounding of products of huge numbers.
@@ -229,7 +230,7 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
     assert known > count // 2
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(120, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [6, pytest.param(120, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
 def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size, count):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
@@ -299,15 +300,11 @@ def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_
     for seed, start in enumerate(drifting):
         _, info = shield.reset(seed=seed, options={"state": start})
         assert info["cost"] == 1.0
-        for _ in range(3):
-            assert info["shield_reason"] == NOT_KNOWN_INSIDE
-            *_, info = shield.step(np.zeros(1))
-        assert info["shield_guaranteed"]  # step 3 was known to be inside from the start
+        assert info["shield_reason"] == NOT_KNOWN_INSIDE
+        assert shield.step(np.zeros(1))[4]["shield_guaranteed"]  # step 3 was known to be inside from the start
     infos = vector.reset(seed=0, options={"state": drifting})[1]
     assert not infos["shield_guaranteed"].any()
-    for _ in range(3):
-        *_, infos = vector.step(np.zeros((2, 1)))
-    assert infos["shield_guaranteed"].all()
+    assert vector.step(np.zeros((2, 1)))[4]["shield_guaranteed"].all()
 
 
 def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():

@@ -55,7 +55,7 @@ def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
     plant, certificate = case
     shield, rng = SafetyFilter(certificate, plant, mode), np.random.default_rng(0)
     passed = projected = 0
-    for _ in range(150):
+    for _ in range(75):
         estimate = 1.4 * certificate.safe_set.sample(rng)
         shape = certificate.Sigma * rng.uniform(0.05, 1.0)
         decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random())
@@ -64,8 +64,8 @@ def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
         if decision.passed:
             passed += 1
             assert worst_next_level(certificate, plant, estimate, shape, decision.input, rng) <= 1.0
-    assert passed > 20
-    assert (projected > 5) is (mode == "project")
+    assert passed > 10
+    assert (projected > 2) is (mode == "project")
 
 
 def test_an_input_that_passes_is_returned_untouched(case):
@@ -418,7 +418,7 @@ def random_cases(rng, shield, count):
 )
 def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
     plant = replace(random_plant(n, n, m), u_max=0.3 / m)
-    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 150
+    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 300
     estimates, shapes, inputs = random_cases(rng, shield, count)
     found = many(shield, estimates, shapes, inputs)
     ones = [shield.decide(*case) for case in zip(estimates, shapes, inputs, strict=True)]
