@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorWrapper
 
 from ncs_gym import (
     Actuator,
@@ -44,9 +43,7 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
-from tests.shields.attacks.extremes import ExtremalNoise
-from tests.shields.backup_plans.adversary import box_ellipsoid
-from tests.shields.downlink.adversary import Case, edges
+from tests.shields.downlink.adversary import Case
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
@@ -64,41 +61,6 @@ def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
 
 def levels(shield, info):
     return shield.certificate.safe_set.gauge(info["state"])
-
-
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
-def test_every_mode_keeps_its_guarantee(mode):
-    shield = shielded(mode, kind=ExtremalNoise, disturbance="adversarial")
-    _, info = shield.reset(seed=0)
-    rng = np.random.default_rng(0)
-    interventions = 0
-    for _ in range(300):
-        *_, info = shield.step(rng.uniform(-1, 1, 1).astype(np.float32))
-        assert info["shield_guaranteed"], info["shield_reason"]
-        assert info["constraint_values"].max() <= 0.0 if mode == "lookahead" else levels(shield, info) <= 1.0
-        interventions += info["shield_intervened"]
-    assert 0 < interventions < 300
-
-
-def test_lookahead_keeps_guaranteed_states_in_the_box_under_attack():
-    plan_lengths, outside = 0, 0
-    for downlink in edges(2).values():
-        start = {"initial_set": box_ellipsoid(PLANT, 0.95)}
-        shield = shielded("lookahead", kind=ExtremalNoise, disturbance="adversarial", downlink=downlink, **start)
-        for seed in range(2):
-            _, info = shield.reset(seed=seed)
-            held, rng = info["shield_guaranteed"], np.random.default_rng(seed)
-            for _ in range(60):
-                push = np.sign(PLANT.B.T @ PLANT.weight @ PLANT.A @ info["estimate"])
-                action = push if rng.random() < 0.5 else rng.uniform(-1, 1, 1)
-                *_, info = shield.step(action.astype(np.float32))
-                assert info["shield_guaranteed"] or not held, info["shield_reason"]
-                held = info["shield_guaranteed"]
-                plan_lengths += info["shield_plan_length"]
-                outside += held and levels(shield, info) > 1.0
-                assert not held or info["constraint_values"].max() <= 0.0
-    assert plan_lengths > 0
-    assert outside > 0
 
 
 def test_a_broken_downlink_ends_the_guarantee_in_the_step_in_which_zero_is_applied():
@@ -270,41 +232,15 @@ def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effec
     assert stored > 3
 
 
-def test_final_info_says_that_the_last_step_of_an_episode_broke_the_contract():
-    settings = {"downlink": Channel(loss=0.4, delay=1), "downlink_contract": ChannelContract(3)}
-    start = Ellipsoid(0.09 * certificate_of(PLANT).L)
-    env = NCSVectorEnv(30, plant=PLANT, initial_set=start, max_episode_steps=6, autoreset_mode="SameStep", **settings)
-    shield = VectorSafetyShield(env, certificate_of(PLANT))
-    _, info = shield.reset(seed=0)
-    first_at_the_end = 0
-    for _ in range(60):
-        held = info["shield_guaranteed"]
-        *_, truncated, info = shield.step(np.full((30, 1), 0.3))
-        if truncated.any():
-            final, chosen = info["final_info"], truncated & held
-            broken = final["downlink_broken"][chosen]
-            np.testing.assert_array_equal(final["shield_guaranteed"][chosen], ~broken)
-            assert set(final["shield_reason"][chosen][broken]) <= {LATE_INPUT}
-            assert info["shield_guaranteed"][truncated].all()
-            first_at_the_end += np.count_nonzero(broken)
-    assert first_at_the_end > 0
-
-
 def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_once_inputs_take_effect():
     shield = shielded("lookahead", downlink=Channel(delay=3))
     # Just outside, drifting back in.
     drifting = np.array([[1.001, -0.2], [-1.001, 0.2]]) * PLANT.half_widths
-    vector = VectorSafetyShield(
-        NCSVectorEnv(2, plant=PLANT, channel=UPLINK, downlink=Channel(delay=3)), certificate_of(PLANT), "lookahead"
-    )
     for seed, start in enumerate(drifting):
         _, info = shield.reset(seed=seed, options={"state": start})
         assert info["cost"] == 1.0
         assert info["shield_reason"] == NOT_KNOWN_INSIDE
         assert shield.step(np.zeros(1))[4]["shield_guaranteed"]  # step 3 was known to be inside from the start
-    infos = vector.reset(seed=0, options={"state": drifting})[1]
-    assert not infos["shield_guaranteed"].any()
-    assert vector.step(np.zeros((2, 1)))[4]["shield_guaranteed"].all()
 
 
 def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
@@ -367,18 +303,6 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
 
 
-class MeddlingWithMany(VectorWrapper):
-    """Makes the vector say of some environments that another input was applied than was due."""
-
-    chosen = np.zeros(6, np.bool_)
-
-    def step(self, actions):
-        *result, info = self.env.step(actions)
-        inner = self.unwrapped
-        inner._known = inner._known._replace(applied=inner._known.applied + 1e-12 * self.chosen)
-        return *result, info
-
-
 @pytest.mark.parametrize("late", [False, True])
 def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
@@ -394,56 +318,6 @@ def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(la
         assert not late or info["shield_plan_length"] == 0
         kept += info["shield_plan_length"] > 0
     assert late or kept > 3
-
-
-def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
-    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
-    env = MeddlingWithMany(NCSVectorEnv(6, plant=UNSTABLE.plant, **settings))
-    shield, rng, kept = VectorSafetyShield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
-    for seed in range(5):
-        shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng, 6)})
-        env.chosen = np.arange(6) % 2 == 0
-        *_, info = shield.step(np.ones((6, 1), np.float32))
-        assert set(info["shield_reason"][env.chosen]) == {LATE_INPUT}
-        assert not info["shield_plan_length"][env.chosen].any()
-        kept += np.count_nonzero(info["shield_plan_length"][~env.chosen])
-    assert kept > 3
-
-
-@pytest.mark.parametrize("mode", ["project", "lookahead"])
-@pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
-def test_vector_shield_keeps_its_guarantee_through_resets(mode, autoreset):
-    case = Case(PLANT, UPLINK, KEPT)
-    env = case.env(12, "outwards", max_episode_steps=9, autoreset_mode=autoreset)
-    shield = VectorSafetyShield(env, case.certificate, mode)
-    _, info = shield.reset(seed=0)
-    assert info["shield_guaranteed"].all()
-    rng = np.random.default_rng(0)
-    for step in range(60):
-        if step == 31:
-            _, info = shield.reset(options={"reset_mask": np.arange(12) % 3 == 0})
-            assert info["shield_guaranteed"].all(), set(info["shield_reason"])
-        *_, truncated, info = shield.step(rng.uniform(-1, 1, (12, 1)))
-        assert info["shield_guaranteed"].all(), set(info["shield_reason"])
-        if autoreset == "SameStep" and truncated.any():
-            assert info["final_info"]["shield_guaranteed"][truncated].all()
-    assert env.episodes.min() > 5
-
-
-def test_resetting_some_environments_makes_no_other_wait_less():
-    waits = []
-    for others in (0, 3):
-        env = NCSVectorEnv(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
-        shield = VectorSafetyShield(env, certificate_of(PLANT))
-        _, info = shield.reset(seed=0, options={"state": np.array([[1.99, 1.0], [0.0, 0.0]])})
-        for _ in range(others):
-            options = {"reset_mask": np.array([False, True]), "state": np.zeros((2, 2))}
-            _, info = shield.reset(options=options)
-        waits.append(0)
-        while not info["shield_guaranteed"][0]:
-            *_, info = shield.step(np.zeros((2, 1)))
-            waits[-1] += 1
-    assert waits[0] == waits[1] > 0
 
 
 def run_safe_loop(downlink, steps, contract=None, report=True):

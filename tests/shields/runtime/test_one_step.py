@@ -145,26 +145,6 @@ def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
         monkeypatch.undo()
 
 
-def test_a_batch_says_of_each_what_a_batch_of_one_does(case):
-    plant, certificate = case
-    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(4)
-    estimates, shapes, inputs = (np.array(each) for each in zip(*cases(certificate, plant, rng, 120), strict=True))
-    estimates[7], shapes[8], shapes[9] = np.nan, np.nan, -shapes[9]
-    errors = test.predicted(shapes, certificate.error_shapes)
-    chosen = rng.permutation(120)
-    with np.errstate(all="ignore"):
-        sets = test.reachable(estimates[chosen].T, errors.of(chosen))
-        found = np.array([*sets.margins(inputs[chosen].T), sets.smallest_test_margin()])
-        closest = sets.closest(inputs[chosen].T, 1e-9)
-        for k, e in enumerate(chosen.tolist()):
-            one = reachable(test, estimates[e], shapes[e])
-            expected = [*margins(one, inputs[e]), one.smallest_test_margin().item()]
-            np.testing.assert_allclose(found[:, k], expected, rtol=1e-12, atol=1e-13)
-            np.testing.assert_allclose(closest[:, [k]], one.closest(inputs[e][:, None], 1e-9), rtol=1e-7, atol=1e-9)
-    assert np.isnan(found[:, np.isin(chosen, [7, 8, 9])]).all()
-    assert np.isfinite(closest).all(axis=0).sum() > 40
-
-
 @pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0])
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 def test_nothing_is_said_about_indefinite_shapes_of_any_size(key, size):
