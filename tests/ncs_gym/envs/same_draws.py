@@ -302,6 +302,7 @@ def compare(
             if begun and many.autoreset_mode is AutoresetMode.SAME_STEP:
                 last = infos["final_obs"], infos["final_info"]
             elif begun:
+                assert (rewards[index], terminated[index], truncated[index]) == (0.0, False, False)
                 begin(index, infos)
                 continue
             if many.channel.on_request:

@@ -54,20 +54,20 @@ SETPOINT = SetpointTracking(output=(1.0, 0.5), reach=0.8, width=0.3, change_prob
 
 
 def custom(plant, channel, **settings):
-    return lambda: NCSVectorEnv(3, plant=plant, channel=channel, **settings)
+    return lambda: NCSVectorEnv(2, plant=plant, channel=channel, **settings)
 
 
 def ending(channel, mode, **settings):
     """Episodes that end at different times, so that some environments send while others do not."""
-    settings |= {"max_episode_steps": 23, "autoreset_mode": mode, "terminate_on_violation": True}
-    return lambda: NCSVectorEnv(4, plant=TRUCK, channel=channel, task=SpeedTracking(), **settings)
+    settings |= {"max_episode_steps": 13, "autoreset_mode": mode, "terminate_on_violation": True}
+    return lambda: NCSVectorEnv(3, plant=TRUCK, channel=channel, task=SpeedTracking(), **settings)
 
 
 ENVIRONMENTS = (
     {name: custom(TRUCK, channel, task=SPEED) for name, channel in CHANNELS.items()}
-    | {name: lambda name=name: make(name, 3, **ENDLESS).unwrapped for name in IDS}
+    | {name: lambda name=name: make(name, 2, **ENDLESS).unwrapped for name in IDS}
     | {
-        f"{name}, Gaussian": lambda name=name: make(name, 3, noise="gaussian", **ENDLESS).unwrapped
+        f"{name}, Gaussian": lambda name=name: make(name, 2, noise="gaussian", **ENDLESS).unwrapped
         for name in ("TruckTrailerCruise", "BatchReactor")
     }
     | {
@@ -114,14 +114,14 @@ ENVIRONMENTS = (
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_equals_scalar_environments_with_the_same_draws(name):
     env = ENVIRONMENTS[name]()
-    seen = compare(env, 100)
+    seen = compare(env, 64)
     assert (seen.alarms > 0) is name.startswith("alarms")
-    assert seen.alarms < 3 * 100
+    assert seen.alarms < 2 * 64
     assert seen.broken > 0 or name not in ("cart-pole, some outputs", "a broken contract")
     assert env.episodes.min() >= 4 or not name.endswith(("NextStep", "SameStep", "downlink"))
 
 
-@pytest.mark.parametrize("name", ["TruckTrailerCruise", "BatchReactor"])
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", pytest.param("BatchReactor", marks=pytest.mark.slow)])
 def test_a_graph_that_forgets_changes_nothing(name, monkeypatch):
     monkeypatch.setattr(arrival_histories, "_shared", {})
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 40)
@@ -197,17 +197,16 @@ def test_threads_share_a_graph(most, monkeypatch):
     interval = sys.getswitchinterval()
     try:
         sys.setswitchinterval(1e-6)
-        for _ in range(2):
-            monkeypatch.setattr(arrival_histories, "_shared", {})
-            threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-            for seed in range(4):
-                assert_equal(together.pop(seed), alone[seed])
+        monkeypatch.setattr(arrival_histories, "_shared", {})
+        threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
     finally:
         sys.setswitchinterval(interval)
+    for seed in range(4):
+        assert_equal(together[seed], alone[seed])
 
 
 @pytest.mark.parametrize(

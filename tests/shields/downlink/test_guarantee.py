@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorWrapper
 
 from ncs_gym import (
     Actuator,
@@ -44,7 +43,7 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
-from tests.shields.attacks.cases import behind, box_ellipsoid, edges, harmful
+from tests.shields.attacks.cases import behind, harmful
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
@@ -62,41 +61,6 @@ def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
 
 def levels(shield, info):
     return shield.certificate.safe_set.gauge(info["state"])
-
-
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
-def test_every_mode_keeps_its_guarantee(mode):
-    shield = shielded(mode, noise="extreme", disturbance="adversarial")
-    _, info = shield.reset(seed=0)
-    rng = np.random.default_rng(0)
-    interventions = 0
-    for _ in range(300):
-        *_, info = shield.step(rng.uniform(-1, 1, 1).astype(np.float32))
-        assert info["shield_guaranteed"], info["shield_reason"]
-        assert info["constraint_values"].max() <= 0.0 if mode == "lookahead" else levels(shield, info) <= 1.0
-        interventions += info["shield_intervened"]
-    assert 0 < interventions < 300
-
-
-def test_lookahead_keeps_guaranteed_states_in_the_box_under_attack():
-    plan_lengths, outside = 0, 0
-    for downlink in edges(2).values():
-        start = {"initial_set": box_ellipsoid(PLANT, 0.95)}
-        shield = shielded("lookahead", noise="extreme", disturbance="adversarial", downlink=downlink, **start)
-        for seed in range(4):
-            _, info = shield.reset(seed=seed)
-            held, rng = info["shield_guaranteed"], np.random.default_rng(seed)
-            for _ in range(60):
-                push = np.sign(PLANT.B.T @ PLANT.weight @ PLANT.A @ info["estimate"])
-                action = push if rng.random() < 0.5 else rng.uniform(-1, 1, 1)
-                *_, info = shield.step(action.astype(np.float32))
-                assert info["shield_guaranteed"] or not held, info["shield_reason"]
-                held = info["shield_guaranteed"]
-                plan_lengths += info["shield_plan_length"]
-                outside += held and levels(shield, info) > 1.0
-                assert not held or info["constraint_values"].max() <= 0.0
-    assert plan_lengths > 0
-    assert outside > 0
 
 
 def test_a_broken_downlink_ends_the_guarantee_in_the_step_in_which_zero_is_applied():
@@ -151,20 +115,21 @@ def test_no_state_outside_is_guaranteed_wherever_an_episode_starts():
     assert late > 0
 
 
-@pytest.mark.parametrize("input_delay", [1, 3])
-def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_steps(input_delay):
+@pytest.mark.parametrize(("input_delay", "size"), [(1, 1.001), (1, 1.1), (3, 1.001), (3, 1.2)])
+def test_a_guarantee_that_is_regained_is_one_about_the_present_and_every_step_until_the_next_input(input_delay, size):
     shield = shielded(downlink=Channel(delay=input_delay), disturbance="sphere", start=1e-3)
-    # Just outside S, drifting back in: known from the estimate of step c on, c steps later for the present.
-    direction = np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
-    _, info = shield.reset(seed=0, options={"state": 1.001 * direction})
-    assert info["shield_reason"] == NOT_KNOWN_INSIDE
-    known, guaranteed = [], []
-    for _ in range(30):
-        known.append(shield.filter.knows_inside(info["estimate"], info["error_shape"]))
+    # Outside S, drifting back in: an estimate is that of c steps later.
+    start = size * np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
+    _, info = shield.reset(seed=0, options={"state": start})
+    inside, guaranteed = [each.in_safe_set for each in starts_known(shield.filter, start, input_delay)], []
+    for step in range(30):
+        known = shield.filter.knows_inside(info["estimate"], info["error_shape"])
+        inside = [*inside, known] if step else [*inside[:-1], inside[-1] or known]
         guaranteed.append(info["shield_guaranteed"])
+        assert levels(shield, info) <= 1.0 or not guaranteed[-1]
         *_, info = shield.step(np.zeros(1))
-    assert guaranteed.index(True) == known.index(True) + input_delay
-    assert all(guaranteed[guaranteed.index(True) :])
+    assert guaranteed == [all(inside[step : step + input_delay + 1]) for step in range(30)]
+    assert 0 < guaranteed.index(True) < 5
 
 
 def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
@@ -205,7 +170,7 @@ def test_a_given_start_is_followed_under_zero_input():
     assert left > 5
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [16, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 1e7, 1e11])
 def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size, count):
     # Starts that A annihilates, but for the rounding of products of huge numbers.
@@ -227,7 +192,7 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
     assert known > count // 2
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(120, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [6, pytest.param(120, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
 def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size, count):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
@@ -267,45 +232,15 @@ def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effec
     assert stored > 3
 
 
-def test_final_info_says_that_the_last_step_of_an_episode_broke_the_contract():
-    settings = {"downlink": Channel(loss=0.4, delay=1), "downlink_contract": ChannelContract(3)}
-    start = Ellipsoid(0.09 * certificate_of(PLANT).L)
-    env = NCSVectorEnv(30, plant=PLANT, initial_set=start, max_episode_steps=6, autoreset_mode="SameStep", **settings)
-    shield = VectorSafetyShield(env, certificate_of(PLANT))
-    _, info = shield.reset(seed=0)
-    first_at_the_end = 0
-    for _ in range(60):
-        held = info["shield_guaranteed"]
-        *_, truncated, info = shield.step(np.full((30, 1), 0.3))
-        if truncated.any():
-            final, chosen = info["final_info"], truncated & held
-            broken = final["downlink_broken"][chosen]
-            np.testing.assert_array_equal(final["shield_guaranteed"][chosen], ~broken)
-            assert set(final["shield_reason"][chosen][broken]) <= {LATE_INPUT}
-            assert info["shield_guaranteed"][truncated].all()
-            first_at_the_end += np.count_nonzero(broken)
-    assert first_at_the_end > 0
-
-
 def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_once_inputs_take_effect():
     shield = shielded("lookahead", downlink=Channel(delay=3))
     # Just outside, drifting back in.
     drifting = np.array([[1.001, -0.2], [-1.001, 0.2]]) * PLANT.half_widths
-    vector = VectorSafetyShield(
-        NCSVectorEnv(2, plant=PLANT, channel=UPLINK, downlink=Channel(delay=3)), certificate_of(PLANT), "lookahead"
-    )
     for seed, start in enumerate(drifting):
         _, info = shield.reset(seed=seed, options={"state": start})
         assert info["cost"] == 1.0
-        for _ in range(3):
-            assert info["shield_reason"] == NOT_KNOWN_INSIDE
-            *_, info = shield.step(np.zeros(1))
-        assert info["shield_guaranteed"]  # step 3 was known to be inside from the start
-    infos = vector.reset(seed=0, options={"state": drifting})[1]
-    assert not infos["shield_guaranteed"].any()
-    for _ in range(3):
-        *_, infos = vector.step(np.zeros((2, 1)))
-    assert infos["shield_guaranteed"].all()
+        assert info["shield_reason"] == NOT_KNOWN_INSIDE
+        assert shield.step(np.zeros(1))[4]["shield_guaranteed"]  # step 3 was known to be inside from the start
 
 
 def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
@@ -368,18 +303,6 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
 
 
-class MeddlingWithMany(VectorWrapper):
-    """Makes the vector say of some environments that another input was applied than was due."""
-
-    chosen = np.zeros(6, np.bool_)
-
-    def step(self, actions):
-        *result, info = self.env.step(actions)
-        inner = self.unwrapped
-        inner._known = inner._known._replace(applied=inner._known.applied + 1e-12 * self.chosen)
-        return *result, info
-
-
 @pytest.mark.parametrize("late", [False, True])
 def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
@@ -395,6 +318,18 @@ def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(la
         assert not late or info["shield_plan_length"] == 0
         kept += info["shield_plan_length"] > 0
     assert late or kept > 3
+
+
+class MeddlingWithMany(VectorWrapper):
+    """Makes the vector say of some environments that another input was applied than was due."""
+
+    chosen = np.zeros(6, np.bool_)
+
+    def step(self, actions):
+        *result, info = self.env.step(actions)
+        inner = self.unwrapped
+        inner._known = inner._known._replace(applied=inner._known.applied + 1e-12 * self.chosen)
+        return *result, info
 
 
 def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():

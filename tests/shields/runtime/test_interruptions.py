@@ -180,7 +180,7 @@ def test_interrupted_step_in_which_a_stored_input_is_applied_skips_none(kind, st
     assert counts["ended"] > 0
 
 
-@pytest.mark.parametrize("reset", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("reset", [pytest.param("NextStep", marks=pytest.mark.slow), "SameStep"])
 def test_interrupted_step_that_restarts_episodes_ends_the_guarantee_or_has_not_happened(reset):
     settings = {"max_episode_steps": 3 if reset == "SameStep" else 2, "autoreset_mode": reset}
     # No longer than the next episode: the one after that is guaranteed anew.

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, NCSVectorEnv, Remainder
-from shields import Infeasible, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize, verify
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, Remainder
+from shields import Infeasible, SafetyFilter, SafetyShield, synthesize, verify
 from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
 
@@ -16,15 +16,13 @@ LEFT_OUT = Remainder(BOUND, False, "an example")
 LOCAL = LinearPlant(**COMMON, disturbance_bound=0.0, remainder=LEFT_OUT)
 
 
-def reasons(plant, start, mode="monitor", many=False, **settings):
+def reasons(plant, start, mode="monitor", **settings):
     """Why the proof does not hold, step by step, while the state decays."""
-    kind, shield = (NCSVectorEnv, VectorSafetyShield) if many else (NCSEnv, SafetyShield)
-    inner = kind(2, plant=plant, max_episode_steps=None, **settings) if many else kind(plant, **settings)
-    env = shield(inner, certificate_of(plant), mode)
+    env = SafetyShield(NCSEnv(plant, **settings), certificate_of(plant), mode)
     _, info = env.reset(seed=0, options={"state": np.asarray(start)})
     seen = [info["shield_reason"]]
     for _ in range(40):
-        *_, info = env.step(np.zeros((2, 1) if many else 1, np.float32))
+        *_, info = env.step(np.zeros(1, np.float32))
         seen.append(info["shield_reason"])
     _, info = env.reset(seed=0)
     return [*seen, info["shield_reason"]]
@@ -35,44 +33,37 @@ def test_both_plants_have_the_same_bounds_but_not_the_same_name():
     assert EXACT.fingerprint != LOCAL.fingerprint
 
 
-@pytest.mark.parametrize("many", [False, True])
-def test_guarantee_does_not_come_back_after_a_state_that_may_be_outside(many):
+def test_guarantee_does_not_come_back_after_a_state_that_may_be_outside():
     start = [0.99, 0.99]  # in the box, not in S
-    first = (lambda values: [str(value[0]) for value in values]) if many else list
-    exact, local = first(reasons(EXACT, start, many=many)), first(reasons(LOCAL, start, many=many))
+    exact, local = reasons(EXACT, start), reasons(LOCAL, start)
     assert exact[0] == NOT_KNOWN_INSIDE
     assert exact[-2:] == ["", ""]  # back in S, and the next episode
     assert set(local[:-1]) == {LEFT_MODEL}
     assert local[-1] == ""
 
 
-@pytest.mark.parametrize("many", [False, True])
-def test_guarantee_holds_for_a_start_inside(many):
-    assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", many))
+def test_guarantee_holds_for_a_start_inside():
+    assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project"))
 
 
-@pytest.mark.parametrize("many", [False, True])
-def test_behind_a_downlink_every_state_from_the_first_on_must_be_proved_inside(many):
+def test_behind_a_downlink_every_state_from_the_first_on_must_be_proved_inside():
     downlink = {"downlink": Channel(loss=0.3, delay=2, max_consecutive_losses=1)}
-    first = (lambda values: [str(value[0]) for value in values]) if many else list
-    exact = first(reasons(EXACT, [0.99, 0.99], many=many, **downlink))
-    local = first(reasons(LOCAL, [0.99, 0.99], many=many, **downlink))
+    exact = reasons(EXACT, [0.99, 0.99], **downlink)
+    local = reasons(LOCAL, [0.99, 0.99], **downlink)
     assert NOT_KNOWN_INSIDE in exact
     assert exact[-2:] == ["", ""]
     assert set(local[:-1]) == {LEFT_MODEL}
     assert local[-1] == ""
-    assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", many, **downlink))
+    assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", **downlink))
 
 
-@pytest.mark.parametrize("many", [False, True])
-def test_a_first_state_that_may_be_outside_is_not_forgotten_when_inputs_take_effect_inside(many):
+def test_a_first_state_that_may_be_outside_is_not_forgotten_when_inputs_take_effect_inside():
     downlink = {"downlink": Channel(loss=0.3, delay=2, max_consecutive_losses=1)}
-    first = (lambda values: [str(value[0]) for value in values]) if many else list
     for plant, after in ((EXACT, ""), (LOCAL, LEFT_MODEL)):
         safe = certificate_of(plant).safe_set
         start = 1.02 * np.array([1.0, 0.0]) / safe.gauge(np.array([1.0, 0.0]))  # decays into S in two steps
         assert safe.gauge(plant.A @ plant.A @ start) < 0.9
-        seen = first(reasons(plant, start, many=many, **downlink))
+        seen = reasons(plant, start, **downlink)
         assert seen[0] == (after or NOT_KNOWN_INSIDE)
         assert set(seen[3:-1]) == {after}
         assert seen[-1] == ""
@@ -106,20 +97,18 @@ def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
     assert plant.remainder.sentence == LEFT_OUT.sentence
 
 
-@pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("downlink", [{}, {"downlink": Channel(delay=1)}])
-def test_inputs_under_way_beyond_their_limits_are_outside_the_model(many, downlink):
+def test_inputs_under_way_beyond_their_limits_are_outside_the_model(downlink):
     """S reaches to four times the limits in their direction, the bound of the remainder only to the limits."""
     settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
     model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
     plants = [
         LinearPlant.from_statespace(model, input_delay=1, remainder=each, **settings) for each in (LEFT_OUT, None)
     ]
-    first = (lambda values: [str(value[0]) for value in values]) if many else list
     start = [0.0, 0.0, 1.3]
-    assert set(first(reasons(plants[0], start, many=many, **downlink))[:-1]) == {LEFT_MODEL}
-    assert set(first(reasons(plants[0], [0.0, 0.0, 0.9], many=many, **downlink))) == {""}
-    assert set(first(reasons(plants[1], start, many=many, **downlink))) == {""}
+    assert set(reasons(plants[0], start, **downlink)[:-1]) == {LEFT_MODEL}
+    assert set(reasons(plants[0], [0.0, 0.0, 0.9], **downlink)) == {""}
+    assert set(reasons(plants[1], start, **downlink)) == {""}
 
 
 def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_the_model():

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from ncs_gym import truck_trailer
-from shields import SafetyFilter
 from shields.torch import SafeLayer
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -26,19 +25,6 @@ def setting(request):
         estimates = 0.7 * plant.half_widths * rng.uniform(-1, 1, (60, plant.n))
     shapes = rng.uniform(0.01, 0.6, 60)[:, None, None] * certificate.Sigma
     return plant, certificate, estimates, shapes, rng.uniform(-1.3, 1.3, (60, plant.m))
-
-
-def test_batches_of_decisions_are_those_of_single_ones(setting):
-    plant, certificate, estimates, shapes, actions = setting
-    shield, inputs = SafetyFilter(certificate, plant), np.clip(actions, -1, 1) * plant.u_max
-    inputs[0], estimates = np.nan, estimates.copy()
-    many = shield.decide_many(estimates, shapes, inputs)
-    for e, (x_hat, shape, u) in enumerate(zip(estimates, shapes, inputs, strict=True)):
-        one = shield.decide(x_hat, shape, u)
-        np.testing.assert_allclose(many.input[e], one.input, rtol=1e-6, atol=1e-9)
-        assert (many.intervened[e], many.passed[e], many.reason[e]) == (one.intervened, one.passed, one.reason)
-    of_one_shape = shield.decide_many(estimates, shapes[3], inputs)
-    np.testing.assert_array_equal(of_one_shape.input[3], many.input[3])
 
 
 def test_layer_applies_what_the_shield_applies(setting):

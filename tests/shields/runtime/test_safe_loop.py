@@ -213,7 +213,7 @@ def test_start_is_in_the_safe_set_only_if_estimate_or_set_say_so():
     assert loop.reason == NOT_KNOWN_INSIDE
 
 
-@pytest.mark.parametrize("name", ["truck", "cart-pole"])
+@pytest.mark.parametrize("name", ["truck", pytest.param("cart-pole", marks=pytest.mark.slow)])
 def test_memory_does_not_grow(name):
     # What is kept of arrival histories depends only on which were met: the same steps once more meet no new one.
     plant, _, channel = LOOPS[name]

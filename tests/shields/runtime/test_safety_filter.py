@@ -4,11 +4,8 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid
-from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS
 from tests.certificates import certificate_of
@@ -55,7 +52,7 @@ def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
     plant, certificate = case
     shield, rng = SafetyFilter(certificate, plant, mode), np.random.default_rng(0)
     passed = projected = 0
-    for _ in range(150):
+    for _ in range(75):
         estimate = 1.4 * certificate.safe_set.sample(rng)
         shape = certificate.Sigma * rng.uniform(0.05, 1.0)
         decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random())
@@ -64,8 +61,8 @@ def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
         if decision.passed:
             passed += 1
             assert worst_next_level(certificate, plant, estimate, shape, decision.input, rng) <= 1.0
-    assert passed > 20
-    assert (projected > 5) is (mode == "project")
+    assert passed > 10
+    assert (projected > 2) is (mode == "project")
 
 
 def test_an_input_that_passes_is_returned_untouched(case):
@@ -134,6 +131,7 @@ def test_fallback_within_the_assumptions_needs_no_clipping(case):
         *(np.array([value]) for value in (np.nan, np.inf, 4.0000001, -4.0000001, 1j, 10**400, np.datetime64(1, "s"))),
         np.zeros(2),
         np.zeros((1, 1)),
+        *("left", None, object()),
         np.ma.array([1.0], mask=[True]),
         [10**400],
     ],
@@ -261,14 +259,6 @@ def test_known_inside_ends_at_the_edge(certificate, loaded):
     assert not shield.knows_inside((1.0 - radius - 0.5 * MARGIN) * direction, shape)  # inside, but by too little
 
 
-@pytest.mark.parametrize("proposed", ["left", None, [[1.0]], [1.0, 2.0], object()])
-@pytest.mark.parametrize("mode", MODES)
-def test_what_is_no_input_becomes_the_fallback_in_every_mode(certificate, loaded, proposed, mode):
-    decision = SafetyFilter(certificate, loaded, mode).decide(np.array([0.5, 0.1]), certificate.Sigma, proposed)
-    assert decision.reason == "invalid"
-    assert decision.intervened
-
-
 def test_proposed_fallback_is_no_intervention(case):
     plant, certificate = case
     rng = np.random.default_rng(5)
@@ -329,41 +319,6 @@ def test_boundary_trusts_weak_inputs_of_larger_plants_too():
     assert reasons == {"safe", "fallback"}
 
 
-def test_boundary_trusts_the_agent_where_no_input_can_harm(certificate, loaded):
-    boundary = SafetyFilter(certificate, loaded, "boundary")
-    shape, u = 0.1 * certificate.Sigma, np.array([4.0])
-    assert boundary.decide(np.zeros(2), shape, u).reason == "safe"
-    assert boundary.decide(np.array([1.8, 0.5]), shape, 0.0 * u).reason == "fallback"
-
-
-@given(st.integers(0, 100_000))
-@settings(max_examples=100, deadline=None)
-def test_known_inside_is_never_claimed_wrongly(seed):
-    plant = TWO_STATES
-    certificate = certificate_of(plant)
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(seed)
-    estimate, shape = 1.1 * certificate.safe_set.sample(rng), certificate.Sigma * rng.uniform(0, 1)
-    if shield.knows_inside(estimate, shape):
-        errors = Ellipsoid(shape)
-        assert all(certificate.safe_set.gauge(estimate - errors.sample_boundary(rng)) <= 1.0 for _ in range(50))
-
-
-def test_margin_is_that_of_the_contract(certificate, loaded):
-    shield = SafetyFilter(certificate, loaded)
-    estimate, u = np.array([0.4, -0.3]), np.array([1.0])
-    root = np.linalg.cholesky(certificate.M).T
-    spread = outer_sum(
-        root @ loaded.A @ certificate.Sigma @ loaded.A.T @ root.T,
-        root @ loaded.disturbance.shape_matrix @ root.T,
-        np.eye(2),
-    )
-    center = loaded.A @ estimate + loaded.B @ u
-    expected = 1.0 - np.sqrt(np.linalg.eigvalsh(spread)[-1]) - np.sqrt(center @ certificate.M @ center)
-    decision = shield.decide(estimate, certificate.Sigma, u)
-    assert decision.margin == pytest.approx(expected, abs=1e-12)
-    assert shield.margin(estimate, certificate.Sigma, u) == decision.margin
-
-
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
     shield = SafetyFilter(certificate, loaded, "switch")
     shape = 0.1 * certificate.Sigma
@@ -418,7 +373,7 @@ def random_cases(rng, shield, count):
 )
 def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
     plant = replace(random_plant(n, n, m), u_max=0.3 / m)
-    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 150
+    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 300
     estimates, shapes, inputs = random_cases(rng, shield, count)
     found = many(shield, estimates, shapes, inputs)
     ones = [shield.decide(*case) for case in zip(estimates, shapes, inputs, strict=True)]

@@ -63,16 +63,18 @@ class Feature:
     reasons: tuple[str, ...] = ("",)
     safe_set: str = "ellipsoid"
     options: dict[str, Any] | None = None
-    count: int = 3
+    count: int = 2
 
 
 OUTSIDE = {"state": np.array([[1.99, 1.98], [0.0, 0.0], [-2.05, 1.0]])}
 IN_BOX = {"state": np.array([[0.99, 0.99], [0.2, 0.2], [-0.9, -0.9]])}
+CORNER = certificate_of(TRUCK).safe_set.extreme_point(np.array([1.0, 0.4]))
+EDGE = {"state": np.array([(1.0 - 1e-12) * CORNER, (1.0 + 1e-9) * CORNER])}
 DRAWN = {"channel": lambda rng: Channel(loss=0.2, delay=int(rng.integers(3)))}
-GOES_ON, NEVER = ("", guarantee.NOT_KNOWN_INSIDE), (guarantee.NO_DOWNLINK_CONTRACT,)
+GOES_ON, NEVER = ("", guarantee.NOT_KNOWN_INSIDE), (guarantee.NO_DOWNLINK_CONTRACT, guarantee.LATE_INPUT)
 FEATURES = {
     "one input, in every mode": Feature(TRUCK, {"channel": SPARSE, "disturbance": "adversarial"}, MODES),
-    "an unstable plant with a contract": Feature(CART, LATE_CART, ("project", "lookahead", "monitor"), count=2),
+    "an unstable plant with a contract": Feature(CART, LATE_CART, ("project", "lookahead", "monitor")),
     "some outputs": Feature(
         RANDOM["n=3 m=2 p=1"], {"channel": Channel(0.3, 0.01, delay=1, jitter=2)}, ("project", "switch", "boundary")
     ),
@@ -83,9 +85,13 @@ FEATURES = {
     "a task, and episodes that end": Feature(
         TRUCK, {"task": SpeedTracking(change_probability=0.2), "terminate_on_violation": True}, ("monitor",)
     ),
-    "starts anywhere": Feature(TRUCK, {"channel": SPARSE}, ("project", "lookahead"), GOES_ON, options=OUTSIDE),
+    "starts anywhere": Feature(TRUCK, {"channel": SPARSE}, ("project", "lookahead"), GOES_ON, options=OUTSIDE, count=3),
+    "starts at the edge": Feature(TRUCK, {}, reasons=GOES_ON, options=EDGE),
     "between the samples": Feature(truck_trailer(mass=4000.0, between_samples=2), {"channel": SPARSE}),
-    "a remainder": Feature(LOCAL, {}, ("monitor", "project"), (guarantee.LEFT_MODEL, ""), options=IN_BOX),
+    "a remainder": Feature(LOCAL, {}, ("monitor", "project"), (guarantee.LEFT_MODEL, ""), options=IN_BOX, count=3),
+    "a remainder behind a downlink": Feature(
+        LOCAL, {"downlink": Channel(delay=2)}, ("monitor",), (guarantee.LEFT_MODEL, ""), options=IN_BOX, count=3
+    ),
     "gusts": Feature(
         REACTOR,
         {"disturbance": gust, "allow_assumption_violation": True, "contract": ChannelContract(3)},
@@ -101,12 +107,12 @@ FEATURES = {
         REACTOR,
         {"channel": Channel(loss=0.7), "contract": ChannelContract(2)},
         ("project", "monitor"),
-        ("", guarantee.OLD_SAMPLE),
+        ("", guarantee.OLD_SAMPLE, guarantee.LARGE_ERROR),
     ),
     "everything broken at once": Feature(
         REACTOR,
         {
-            "channel": Channel(loss=0.6, quantization_step=1e-3),
+            "channel": Channel(loss=0.8, quantization_step=1e-3),
             "contract": ChannelContract(2, 1e-3),
             "disturbance": lambda rng, plant, nominal: 4.0 * plant.disturbance.sample_boundary(rng),
             "allow_assumption_violation": True,
@@ -116,7 +122,7 @@ FEATURES = {
     ),
     "a downlink": Feature(TRUCK, {"channel": SPARSE, "downlink": KEPT, **edge(TRUCK, 0.98)}, ("boundary", "lookahead")),
     "a downlink, starts anywhere": Feature(
-        TRUCK, {"channel": SPARSE, "downlink": KEPT}, ("project", "lookahead"), GOES_ON, options=OUTSIDE
+        TRUCK, {"channel": SPARSE, "downlink": KEPT}, ("project", "lookahead"), GOES_ON, options=OUTSIDE, count=3
     ),
     "a broken downlink": Feature(
         TRUCK,
@@ -133,7 +139,7 @@ FEATURES = {
     "an unstable plant behind a downlink": Feature(
         CART, {"channel": KEPT, "downlink": Channel(delay=2)}, ("project", "lookahead"), count=1
     ),
-    "samples on request": Feature(CART, {"channel": ASKED, "contract": ChannelContract(9, 1e-4)}, count=2),
+    "samples on request": Feature(CART, {"channel": ASKED, "contract": ChannelContract(9, 1e-4)}),
     "samples on request behind a downlink": Feature(
         CART,
         {
@@ -141,7 +147,6 @@ FEATURES = {
             "contract": ChannelContract(9, 1e-4),
             "downlink": Channel(0.5, delay=1, max_consecutive_losses=1),
         },
-        count=2,
     ),
 }
 RESETS = "NextStep", "SameStep"
@@ -157,11 +162,12 @@ ROWS = [
 @pytest.mark.parametrize(("name", "mode", "reset"), ROWS)
 def test_scalar_shields_vector_shields_and_loops_agree(name, mode, reset):
     feature = FEATURES[name]
-    settings = {"max_episode_steps": 17, "autoreset_mode": reset} | feature.settings
+    settings = {"max_episode_steps": 11, "autoreset_mode": reset} | feature.settings
     many = NCSVectorEnv(feature.count, plant=feature.plant, **settings)
     certificate = certificate_of(feature.plant, many.certificate_contract, feature.safe_set)
-    seen = compare(many, 45, feature.options, certificate, mode, anew=(9, 31))
-    assert set(feature.reasons) <= seen.reasons
+    seen = compare(many, 34, feature.options, certificate, mode, anew=(1, 7, 25))
+    doubts = {guarantee.NOT_KNOWN_INSIDE} if mode == "monitor" else set()  # nothing keeps the state in S
+    assert set(feature.reasons) <= seen.reasons <= set(feature.reasons) | doubts
     assert seen.interventions > 0 or mode in ("monitor", "lookahead")
     assert seen.plans > 0 or mode != "lookahead"
     assert seen.forced > 0 or not many.channel.on_request

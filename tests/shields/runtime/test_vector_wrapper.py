@@ -6,14 +6,12 @@ import pytest
 from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor
+from ncs_gym import NCSVectorEnv
 from shields import Decision, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
-    NOT_KNOWN_INSIDE,
-    OLD_SAMPLE,
     OTHER_STEPS,
 )
-from shields.runtime.vector_wrapper import Clock, _moved, overridden
+from shields.runtime.vector_wrapper import overridden
 from tests import arrays
 from tests.certificates import certificate_of
 from tests.shields.attacks.cases import CHANNELS, TRUCKS, harmful
@@ -27,15 +25,6 @@ KEYS = {
     "shield_reason",
     "episode_interventions",
 }
-
-
-@pytest.mark.parametrize("next_tick", [True, False])
-def test_one_step_is_one_of_the_environments_own_clock(next_tick):
-    before = Clock(np.array([1, 1, 1, 1, 1, 1]), np.array([5, 5, 5, 9, 9, 9]), 7)
-    now = Clock(np.array([1, 1, 1, 2, 3, 2]), np.array([6, 7, 5, 0, 0, 1]), 8 if next_tick else 9)
-    restarted, once = _moved(before, now)
-    np.testing.assert_array_equal(restarted, [False, False, False, True, True, True])
-    np.testing.assert_array_equal(once, np.array([True, False, False, True, False, False]) & next_tick)
 
 
 def test_error_shapes_that_the_environment_forgets_and_meets_again_change_nothing():
@@ -58,14 +47,6 @@ def test_error_shapes_that_the_environment_forgets_and_meets_again_change_nothin
             arrays.assert_equal(value, other[key])
 
 
-def test_start_on_the_boundary_of_the_safe_set_is_known_in_batches_too():
-    plant, certificate = TRUCKS["4000 kg"], certificate_of(TRUCKS["4000 kg"])
-    shield = VectorSafetyShield(NCSVectorEnv(2, plant=plant), certificate)
-    edge = certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
-    for factor in (1 - 1e-12, 1 + 1e-9):
-        assert (shield.reset(options={"state": factor * edge})[1]["shield_guaranteed"] == (factor < 1.0)).all()
-
-
 @pytest.mark.parametrize(
     ("given", "kept"), [(np.float32, np.float32), (np.float64, np.float64), (np.int64, np.float64)]
 )
@@ -81,70 +62,19 @@ def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
 )
 def test_no_policy_leaves_the_safe_set(mode, channel):
     plant = TRUCKS["4000 kg"]
-    env = NCSVectorEnv(200, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=100)
+    env = NCSVectorEnv(100, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=60)
     shield = VectorSafetyShield(env, certificate_of(plant), mode)
     _, info = shield.reset(seed=0)
     rng, levels, overridden = np.random.default_rng(0), [], 0
-    for step in range(200):
+    for step in range(120):
         outwards = np.sign(info["estimate"] @ (shield.certificate.M @ plant.B))
-        actions = outwards if step % 2 else rng.uniform(-1, 1, (200, 1))
+        actions = outwards if step % 2 else rng.uniform(-1, 1, (100, 1))
         _, _, _, _, info = shield.step(actions)
         levels.append(np.einsum("ei,ij,ej->e", info["state"], shield.certificate.M, info["state"]).max())
         assert info["shield_guaranteed"].all()
         overridden += int(info["shield_intervened"].sum())
     assert 0.5 < max(levels) <= 1.0
-    assert 0 < overridden < 200 * 200
-
-
-def test_same_step_autoreset_reports_the_last_step_in_final_info():
-    settings = {"num_envs": 5, "max_episode_steps": 7}
-    shields = [
-        VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", autoreset_mode=mode, **settings), penalty=1.0)
-        for mode in ("SameStep", "Disabled")
-    ]
-    for shield in shields:
-        shield.reset(seed=0)
-    for _ in range(7):
-        same, plain = (shield.step(np.ones((5, 1), np.float32)) for shield in shields)
-    np.testing.assert_array_equal(same[1], plain[1])
-    final = same[4]["final_info"]
-    for key, value in plain[4].items():
-        np.testing.assert_array_equal(final[key], value)
-    assert not same[4]["shield_intervened"].any()
-    assert not same[4]["episode_interventions"].any()
-    assert same[4]["shield_guaranteed"].all()
-
-
-def test_penalty_is_subtracted_per_intervention_but_not_for_a_reset():
-    rewards = []
-    for penalty in (0.0, 3.0):
-        env = VectorSafetyShield(
-            gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=4, max_episode_steps=10), penalty=penalty
-        )
-        env.reset(seed=0)
-        run = [env.step(np.ones((4, 1), np.float32)) for _ in range(25)]
-        rewards.append(np.array([step[1] for step in run]))
-        counts = np.array([step[4]["shield_intervened"] for step in run])
-    np.testing.assert_allclose(rewards[0] - rewards[1], 3.0 * counts)
-    assert counts.any()
-    assert not counts[10].any()
-
-
-def test_partial_resets_keep_what_is_known_of_the_others():
-    env = VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=3, autoreset_mode="Disabled"))
-    _, info = env.reset(seed=0)
-    assert set(info) >= KEYS
-    for _ in range(20):
-        *_, info = env.step(np.ones((3, 1), np.float32))
-    counts = info["episode_interventions"]
-    assert counts.any()
-    _, info = env.reset(options={"reset_mask": np.array([False, True, False]), "state": np.array([9.0, 9.0])})
-    np.testing.assert_array_equal(info["episode_interventions"][[0, 2]], counts[[0, 2]])
-    assert info["episode_interventions"][1] == 0
-    np.testing.assert_array_equal(info["shield_guaranteed"], [True, False, True])
-    assert "not known to be in the safe set" in info["shield_reason"][1]
-    *_, info = env.step(np.ones((3, 1), np.float32))
-    np.testing.assert_array_equal(info["shield_guaranteed"][[0, 2]], True)
+    assert 0 < overridden < 120 * 100
 
 
 def test_steps_behind_the_shields_back_end_the_proof():
@@ -272,32 +202,3 @@ def test_scalar_shields_in_gymnasiums_sync_environment_still_work():
     env = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2, vectorization_mode="sync", wrappers=[SafetyShield])
     env.reset(seed=0)
     assert env.step(np.ones((2, 1), np.float32))[4]["shield_guaranteed"].all()
-
-
-def test_sphere_disturbance_and_shared_certificate():
-    certificate = certificate_of(TRUCKS["4000 kg"])
-    envs = [NCSVectorEnv(2, plant=TRUCKS["4000 kg"], disturbance=SphereDisturbance()) for _ in range(2)]
-    shields = [VectorSafetyShield(env, certificate) for env in envs]
-    for shield in shields:
-        shield.reset(seed=1)
-    one, other = (shield.step(np.ones((2, 1)))[4] for shield in shields)
-    np.testing.assert_array_equal(one["input"], other["input"])
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_broken_contract_is_the_reason_given_for_a_large_error(mode):
-    plant, contract = batch_reactor(), ChannelContract(3)
-    certificate = certificate_of(plant, contract)
-    settings = {"plant": plant, "channel": Channel(loss=1.0), "contract": contract, "max_episode_steps": 10}
-    env = VectorSafetyShield(NCSVectorEnv(num_envs=3, autoreset_mode=mode, **settings), certificate)
-    env.reset(seed=0)
-    seen, last = set(), {}
-    for _ in range(10):
-        *_, info = env.step(np.zeros((3, plant.m)))
-        last = info.get("final_info", info)
-        old = last["measurement_age"] > contract.max_age
-        assert (last["shield_guaranteed"] | old).all()
-        seen |= set(last["shield_reason"])
-    assert OLD_SAMPLE in seen <= {"", OLD_SAMPLE, NOT_KNOWN_INSIDE}
-    assert (last["measurement_age"] == 10).all()
-    assert OLD_SAMPLE in last["shield_reason"]

@@ -26,9 +26,7 @@ from shields.runtime.guarantee import (
     OTHER_INPUT,
     OTHER_STEPS,
 )
-from shields.runtime.safety_filter import SafetyFilter
-from tests.certificates import certificate_of, with_proof
-from tests.shields.attacks.cases import RANDOM
+from tests.certificates import with_proof
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 KEYS = {
@@ -90,14 +88,6 @@ def test_full_throttle_is_overridden_and_stays_inside(certificate, mode):
     assert bare[-1]["is_success"] == 0.0
 
 
-def test_projection_corrects_less_than_switching(certificate):
-    total = {
-        mode: sum(info["shield_correction"] for info in play(shielded(certificate, mode), full, seed=0)[1:10])
-        for mode in ("project", "switch")
-    }
-    assert total["project"] < total["switch"]
-
-
 def test_idle_shield_is_the_identity_bit_for_bit(certificate):
     actions = np.random.default_rng(0).uniform(-0.05, 0.05, (200, 1)).astype(np.float32)
     plain, shield = gym.make(CRUISE), shielded(certificate)
@@ -133,13 +123,9 @@ def test_a_copy_of_the_callers_own_action_is_passed_on(certificate):
     assert all(env.action_space.contains(a) for a in seen[2:])
 
 
-def test_float64_actions_are_judged_at_full_precision(certificate):
-    infos = play(shielded(certificate), lambda info: np.array([1.0]), seed=0)
-    assert all(info["shield_guaranteed"] for info in infos)
-
-
-def test_penalty_is_paid_per_intervention_only(certificate):
-    free, paid = shielded(certificate), shielded(certificate, penalty=0.5)
+@pytest.mark.parametrize("mode", ["project", "monitor"])
+def test_penalty_is_paid_per_intervention_only(certificate, mode):
+    free, paid = shielded(certificate, mode), shielded(certificate, mode, penalty=0.5)
     free.reset(seed=0)
     paid.reset(seed=0)
     for _ in range(30):
@@ -167,48 +153,12 @@ def test_monitor_is_the_unshielded_environment_bit_for_bit(certificate):
     assert doubted
 
 
-def test_monitor_counts_what_switch_does_at_the_same_estimates(certificate):
-    env = shielded(certificate, mode="monitor")
-    switch = SafetyFilter(certificate, env.filter.plant, "switch")
-    _, info = env.reset(seed=0)
-    rng = np.random.default_rng(1)
-    for _ in range(150):
-        estimate, shape = info["estimate"], info["error_shape"]
-        action = rng.uniform(-1, 1, 1).astype(np.float32)
-        *_, info = env.step(action)
-        decision = switch.decide(estimate, shape, 4.0 * action.astype(np.float64))
-        assert info["shield_intervened"] == decision.intervened
-
-
 def test_monitor_keeps_the_proof_while_nothing_unsafe_is_proposed(certificate):
     env = shielded(certificate, mode="monitor", disturbance=AdversarialDisturbance(certificate.M))
     gain = certificate.K / env.filter.plant.u_max[:, None]
     infos = play(env, lambda info: gain @ info["estimate"], seed=0)
     assert all(info["shield_guaranteed"] for info in infos)
     assert infos[-1]["episode_interventions"] == 0
-
-
-def test_monitor_charges_the_penalty_for_what_it_counts(certificate):
-    free, charged = (shielded(certificate, mode="monitor", penalty=penalty) for penalty in (0.0, 2.0))
-    for env in (free, charged):
-        env.reset(seed=0)
-    for _ in range(30):
-        (_, reward, *_, info), (_, less, *_, _) = free.step(full(None)), charged.step(full(None))
-        assert less == pytest.approx(reward - 2.0 * info["shield_intervened"])
-
-
-def test_boundary_overrides_more_often_than_switch(certificate):
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (200, 1)).astype(np.float32)
-    counts = []
-    for mode in ("project", "switch", "boundary"):
-        env = shielded(certificate, mode=mode)
-        env.reset(seed=0)
-        for action in actions:
-            *_, info = env.step(action)
-            assert info["shield_guaranteed"]
-        counts.append(info["episode_interventions"])
-    assert counts[2] > counts[1]
 
 
 @pytest.mark.parametrize("action", [np.array([np.nan]), np.zeros(2), None, "left", ["0.1"], [10**400], np.array([1j])])
@@ -258,22 +208,6 @@ def test_shielded_environment_survives_pickling(certificate):
     twin = pickle.loads(pickle.dumps(env))
     for _ in range(20):
         np.testing.assert_array_equal(env.step(full(None))[4]["state"], twin.step(full(None))[4]["state"])
-
-
-def test_shield_never_reads_the_true_state(certificate):
-    class Blind(gym.Wrapper):
-        def reset(self, **kwargs):
-            observation, info = self.env.reset(**kwargs)
-            return observation, {key: value for key, value in info.items() if key in SEEN}
-
-        def step(self, action):
-            observation, reward, terminated, truncated, info = self.env.step(action)
-            return observation, reward, terminated, truncated, {key: info[key] for key in SEEN}
-
-    SEEN = ("estimate", "error_shape", "input", "assumption_violated")
-    inputs = [play(SafetyShield(layer(gym.make(CRUISE)), certificate), full, seed=0) for layer in (Blind, gym.Wrapper)]
-    for one, other in zip(*inputs, strict=True):
-        np.testing.assert_array_equal(one["input"], other["input"])
 
 
 # The proof and its assumptions, each broken on purpose.
@@ -468,7 +402,7 @@ def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, rewr
     plain, forged = shielded(certificate), SafetyShield(Rewrites(gym.make(CRUISE), rewrite), certificate)
     plain.reset(seed=0)
     forged.reset(seed=0)
-    for _ in range(200):
+    for _ in range(60):
         one, other = plain.step(full(None))[4], forged.step(full(None))[4]
         for key in KEYS:
             np.testing.assert_array_equal(one[key], other[key])
@@ -522,19 +456,3 @@ def test_alarm_is_cleared_by_a_new_episode(certificate):
     env.step(full(None))
     env.unwrapped.estimator.advance = honest
     assert env.reset()[1]["shield_guaranteed"]
-
-
-def test_several_inputs_with_partial_measurements_are_shielded():
-    plant = RANDOM["n=3 m=2 p=1"]
-    channel = Channel(loss=0.4, quantization_step=0.01, delay=1, jitter=2)
-    rng = np.random.default_rng(0)
-    for mode in ("project", "switch"):
-        env = SafetyShield(
-            gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance="adversarial"),
-            certificate_of(plant),
-            mode,
-        )
-        infos = play(env, lambda info: np.sign(rng.standard_normal(2)).astype(np.float32), seed=0)
-        assert all(info["shield_guaranteed"] for info in infos)
-        assert infos[-1]["is_success"] == 1.0
-        assert infos[-1]["episode_interventions"] > 10
