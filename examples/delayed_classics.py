@@ -2,10 +2,11 @@
 
     python examples/delayed_classics.py [--seeds 3] [--smoke] [--out delayed_classics.png]
 
-Takes about 3000 seconds on one core (with --smoke 40). PPO of stable-baselines3 (and SAC, where actions are continuous)
-is trained and evaluated on no network, on one that delays observations by two steps, and on one that loses half of them
-in bursts, with and without the age of the newest observation and the pending actions beside it. Hyperparameters are those of rl-baselines3-zoo. Prints the mean return
-with Student's 95 % interval over the trainings, and draws it if matplotlib is installed.
+Takes about 3000 seconds on one core (with --smoke 40). PPO of stable-baselines3 (and SAC, where actions are
+continuous) is trained and evaluated on no network, on one that delays observations by two steps, and on one that
+loses half of them in bursts, with and without the age of the newest observation and the pending actions beside it.
+Hyperparameters are those of rl-baselines3-zoo. Prints the mean return with Student's 95 % interval over the
+trainings, and draws it if matplotlib is installed.
 """
 
 import argparse

@@ -3,9 +3,9 @@
     python examples/pettingzoo_network.py
 
 Takes about one second on one core. PettingZoo's parallel API is not Gymnasium's: `Together` makes one environment of
-all agents, whose observations and actions are dictionaries, so that `Networked` gives each of them a channel. It takes any
-object with that API whose agents all stay until the end; this program brings a small one of its own, so that it runs
-without PettingZoo.
+all agents, whose observations and actions are dictionaries, so that `Networked` gives each of them a channel. It
+takes any object with that API whose agents all stay until the end; this program brings a small one of its own, so
+that it runs without PettingZoo.
 """
 
 import gymnasium as gym
