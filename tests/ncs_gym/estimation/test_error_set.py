@@ -46,9 +46,15 @@ def test_error_never_leaves_the_set_without_any_packet(seed):
     assert largest <= 1.0
 
 
-def test_set_covers_a_bad_first_estimate():
-    plant = truck_trailer(initial_cov=0.2 * np.eye(2))
+KNOWN = {"gamma": 0.0, **dict.fromkeys(("measurement_noise_cov", "initial_cov"), np.zeros((2, 2)))}
+PERFECT = truck_trailer(process_noise_cov=np.zeros((2, 2)), **KNOWN)
+FLAT = truck_trailer(process_noise_cov=np.diag([0.0, 1e-4]), **KNOWN)
+
+
+@pytest.mark.parametrize("plant", [truck_trailer(initial_cov=0.2 * np.eye(2)), FLAT, PERFECT])
+def test_set_covers_a_bad_first_estimate_and_leaves_slack_in_every_direction(plant):
     errors = certified_error_set(plant)
+    assert plant is not PERFECT or np.linalg.eigvalsh(errors.Sigma)[1] < 1e-9
     slack = np.linalg.eigvalsh(errors.Sigma - plant.initial_error.shape_matrix)[0]
     grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape_matrix / (1.0 - errors.rate)
     assert slack > 0.0
@@ -61,21 +67,6 @@ def test_covering_a_bad_first_estimate_costs_less_than_scaling_would():
     factor = plant.initial_error.shape_matrix[0, 0] / np.linalg.eigvalsh(plain.Sigma / 1.1)[0]
     assert factor > 1.0
     assert np.trace(errors.Sigma) < factor * np.trace(plain.Sigma)
-
-
-def test_perfectly_known_plant_has_a_thin_but_full_set():
-    zero = np.zeros((2, 2))
-    plant = truck_trailer(gamma=0.0, process_noise_cov=zero, measurement_noise_cov=zero, initial_cov=zero)
-    values = np.linalg.eigvalsh(certified_error_set(plant).Sigma)
-    assert values[0] > 0.0
-    assert values[1] < 1e-9
-
-
-def test_flat_disturbance_leaves_slack_in_every_direction():
-    plant = truck_trailer(gamma=0.0, process_noise_cov=np.diag([0.0, 1e-4]))
-    errors = certified_error_set(plant)
-    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape_matrix / (1.0 - errors.rate)
-    assert np.linalg.eigvalsh(errors.Sigma - grown)[0] > 0.0
 
 
 def test_units_do_not_change_the_set():

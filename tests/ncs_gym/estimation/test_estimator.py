@@ -288,7 +288,7 @@ def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_thei
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
 def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditioned(size):
-    """Coordinates of its unit ball and back are not the identity: its factor's inverse has entries of 2^(n - 2)."""
+    """Coordinates of its unit ball and back are not the identity: the inverse of its factor has entries of 2^(n-2)."""
     n, rng = 44, np.random.default_rng(0)
     factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
     plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from ncs_gym import LinearPlant, batch_reactor, cart_pole, truck_trailer
-from ncs_gym.plants.between_samples import GridRows
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANTS = {
@@ -44,6 +43,7 @@ def random_model(seed, n, m, k):
 def test_grid_is_that_of_the_model_and_begins_with_the_box(name):
     plant = replace(PLANTS[name](), between_samples=6)
     grid = plant.grid_rows
+    assert not any(array.flags.writeable for array in grid)
     np.testing.assert_array_equal(grid.state[0], plant.box_rows)
     assert not grid.input[0].any()
     true = plant.box_rows @ exponentials(plant, plant.dt * np.arange(6) / 6)
@@ -170,12 +170,6 @@ def test_once_per_step_is_at_the_sampling_instants_alone():
     assert "by any time within a step" in " ".join(plant.assumptions)
     assert replace(plant, between_samples=1).between_samples is None
     assert replace(plant, between_samples=1).fingerprint == truck_trailer().fingerprint
-
-
-def test_rows_of_a_grid_are_read_only():
-    grid = replace(truck_trailer(), between_samples=3).grid_rows
-    assert isinstance(grid, GridRows)
-    assert not any(array.flags.writeable for array in grid)
 
 
 @pytest.mark.parametrize("make", [gym.make, lambda env_id, **settings: gym.make_vec(env_id, num_envs=2, **settings)])
