@@ -17,7 +17,7 @@ from shields.runtime import safety_filter
 from shields.runtime.backup_plans import plan_check
 from shields.runtime.guarantee import OLD_SAMPLE
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
-from tests.shields.attacks.cases import CASES, case
+from tests.shields.attacks.cases import CASES, RANDOM, case
 from tests.shields.attacks.worlds import (
     AGE,
     ALL_TIMES,
@@ -35,13 +35,13 @@ MODES = ("project", "switch", "boundary", "lookahead")
 # Environments and steps behind one network in the part, and behind each of them in the whole.
 SIZES = {
     "SafetyShield": ((None, 60), (None, 400)),
-    "VectorSafetyShield": ((30, 40), (100, 150)),
+    "VectorSafetyShield": ((20, 30), (100, 150)),
     "SafeLoop": ((1, 150), (1, 600)),
 }
 # How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
 # than the safe set.
 CLOSE = {SAFE_SET: 0.9, BOX: 0.4, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
-SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 1.0}
+SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 0.8}
 WITH_REMAINDER = [name for name in CASES if name.endswith("with remainder")]
 
 
@@ -55,7 +55,9 @@ def attacked(name, mode, through, network, seed, is_whole=False, of=None, **worl
 
 
 def campaign() -> list:
-    """All of case x mode x what is attacked; the part is every mode of vectors and one mode of the others."""
+    """All of case x mode x what is attacked; the part is every mode of vectors, of random plants every second, and one
+    mode of the others.
+    """
     rows = []
     for c, name in enumerate(CASES):
         for m, mode in enumerate(MODES):
@@ -63,7 +65,8 @@ def campaign() -> list:
                 if through == "SafeLoop" and name in WITH_REMAINDER:  # only the environments have their processes
                     continue
                 row = name, mode, through
-                if through == "VectorSafetyShield" or (c + m + t) % len(MODES) == 0:
+                every = len(MODES) if through != "VectorSafetyShield" else 2 if name in RANDOM else 1
+                if (c + m + t) % every == 0:
                     rows.append(pytest.param(*row, False, id="-".join(row)))
                 rows.append(pytest.param(*row, True, id="-".join((*row, "whole")), marks=pytest.mark.slow))
     return rows
@@ -91,7 +94,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
-@pytest.mark.parametrize(("count", "steps"), [(40, 60), pytest.param(200, 500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("count", "steps"), [(30, 50), pytest.param(200, 500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
     for network in range(len(case(name).networks) if steps > 100 else 1):
@@ -101,7 +104,7 @@ def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, c
         assert case(name).contract is None or outcome.largest[AGE] == 1.0
         # Shapes recur: they are compared in exact arithmetic, in the part some of all ages.
         by_age = sorted(seen, key=lambda each: each[1])
-        for shape, age in by_age if steps > 100 else by_age[:: len(by_age) // 15 + 1]:
+        for shape, age in by_age if steps > 100 else by_age[:: len(by_age) // 10 + 1]:
             certified = error_set.shape_at(age)
             running = np.frombuffer(shape).reshape(certified.shape)
             assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
@@ -208,15 +211,15 @@ def each(names, modes, through):
 
 STATE = (SAFE_SET, BOX)
 # Which claims become false with which defect, where that is sought, whether it counts though the guarantee was
-# withdrawn, and every how many rows are tried in the part.
+# withdrawn, and every how many rows are tried in the part, so that every case has a twin there.
 TWINS = {
-    "errors forgotten": ((SAFE_SET,), turns(CASES, ONE_STEP, VECTOR), False, 1),
+    "errors forgotten": ((SAFE_SET,), turns(CASES, ONE_STEP, VECTOR), False, 2),
     "set enlarged": (STATE, turns(CASES, ("lookahead", *ONE_STEP), VECTOR), False, 3),
     "no filter": (STATE, turns(CASES, ["monitor"], SCALAR), True, 3),
     "disturbances three times as large": (STATE, turns(LINEAR, MODES, LOOP), True, 3),
     "downlink not known": ((SAFE_SET,), each(BOTH_WAYS, ONE_STEP, LOOP), True, 1),
     "samples later than promised": ((AGE,), turns(PROMISED, MODES, LOOP), True, 3),
-    "times between samples not counted": ((ALL_TIMES,), each(AT_ALL_TIMES, MODES, VECTOR), False, 1),
+    "times between samples not counted": ((ALL_TIMES,), each(AT_ALL_TIMES[:2], MODES, VECTOR), False, 1),
     "plans checked with nothing": ((BOX,), each(PLANNED, ["lookahead"], VECTOR), False, 1),
     "plans checked with a disturbance less": ((BOX,), each(PLANNED, ["lookahead"], LOOP), False, 1),
     "plans turned round": ((BOX,), each(PLANNED[:3], ["lookahead"], LOOP), False, 1),
@@ -225,8 +228,8 @@ TWINS = {
 
 def twins() -> list:
     return [
-        pytest.param(defect, *row, id="-".join((defect, *row)), marks=[pytest.mark.slow] if k % every else [])
-        for defect, (_, rows, _, every) in TWINS.items()
+        pytest.param(defect, *row, id="-".join((defect, *row)), marks=[pytest.mark.slow] if (d + k) % every else [])
+        for d, (defect, (_, rows, _, every)) in enumerate(TWINS.items())
         for k, row in enumerate(rows)
     ]
 

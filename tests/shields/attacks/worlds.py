@@ -24,7 +24,7 @@ SAFE_SET, BOX, ALL_TIMES, ERROR, AGE = (
     "age within the contract",
 )
 # Episodes are begun anew after so many steps, in the middle of plans; in vectors after so many.
-EPISODE, VECTOR_EPISODE = 60, 27
+EPISODE, VECTOR_EPISODE = 60, 20
 # What is no input; a loop puts its own in the place of it.
 NO_INPUTS = (None, np.nan, "left", np.zeros(9), 10**400)
 
