@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
+import gymnasium as gym
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
@@ -69,6 +71,12 @@ def delayed(steps: int) -> LinearPlant:
     return LinearPlant.from_statespace(model, dt=0.1, box=[1.0, 1.5], u_max=0.8, input_delay=steps, **bounds)
 
 
+def counted_between(name: str, points: int) -> tuple[LinearPlant, ChannelContract | None]:
+    """The plant of a registered environment, whose box counts between samples, too, and its contract."""
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    return replace(env.plant, between_samples=points), env.certificate_contract
+
+
 # Plants with contracts, whose certificates with polytopes are checked in: data/certificates.
 NAMED: dict[str, Callable[[], tuple[LinearPlant, ChannelContract | None]]] = {
     "stable": lambda: (small([[0.9, 0.1], [0.0, 0.8]]), None),
@@ -79,6 +87,8 @@ NAMED: dict[str, Callable[[], tuple[LinearPlant, ChannelContract | None]]] = {
     "servo": lambda: (servo(), ChannelContract(3)),
     "servo, bearable": lambda: (servo(0.8), ChannelContract(3)),
     "servo, at all times": lambda: (servo(1.1, between_samples=4), ChannelContract(3)),
+    "cruise, at all times": lambda: counted_between("TruckTrailerCruise", 8),
+    "reactor, at all times": lambda: counted_between("BatchReactor", 4),
 }
 
 

@@ -4,7 +4,6 @@ OpenBLAS takes the kernels that `OPENBLAS_CORETYPE` names, numpy leaves out the 
 `NPY_DISABLE_CPU_FEATURES` names; both are read when a process starts.
 """
 
-import functools
 import json
 import os
 import platform
@@ -23,7 +22,7 @@ from agents import Agent
 from benchmarks.portability import KERNELS, can_run, random_plant
 from shields import Certificate, SafetyFilter, verify
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
-from tests.certificates import ROOT, certificate_of
+from tests.certificates import CHECKED_IN, ROOT, certificate_of
 from tests.verdicts import verified
 
 on_x86 = pytest.mark.skipif(
@@ -32,7 +31,6 @@ on_x86 = pytest.mark.skipif(
 
 WIDE = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3"
 IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleNonlinear")
-DATA = Path(__file__).resolve().parent.parent / "data" / "certificates"
 
 
 def all_plants():
@@ -61,6 +59,11 @@ def print_verdicts(folder):
     for file in sorted(Path(folder).glob("*.json")):
         certificate, plant = Certificate.load(file), plants[file.stem][0]
         print(file.stem, all(verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint")))
+
+
+def print_plants_and_verdicts(folder):
+    print_plants()
+    print_verdicts(folder)
 
 
 def make_certificates(folder):
@@ -92,25 +95,21 @@ def call(function, *arguments):
     return "-c", f"{load}(*{tuple(map(str, arguments))!r})"
 
 
-@functools.cache
-def own_plants():
-    return {name: derived(plant) for name, (plant, _) in all_plants().items()}
-
-
 @on_x86
-@pytest.mark.parametrize(("kernels", "wide"), [("Haswell", True), ("SkylakeX", True), ("Prescott", False)])
-def test_plants_and_their_bounds_are_the_same_numbers(kernels, wide):
-    assert json.loads(under(kernels, *call(print_plants), wide=wide)) == own_plants()
-
-
-@on_x86
-def test_certificate_made_here_verifies_under_other_kernels(tmp_path):
+@pytest.mark.parametrize(
+    ("kernels", "wide"),
+    [
+        ("Prescott", False),
+        *(pytest.param(kernels, True, marks=pytest.mark.slow) for kernels in ("Haswell", "SkylakeX")),
+    ],
+)
+def test_plants_are_the_same_numbers_under_other_kernels_and_their_certificates_verify(kernels, wide, tmp_path):
     for name in IDS:
         env = gym.make(f"ncs_gym/{name}-v0").unwrapped
         certificate_of(env.plant, env.certificate_contract).save(tmp_path / f"{name}.json")
-    expected = "".join(f"{name} True\n" for name in sorted(IDS))
-    assert under("Prescott", *call(print_verdicts, tmp_path), wide=False) == expected
-    assert under("Haswell", *call(print_verdicts, tmp_path)) == expected
+    numbers, *verdicts = under(kernels, *call(print_plants_and_verdicts, tmp_path), wide=wide).splitlines()
+    assert json.loads(numbers) == {name: derived(plant) for name, (plant, _) in all_plants().items()}
+    assert verdicts == [f"{name} True" for name in sorted(IDS)]
 
 
 @on_x86
@@ -125,7 +124,7 @@ def test_certificates_of_every_plant_verify_under_all_kernels(tmp_path, maker):
         assert under(judge, *call(print_verdicts, tmp_path)) == "".join(f"{name} True\n" for name in made)
 
 
-@pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", sorted(CHECKED_IN.glob("*-*.json")), ids=lambda file: file.stem)
 def test_certificate_of_an_earlier_version_and_another_processor_still_holds(file):
     """Made when the last bits of A and B, and with them the fingerprint, depended on the processor."""
     certificate = Certificate.load(file)
@@ -140,22 +139,11 @@ def test_certificate_of_an_earlier_version_and_another_processor_still_holds(fil
 
 
 @on_x86
+@pytest.mark.slow
 def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path):
     compare = ("-m", "experiments", "compare", "--env", "ncs_gym/BatchReactor-v0", "--out", tmp_path, "--jobs", "1")
-    compare = (
-        *compare,
-        "--steps",
-        "64",
-        "--episodes",
-        "2",
-        "--seeds",
-        "1",
-        "--arms",
-        "shielded",
-        "--baselines",
-        "lqr",
-    )
-    compare = (*compare, "--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")
+    compare += ("--steps", "64", "--episodes", "2", "--seeds", "1", "--arms", "shielded", "--baselines", "lqr")
+    compare += ("--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")
     under("Haswell", *compare)
     files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("runs/*.json")}
     assert files
@@ -167,7 +155,10 @@ def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path)
     assert Agent.load(folder).env == "ncs_gym/BatchReactor-v0"
 
 
-@pytest.mark.parametrize("name", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
+@pytest.mark.parametrize(
+    "name",
+    ["TruckTrailerCruise", *(pytest.param(name, marks=pytest.mark.slow) for name in ("CartPole", "BatchReactor"))],
+)
 def test_verdicts_are_true_in_any_order_of_summation(name):
     """With the states in other orders every sum is taken in another order; what passes lies inside, exactly."""
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped

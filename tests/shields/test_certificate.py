@@ -34,24 +34,6 @@ def test_arrays_are_read_only_even_after_pickling(certificate):
             assert not getattr(twin, name).flags.writeable
 
 
-def test_every_changed_digit_is_noticed(path):
-    text = path.read_text()
-    digits = [i for i, letter in enumerate(text) if letter.isdigit()]
-    for i in digits[:: max(1, len(digits) // 200)]:
-        changed = text[:i] + str((int(text[i]) + 1) % 10) + text[i + 1 :]
-        path.write_text(changed)
-        with pytest.raises(CertificateError):
-            Certificate.load(path)
-
-
-def test_every_truncation_is_noticed(path):
-    data = path.read_bytes()
-    for length in range(0, len(data) - 2, 37):
-        path.write_bytes(data[:length])
-        with pytest.raises(CertificateError):
-            Certificate.load(path)
-
-
 @pytest.mark.parametrize(
     "content", ["", "{}", "[]", "null", '"text"', '{"format": "other"}', "[" * 100_000, "\x00\xff"]
 )

@@ -2,19 +2,23 @@
 
 import json
 from dataclasses import replace
+from itertools import count
 
 import gymnasium as gym
 import pytest
 
 import shields.certificates
-from ncs_gym import ChannelContract, LinearPlant, contract_of
+from ncs_gym import ChannelContract, contract_of
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import ENVIRONMENTS
 from shields import CertificateError, SafetyShield, certificate_for, synthesize
 from shields.certificates import certificate_of_package
 from shields.verification import require_valid, verifier
+from tests.certificates import certificate_of
+from tests.plants import named, small
 from tests.verdicts import verified
 
+UNASKED = count(1)
 IDS = [env_id for env_id, each in ENVIRONMENTS.items() if each.plant is not None]
 
 
@@ -30,20 +34,20 @@ def plant_and_contract(env_id):
 
 
 @pytest.fixture
-def nothing_made(monkeypatch):
-    """A process that has asked for no certificate yet."""
-    monkeypatch.setattr(shields.certificates, "_made", {})
+def calls(monkeypatch):
+    """Arguments of each synthesis."""
+    seen, made = [], certificate_of(*named("stable"))
+    monkeypatch.setattr("shields.synthesis.synthesize", lambda *given, **settings: seen.append(given) or made)
+    return seen
 
 
 @pytest.fixture
-def calls(monkeypatch, nothing_made):
-    """Arguments of each synthesis."""
-    seen = []
-    small = synthesize(
-        LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, gamma=1e-6), safe_set="ellipsoid"
-    )
-    monkeypatch.setattr("shields.synthesis.synthesize", lambda *given, **settings: seen.append(given) or small)
-    return seen
+def unasked(tmp_path, monkeypatch):
+    """A plant that this process has asked for no certificate of; a folder of certificates that the package reads."""
+    monkeypatch.setattr(shields.certificates, "__file__", str(tmp_path / "__init__.py"))
+    plant = small([[0.9, 0.1], [0.0, 0.8]], delta=0.05 * (1.0 + 1e-6 * next(UNASKED)))  # bounds are smaller then
+    certificate = certificate_of(*named("stable"), "polytope")
+    return plant, replace(certificate, fingerprint=plant.fingerprint), tmp_path / "own.json"
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -67,6 +71,15 @@ def test_synthesis_gives_what_comes_with_the_package(env_id):
     assert replace(alone, provenance={}) == replace(kept.without_polytope(), provenance={})
 
 
+def test_certificate_of_the_package_is_taken_and_nothing_synthesized(calls, unasked):
+    plant, certificate, file = unasked
+    certificate.save(file)
+    both, alone = (certificate_for(plant, None, safe_set) for safe_set in ("polytope", "ellipsoid"))
+    assert both == certificate
+    assert alone == certificate.without_polytope()
+    assert not calls
+
+
 def test_shield_of_a_registered_id_synthesizes_nothing(calls):
     one, other = (SafetyShield(gym.make("ncs_gym/CartPole-v0")) for _ in range(2))
     assert one.certificate is other.certificate
@@ -77,37 +90,28 @@ def test_other_plants_and_contracts_are_synthesized_once_and_that_is_said(calls,
     plant, contract = plant_and_contract("ncs_gym/CartPole-v0")
     assert certificate_for(plant, contract).contract == contract
     assert capfd.readouterr().err == ""
-    for changed in [(plant, ChannelContract(2)), (replace(plant, delta=0.04), contract), (plant, None)]:
+    unasked = replace(plant, delta=0.04 * (1.0 + 1e-6 * next(UNASKED)))
+    for changed in [(unasked, ChannelContract(2)), (unasked, contract), (unasked, None)]:
         assert certificate_for(*changed) is certificate_for(*changed)
         assert calls.pop() == changed[:1]
         assert not calls
         assert capfd.readouterr().err == "synthesizing a certificate, which takes seconds to minutes\n"
 
 
-def test_ellipsoid_alone_is_that_of_the_package(nothing_made):
-    plant, contract = plant_and_contract("ncs_gym/TruckTrailerCruise-v0")
-    alone, both = (certificate_for(plant, contract, safe_set) for safe_set in ("ellipsoid", "polytope"))
-    assert alone.polytope is None
-    assert both.polytope is not None
-    assert (alone.L == both.L).all()
-    assert verified(alone, plant).valid
-
-
-def test_damaged_file_of_the_package_is_refused(tmp_path, monkeypatch, nothing_made):
-    plant, contract = plant_and_contract("ncs_gym/TruckTrailerCruise-v0")
-    document = certificate_of_package(plant, contract).document
+def test_damaged_file_of_the_package_is_refused(unasked):
+    plant, certificate, file = unasked
+    document = certificate.document
     document["certificate"]["K"][0][0] += 1e-9
-    (tmp_path / "TruckTrailerCruise-v0.json").write_text(json.dumps(document))
-    monkeypatch.setattr(shields.certificates, "__file__", str(tmp_path / "__init__.py"))
+    file.write_text(json.dumps(document))
     with pytest.raises(CertificateError, match="was altered"):
-        certificate_for(plant, contract)
+        certificate_for(plant)
 
 
-def test_what_has_verified_is_not_verified_again_and_what_is_changed_is(monkeypatch):
-    plant, contract = plant_and_contract("ncs_gym/TruckTrailerCruise-v0")
-    certificate = certificate_of_package(plant, contract)
+def test_what_has_verified_is_not_verified_again_and_what_is_changed_is(monkeypatch, unasked):
+    plant, certificate, _ = unasked
+    plant = replace(plant, gamma=(1.0 - 1e-9) * plant.gamma)  # with which the certificate still verifies
+    certificate = replace(certificate, fingerprint=plant.fingerprint)
     judged, verify = [], verifier.verify
-    monkeypatch.setattr(verifier, "_valid", set())
     monkeypatch.setattr(verifier, "verify", lambda *given: judged.append(given) or verify(*given))
     for _ in range(3):
         require_valid(certificate, replace(plant))

@@ -137,21 +137,21 @@ REFUSED = [
     (lambda: with_proofs("stable", inputs=None), CertificateError, "both be given, or neither"),
     (lambda: with_proofs("stable", shares=[None, 0.1, 0.1]), CertificateError, r"multipliers of \(I\) must be numbers"),
     # Files whose checksum fits.
-    (lambda: read(L=[[float("nan"), 0.0], [0.0, 1.0]]), CertificateError, ""),
-    (lambda: read(K="no"), CertificateError, ""),
-    (lambda: read(Sigma=[[1.0]]), CertificateError, ""),
-    (lambda: read(multipliers={}), CertificateError, ""),
-    (lambda: read(multipliers=3), CertificateError, ""),
+    (lambda: read(L=[[float("nan"), 0.0], [0.0, 1.0]]), CertificateError, "certificate"),
+    (lambda: read(K="no"), CertificateError, "certificate"),
+    (lambda: read(Sigma=[[1.0]]), CertificateError, "certificate"),
+    (lambda: read(multipliers={}), CertificateError, "certificate"),
+    (lambda: read(multipliers=3), CertificateError, "certificate"),
     *(
-        (lambda entry=entry: read_multipliers(entry), CertificateError, "")
+        (lambda entry=entry: read_multipliers(entry), CertificateError, "certificate")
         for entry in (
             *([[0, "1"]], [[0.5, 1.0]], [[-1, 1.0]], [[10**6, 1.0]], [[0]], "x", None),
             *([[0, 10**400]], [[0, True]], [[0, 1.0], [0, 0.5]], [[0, 0.0]]),
         )
     ),
     # Too many rows are refused before they take memory.
-    (lambda: read(polytope={"rows": [[]] * 200_000, "multipliers": [[]] * 200_000}), CertificateError, ""),
-    (lambda: read(polytope={"rows": [[1.0]] * 500, "multipliers": [[]] * 501}), CertificateError, ""),
+    (lambda: read(polytope={"rows": [[]] * 200_000, "multipliers": [[]] * 200_000}), CertificateError, "certificate"),
+    (lambda: read(polytope={"rows": [[1.0]] * 500, "multipliers": [[]] * 501}), CertificateError, "certificate"),
     # Formulas of the paper.
     (lambda: uplink_error_bound(-1e-9, Q, P0, 0.05, 0.9), ValueError, "gamma"),
     (lambda: uplink_error_bound(5e-4, -Q, P0, 0.05, 0.9), ValueError, "process_noise_cov"),

@@ -107,7 +107,7 @@ def test_tolerated_factor_certifies():
     assert point.tolerance is not None
     assert point.tolerance > 1.0
     plant = with_radii(servo(), disturbance=point.tolerance, noise=point.tolerance)
-    assert synthesize(plant, contract=ChannelContract(0), safe_set="ellipsoid") is not None
+    assert synthesize(plant, contract=ChannelContract(0)) is not None
 
 
 def test_stable_plant_may_lose_everything_and_an_unstable_one_may_not():
