@@ -53,13 +53,26 @@ class _Manager:
 
 
 @contextlib.contextmanager
-def no_worker_processes() -> Iterator[None]:
-    """Commands execute their training runs and batches in this process."""
-    with (
-        mock.patch("experiments.backends.execution.ProcessPoolExecutor", _Executor),
-        mock.patch("experiments.backends.execution.SyncManager", _Manager),
-    ):
+def no_worker_processes(*, evaluates_on_the_way: bool = False) -> Iterator[None]:
+    """Commands execute their training runs and batches in this process.
+
+    Evaluations on the way take most of a short training and change no result (tests/agents/test_training.py): they are
+    left out unless they are asked for.
+    """
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch("experiments.backends.execution.ProcessPoolExecutor", _Executor))
+        stack.enter_context(mock.patch("experiments.backends.execution.SyncManager", _Manager))
+        if not evaluates_on_the_way:
+            from agents import training
+
+            stack.enter_context(mock.patch.object(training, "EvaluationCallback", _no_evaluation))
         yield
+
+
+def _no_evaluation(*settings: Any) -> Any:
+    from agents.callbacks import RegularCallback
+
+    return RegularCallback(lambda: None)
 
 
 def replace_cases(monkeypatch: Any, cases: dict[str, Any]) -> None:
