@@ -90,22 +90,6 @@ def test_wrappers_change_no_decision_on_either_side_of_the_shield(name, order, s
     assert_same_infos(shielded[2], wrapped[2])
 
 
-def test_normalized_observations_have_the_statistics_of_the_raw_ones(bare):
-    env = wrappers.NormalizeObservation(gym.make(CRUISE))
-    raw, normalized = bare[0], play(env, SOME, 1)[0]
-    deviation = np.sqrt(raw.var(axis=0) + env.epsilon)
-    np.testing.assert_allclose(normalized[-1], (raw[-1] - raw.mean(axis=0)) / deviation, rtol=1e-3, atol=1e-3)
-
-
-def test_stacked_and_delayed_observations_are_the_earlier_ones(bare):
-    raw = bare[0]
-    stacked = play(SCALAR["FrameStackObservation"](gym.make(CRUISE)), SOME, 1)[0]
-    delayed = play(SCALAR["DelayObservation"](gym.make(CRUISE)), SOME, 1)[0]
-    np.testing.assert_array_equal(stacked[2:], np.stack([raw[:-2], raw[1:-1], raw[2:]], axis=1))
-    np.testing.assert_array_equal(delayed[2:], raw[:-2])
-    np.testing.assert_array_equal(delayed[:2], 0.0)
-
-
 def test_recorded_return_pays_the_penalty_only_where_the_recorder_is_outside_the_shield(certificate):
     record = wrappers.RecordEpisodeStatistics
     _, rewards, outside = play(record(SafetyShield(gym.make(CRUISE), certificate, penalty=0.5)), STEPS, 1)
@@ -156,17 +140,6 @@ def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, orde
     if order != "bare":
         assert sum(info["shield_intervened"].sum() for info in wrapped[2]) > 0
         assert all(info["shield_guaranteed"].all() for info in wrapped[2])
-
-
-def test_vector_normalization_has_the_statistics_of_all_environments(certificate):
-    def make():
-        return VectorSafetyShield(gym.make_vec(CRUISE, num_envs=8), certificate)
-
-    env = vector.NormalizeObservation(make())
-    raw, normalized = play(make(), 100, 8, 1)[0], play(env, 100, 8, 1)[0]
-    every = raw.reshape(-1, raw.shape[-1])
-    expected = (raw[-1] - every.mean(axis=0)) / np.sqrt(every.var(axis=0) + env.epsilon)
-    np.testing.assert_allclose(normalized[-1], expected, rtol=1e-3, atol=1e-3)
 
 
 def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificate):

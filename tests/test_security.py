@@ -159,12 +159,17 @@ def test_settings_files_name_no_module():
     assert settings_json("compare", CompareSettings(env="evil:Evil-v0"))["settings"]["env"] == "Evil-v0"
 
 
+def forge(folder, **values):
+    """Changes the file of an agent; the checksum is right."""
+    document = json.loads((folder / "agent.json").read_text())
+    document["agent"] |= values
+    document["sha256"] = digest(document["agent"])
+    (folder / "agent.json").write_text(json.dumps(document))
+
+
 def test_agents_of_others_import_no_module(evil):
     untrained(LoopConfig(env="ncs_gym/TruckTrailer-v0"), seed=0).save(evil)
-    document = json.loads((evil / "agent.json").read_text())
-    document["agent"]["env"] = "evil:Evil-v0"
-    document["sha256"] = digest(document["agent"])
-    (evil / "agent.json").write_text(json.dumps(document))
+    forge(evil, env="evil:Evil-v0")
     with pytest.raises(AgentError, match="evil:Evil-v0, which is not registered"):
         Agent.load(evil)
 
@@ -237,10 +242,7 @@ def test_members_of_the_weights_of_others_are_not_unpacked(name, agent, tmp_path
             target.writestr(member, source.read(member))
         target.writestr(name.replace("/{root}", str(tmp_path)), source.read("policy.pth"))
     (agent / "model.zip").write_bytes(data.getvalue())
-    document = json.loads((agent / "agent.json").read_text())
-    document["agent"]["sha256_of_model"] = hashlib.sha256(data.getvalue()).hexdigest()
-    document["sha256"] = digest(document["agent"])
-    (agent / "agent.json").write_text(json.dumps(document))
+    forge(agent, sha256_of_model=hashlib.sha256(data.getvalue()).hexdigest())
     before = {path for path in tmp_path.rglob("*")}
     with suppress(AgentError):  # members that are no weights are not read at all
         Agent.load(agent)

@@ -46,10 +46,25 @@ def _here(workers: int, log_folder: Path | None = None) -> Iterator[_Here]:
 
 
 @contextlib.contextmanager
-def no_worker_processes() -> Iterator[None]:
-    """Commands execute their training runs and batches in this process."""
-    with mock.patch("experiments.backends.execution.local_workers", _here):
+def no_worker_processes(*, evaluates_on_the_way: bool = False) -> Iterator[None]:
+    """Commands execute their training runs and batches in this process.
+
+    Evaluations on the way take most of a short training and change no result (tests/agents/test_training.py): they are
+    left out unless they are asked for.
+    """
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mock.patch("experiments.backends.execution.local_workers", _here))
+        if not evaluates_on_the_way:
+            from agents import training
+
+            stack.enter_context(mock.patch.object(training, "EvaluationCallback", _no_evaluation))
         yield
+
+
+def _no_evaluation(*settings: Any) -> Any:
+    from agents.callbacks import RegularCallback
+
+    return RegularCallback(lambda: None)
 
 
 def replace_cases(monkeypatch: Any, cases: dict[str, Any]) -> None:

@@ -120,7 +120,7 @@ def execute(
 def _progress_bar(runs: Sequence[Run]) -> tqdm:
     return tqdm(
         total=sum(run.total_steps for run in runs),
-        desc=" and ".join(dict.fromkeys(part for run in runs for part in run.parts)),
+        desc=" and ".join(sorted({part for run in runs for part in run.parts}, reverse=True)),
         unit="step",
         unit_scale=True,
         mininterval=_TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD,

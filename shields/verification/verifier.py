@@ -89,7 +89,7 @@ def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
 
 
 # Digests of the certificates and plants, as they were then, that have been verified in this process.
-_valid: set[tuple[str, str]] = set()
+_valid: set[tuple[str, str, bytes]] = set()
 
 
 @own_error_state
@@ -101,7 +101,8 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
     Raises:
         CertificateError: Naming the first condition that does not hold.
     """
-    key = certificate.document["sha256"], plant.digest()
+    rows = b"".join(each.tobytes() for each in plant.grid_rows or ())  # computed, and verified with the rest
+    key = certificate.document["sha256"], plant.digest(), rows
     if key not in _valid:
         _require_conditions(certificate, plant)
         _valid.add(key)

@@ -21,19 +21,20 @@ CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 OBSERVATIONS = np.random.default_rng(0).standard_normal((50, 3))
 SETTINGS = {
     "PPO": dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=2, policy_kwargs=dict(net_arch=[16, 16])),
-    "TD3": dict(
-        n_envs=4,
-        gradient_steps=1,
-        batch_size=32,
-        buffer_size=1000,
-        learning_starts=64,
-        policy_kwargs=dict(net_arch=[16, 16]),
-    ),
+    "TD3": dict(n_envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
+    | dict(policy_kwargs=dict(net_arch=[16, 16])),
 }
 
 
 def trained(algorithm="PPO", channel=None):
     return train(LoopConfig(env=CRUISE, kwargs={"channel": channel}), 512, 1, algorithm, SETTINGS[algorithm]).agent
+
+
+def change(folder, **values):
+    document = json.loads((folder / "agent.json").read_text())
+    document["agent"] |= values
+    document["sha256"] = digest(document["agent"])
+    (folder / "agent.json").write_text(json.dumps(document))
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +131,7 @@ def test_saved_agent_keeps_the_shield_it_was_trained_behind(certificate, tmp_pat
     again = Agent.load(tmp_path)
     assert (again.shield_mode, again.horizon) == ("lookahead", 3)
     for wrong in ({"mode": "hope", "horizon": None}, {"mode": "lookahead", "horizon": 0}, {"mode": "lookahead"}):
-        document = json.loads((tmp_path / "agent.json").read_text())
-        document["agent"]["shield"] = wrong
-        document["sha256"] = digest(document["agent"])
-        (tmp_path / "agent.json").write_text(json.dumps(document))
+        change(tmp_path, shield=wrong)
         with pytest.raises(AgentError, match="is damaged"):
             Agent.load(tmp_path)
 
@@ -188,22 +186,11 @@ def test_weights_with_code_in_them_are_refused(folder):
             content = (folder / "policy.pth").read_bytes() if name == "policy.pth" else source.read(name)
             target.writestr(name, content)
     (folder / "new.zip").replace(folder / "model.zip")
-    document = json.loads((folder / "agent.json").read_text())
-    document["agent"]["sha256_of_model"] = hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest()
-    document["sha256"] = digest(document["agent"])
-    (folder / "agent.json").write_text(json.dumps(document))
+    change(folder, sha256_of_model=hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest())
     with pytest.raises(AgentError, match="damaged"):
         Agent.load(folder)
 
 
-def change(folder, **values):
-    document = json.loads((folder / "agent.json").read_text())
-    document["agent"] |= values
-    document["sha256"] = digest(document["agent"])
-    (folder / "agent.json").write_text(json.dumps(document))
-
-
-NEGATIVE = {"mean": [0.0] * 3, "variance": [-1.0] * 3, "epsilon": 1e-8, "clip": 10.0}
 SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
 
 

@@ -9,13 +9,6 @@ import agents
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_every_exported_name_exists():
-    namespace = {}
-    exec("from agents import *", namespace)
-    assert set(agents.__all__) <= namespace.keys()
-    assert all(namespace[name].__name__ == name for name in agents.__all__)
-
-
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'agents' has no attribute 'nothing'"):
         _ = agents.nothing

@@ -195,7 +195,7 @@ def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificat
 
 def test_predictive_filter_keeps_the_box_between_samples_where_it_counts_there(loaded):
     part, rng = loaded.resampled(loaded.dt / 20), np.random.default_rng(1)
-    proposals = loaded.u_max * np.sign(np.repeat(rng.standard_normal(60), 10))[:, None]
+    proposals = loaded.u_max * np.sign(np.repeat(rng.standard_normal(30), 10))[:, None]
 
     def largest(plant, **settings):
         """Largest |c_j x|, looked at 20 times per step, where the model is the truth."""

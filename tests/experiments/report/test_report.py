@@ -170,17 +170,10 @@ def test_every_arm_is_in_every_table_and_explained():
     assert "every intervention costs 0.25 of reward" in "".join(reader.text)
 
 
-def test_without_a_violation_the_table_says_what_the_probability_is_at_most():
-    cells = safety(comparison("shielded", runs=3))["shielded"]
-    assert "0 of 60 %, at most 45.93 %" in cells[2]  # 1 - 0.025^(1/6)
-
-
-def test_violating_episodes_have_their_exact_interval():
-    change = {"violations": (3, 0)}
-    assert "3 of 650.0 % [11.8, 88.2]" in safety(comparison("unshielded", change=change))["unshielded"][2]
-
-
-def test_violations_of_state_and_estimate_stand_apart():
+def test_violations_have_their_exact_interval_and_those_of_state_and_estimate_stand_apart():
+    assert "0 of 60 %, at most 45.93 %" in safety(comparison("shielded", runs=3))["shielded"][2]  # 1 - 0.025^(1/6)
+    page = comparison("unshielded", change={"violations": (3, 0)})
+    assert "3 of 650.0 % [11.8, 88.2]" in safety(page)["unshielded"][2]
     summary = summary_of({"shielded": [run("shielded")]})
     summary["arms"]["shielded"] |= {"eval_violation_steps": 1234, "eval_estimate_violation_steps": 5678}
     assert safety(comparison_report(summary, VERIFIED, {}, []))["shielded"][3:5] == ["1,234", "5,678"]
@@ -215,9 +208,6 @@ def test_one_run_has_no_interval_and_the_page_says_so():
     assert "1 runs" not in page
     assert "how training varies is unknown" in page
     assert "bootstrap over" not in page
-
-
-def test_a_single_arm_has_no_differences():
     assert "Paired differences" not in comparison("shielded")
 
 

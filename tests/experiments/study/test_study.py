@@ -6,6 +6,7 @@ import pytest
 
 from experiments.settings import StudySettings
 from experiments.study.study import study
+from tests.command import without_pictures
 from tests.workers import no_worker_processes
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -25,13 +26,13 @@ def finished(tmp_path_factory):
         seeds=2,
         budget=0.01,
         episodes=2,
-        channel_episodes=2,
+        channel_episodes=1,
         jobs=1,
         arms=("unshielded", "lookahead"),
         baselines=("lqr", "lqr+trusting", "lqr+shielded"),
         scenarios=("ideal-channel", "attacked"),
     )
-    with no_worker_processes(), mock.patch.multiple("experiments.study.channel_switches", **FEW):
+    with no_worker_processes(), without_pictures(), mock.patch.multiple("experiments.study.channel_switches", **FEW):
         study(settings)
         yield settings
 
@@ -78,9 +79,7 @@ def test_all_tables_stand_beside_the_page_that_links_to_them(finished):
 def test_finished_runs_are_kept_and_give_the_same_summary(finished, capsys):
     before = (finished.out / "summary.json").read_bytes()
     study(finished)
-    messages = capsys.readouterr().err
-    assert "10 of 10 runs were finished before" in messages
-    assert "10 of 10 runs were finished before" in messages
+    assert "10 of 10 runs were finished before" in capsys.readouterr().err
     assert (finished.out / "summary.json").read_bytes() == before
 
 
