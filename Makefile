@@ -19,8 +19,8 @@ RAY_INSTALLED := $(VENV)/.installed-ray
 ADDRESS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs words audit \
-	dist address clean
+.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
+	example-times docs words audit dist address clean
 
 help: ## this list
 	@echo 'make TARGET; everything is installed into $(VENV) when it is first needed.'
@@ -58,6 +58,13 @@ coverage-report: ## that share, of the tests that ran last
 test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks, and examples in processes of their own
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
+# What CI has time for: the long attacks and the proofs of one kind each.
+test-slow-part: $(INSTALLED) ## a fixed part of the long tests
+	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)
+
+mutants: $(INSTALLED) ## sixty small faults, and the test that notices each
+	$(BIN)/python benchmarks/mutants.py
+
 lint: $(INSTALLED) ## style and declared dependencies
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -68,6 +75,8 @@ types: $(INSTALLED) ## types
 
 benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environments ...
 	$(BIN)/python benchmarks/import_time.py
+	$(BIN)/python benchmarks/first_shield.py
+	$(BIN)/python benchmarks/networked.py
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/shield_cost.py
 	$(BIN)/python benchmarks/containment.py
@@ -87,6 +96,7 @@ example-times: $(INSTALLED) ## how long each example takes, and what it says (EX
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED) ## the site, in site/
 	$(BIN)/python docs/hooks/build_site.py
+	$(BIN)/python -m pytest -n auto --dist worksteal -m site
 
 words: ## words of README and of every page
 	@wc -w README.md docs/*.md

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import io
 import platform
-import zipfile
+import warnings
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,7 +17,6 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent_file import (
     AGENT_FILES,
@@ -27,48 +26,16 @@ from agents.agent_file import (
     read_files,
     shield_from_json,
 )
-from agents.algorithms import algorithm_class, build_model
-from agents.hyperparams import ALGORITHMS, complete_hyperparams
+from agents.algorithms import algorithm_class, build_model, policy_arguments
+from agents.hyperparams import ALGORITHMS, ON_POLICY, complete_hyperparams, require_moderate_networks
 from agents.loop import LoopConfig, ShieldSettings, with_gain
+from agents.normalization import Normalization, read_statistics, statistics_beside
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
+from agents.sb3_zip import read_model, require_moderate_zip, require_same_spaces
 from ncs_gym import Channel, LinearPlant
-from ncs_gym.reading import LARGEST_MODEL, MOST_MEMBERS, json_values, read_file
+from ncs_gym.envs.json_settings import to_json
 from shields.atomic_write import write_atomically
-
-
-@dataclass(frozen=True, eq=False)
-class Normalization:
-    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip).
-
-    Attributes:
-        mean: Mean of the observations in training, shape (entries,).
-        variance: Their variance, shape (entries,).
-        epsilon: Keeps the root away from 0.
-        clip: Largest absolute value of a normalized entry.
-    """
-
-    mean: np.ndarray
-    variance: np.ndarray
-    epsilon: float
-    clip: float
-
-    @classmethod
-    def of(cls, env: VecNormalize) -> Normalization:
-        """Returns the present statistics of a `VecNormalize`.
-
-        Raises:
-            TypeError: If its observations are dictionaries.
-        """
-        statistics = env.obs_rms
-        if isinstance(statistics, dict):
-            raise TypeError("observations must be one array, got a dictionary of them")
-        return cls(statistics.mean.copy(), statistics.var.copy(), float(env.epsilon), float(env.clip_obs))
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Returns normalized observations (N, entries), float32."""
-        scaled = (observations - self.mean) / np.sqrt(self.variance + self.epsilon)
-        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -155,7 +122,7 @@ class Agent:
             "algorithm": self.algorithm,
             "hyperparams": self.hyperparams,
             "env": self.env,
-            "channel": None if self.channel is None else asdict(self.channel),
+            "channel": to_json(self.channel),
             "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
             "plant": None if (plant := _plant_of(self.env)) is None else plant.fingerprint,
             "normalization": {
@@ -281,81 +248,94 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     )
 
 
-def require_moderate_zip(content: bytes) -> None:
-    """Returns if a zip, and those that it holds, unpack to no more than files of agents may.
-
-    Raises:
-        ValueError: If they would.
-        zipfile.BadZipFile: If it is no zip, or one that it holds is none.
-    """
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.infolist()
-        if len(members) > MOST_MEMBERS or sum(each.file_size for each in members) > LARGEST_MODEL:
-            raise ValueError(f"it unpacks to more than {MOST_MEMBERS} files or {LARGEST_MODEL:,} bytes")
-        for name in (each.filename for each in members if each.filename.endswith((".pth", ".pt"))):
-            require_moderate_zip(archive.read(name))
-
-
-# What only one algorithm's file has among its settings; the first that fits.
-_MARKS = {"TQC": "top_quantiles_to_drop_per_net", "SAC": "target_entropy", "TD3": "target_policy_noise"}
-_MARKS |= {"PPO": "clip_range", "TRPO": "cg_max_steps", "A2C": "gae_lambda"}
-
-
 def is_sb3_zip(path: Path) -> bool:
     """Returns whether a path is a zip of stable-baselines3, and not a file of an `Agent`."""
     return path.suffix == ".zip" and not (path.name in AGENT_FILES and path.with_name("agent.json").exists())
 
 
-def load_sb3_zip(path: Path, env_id: str) -> Agent:
-    """Returns an agent that was saved by `model.save`, of an environment whose observations it saw as they are.
+# In the place of a file of statistics: the agent saw observations as they are.
+NO_STATISTICS = "none"
+
+
+def load_sb3_zip(path: Path, env_id: str, vec_normalize: str | Path | None = None) -> Agent:
+    """Returns an agent that was saved by `model.save`.
 
     Args:
         path: The zip.
         env_id: Id of the environment.
+        vec_normalize: File that `VecNormalize.save` wrote, of which numbers alone are read; "none" says that the agent
+            saw observations as they are; None, that the zip says so, and no such file lies beside it.
 
     Raises:
-        AgentError: If it cannot be read, is of an unknown algorithm, has settings that only unpickling would tell, or
-            does not fit the environment.
+        AgentError: If it cannot be read, is of an unknown algorithm, has settings that only unpickling would tell, does
+            not fit the environment, or needs what is not given here; the message names it.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
+    saved = read_model(path)
     try:
-        weights = read_file(path, LARGEST_MODEL)
-        require_moderate_zip(weights)
-        with zipfile.ZipFile(io.BytesIO(weights)) as archive:
-            data = json_values(archive.read("data"))
-        _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
-        algorithm = next((name for name, mark in _MARKS.items() if mark in data), None)
-        policy = data.get("policy_kwargs", {})
+        require_moderate_networks(saved.policy_kwargs)
+    except ValueError as error:
+        raise AgentError(f"the agent in {path} is too large: {error}") from error
+    cls = algorithm_class(saved.algorithm)
+    sde = {"use_sde": True} if saved.use_sde else {}
+    rest: dict[str, Any] = sde if saved.algorithm in ON_POLICY else sde | {"buffer_size": 1}
+    try:
+        env = SB3VecEnv(LoopConfig(env=env_id).vector(2))
+        doubt = require_same_spaces(saved, env.observation_space, env.action_space)
+        _, parameters, _ = load_from_zip_file(io.BytesIO(saved.file), load_data=False, device="cpu")
+        model = cls("MlpPolicy", env, policy_kwargs=policy_arguments(saved.policy_kwargs), device="cpu", **rest)
+        weights: Any = parameters["policy"]
+        model.policy.load_state_dict(weights)
     except Exception as error:  # a forged file may break any part of the libraries that read it
-        raise AgentError(
-            f"{path} is no agent that stable-baselines3 saved: {str(error) or type(error).__name__}"
-        ) from error
-    if algorithm is None:
-        raise AgentError(f"{path} is of none of the algorithms {', '.join(_MARKS)}")
-    if ":serialized:" in policy:
-        raise AgentError(
-            f"the policy_kwargs in {path} are pickled, and pickles are not read: load it yourself, and evaluate it "
-            "with agents.evaluate"
-        )
-    cls = algorithm_class(algorithm)
-    replay: dict[str, Any] = {"buffer_size": 1} if algorithm in ("TQC", "SAC", "TD3") else {}
-    try:
-        model = cls(
-            "MlpPolicy", SB3VecEnv(LoopConfig(env=env_id).vector(2)), policy_kwargs=policy, device="cpu", **replay
-        )
-        model.set_parameters(parameters, exact_match=True, device="cpu")
-    except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise AgentError(f"the agent in {path} does not fit {env_id}: {reason}") from error
-    size = int(np.prod(model.observation_space.shape or ()))
+    if doubt:
+        warnings.warn(f"the agent in {path} {doubt}", stacklevel=2)
+    entries = int(np.prod(env.observation_space.shape or ()))
+    normalization = _normalization_for(path, saved.is_normalized, vec_normalize) or Normalization.none(entries)
+    if normalization.mean.size != entries:
+        raise AgentError(f"{vec_normalize} has statistics of {normalization.mean.size} entries, {env_id} has {entries}")
+    net_arch: Any = model.policy.net_arch
     return Agent(
-        algorithm=algorithm,
-        hyperparams={"policy_kwargs": policy},
+        algorithm=saved.algorithm,
+        hyperparams={"policy_kwargs": {"net_arch": net_arch} | saved.policy_kwargs} | sde,
         env=env_id,
         channel=None,
         model=model,
-        normalization=Normalization(np.zeros(size), np.ones(size), 0.0, float("inf")),
+        normalization=normalization,
     )
+
+
+def _normalization_for(
+    path: Path, is_normalized: bool | None, vec_normalize: str | Path | None
+) -> Normalization | None:
+    """Returns how an agent's observations are normalized; None if they are not.
+
+    Raises:
+        AgentError: If there have to be some and none are given, they cannot be read, or there can be none.
+    """
+    if vec_normalize is not None and str(vec_normalize) == NO_STATISTICS:
+        return None
+    if vec_normalize is not None:
+        if is_normalized is False:
+            raise AgentError(f"the agent in {path} saw observations as they are: leave out --vec-normalize")
+        return read_statistics(Path(vec_normalize))
+    if is_normalized is False:
+        return None
+    beside = statistics_beside(path)
+    if is_normalized or beside is not None:
+        known = f"statistics of VecNormalize lie beside {path}"
+        if is_normalized:
+            known = f"the agent in {path} saw observations that VecNormalize normalized"
+        raise AgentError(
+            f"{known}: give --vec-normalize {beside or 'FILE'}, or --vec-normalize none if it saw them as they are"
+        )
+    warnings.warn(
+        f"{path} does not say whether VecNormalize normalized observations: they are taken as they are, give "
+        "--vec-normalize FILE otherwise",
+        stacklevel=3,
+    )
+    return None
 
 
 _PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")

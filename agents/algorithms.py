@@ -17,6 +17,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
 from ncs_gym.installation import install_command
@@ -91,13 +92,15 @@ def _arguments(
     name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
 ) -> dict[str, Any]:
     """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown or of a wrong type."""
-    own = {"policy": "MlpPolicy"} | {
+    own: dict[str, Any] = {"policy": "MlpPolicy"} | {
         key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
     }
     for key, value in own.items():
         if isinstance(value, str) and value.startswith(_LINEAR):
             own[key] = _falling(float(value.removeprefix(_LINEAR)), name, env, hyperparams, steps)
     _require_fitting(cls, own)
+    if isinstance(given := own.get("policy_kwargs"), dict):
+        own["policy_kwargs"] = policy_arguments(given)
     if name in ON_POLICY and "batch_size" in own:
         own["batch_size"] = min(own["batch_size"], hyperparams["n_steps"] * env.num_envs)
     if (stored := hyperparams.get("stored_action", "proposed")) not in ("proposed", "applied"):
@@ -113,6 +116,21 @@ def _arguments(
         size = flatdim(env.action_space)
         own["action_noise"] = NormalActionNoise(np.zeros(size), deviation * np.ones(size))
     return own
+
+
+def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the hyperparameter `policy_kwargs` as policies take it: with the class of its activation function.
+
+    Raises:
+        ValueError: If torch has no activation function of that name.
+    """
+    found, name = dict(given), given.get("activation_fn")
+    if isinstance(name, str):
+        name = name.removeprefix("nn.")
+        if name not in activation.__all__:
+            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)}")
+        found["activation_fn"] = getattr(activation, name)
+    return found
 
 
 def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:

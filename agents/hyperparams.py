@@ -9,6 +9,7 @@ the constructor:
 - `n_timesteps`: training steps, where the caller asks for no number of them;
 - `normalize`: true, or arguments of `VecNormalize` such as `{"norm_reward": false}`;
 - `noise_std`, and `noise_type`, which is "normal": exploration noise of off-policy algorithms, in units of the limits;
+- `policy_kwargs`: may have `activation_fn`, an activation function of `torch.nn` by its name, such as "nn.ReLU";
 - `stored_action`: of off-policy algorithms, "applied" to learn from the actions that the shield applied, "proposed"
   (the default) from the agent's own.
 
@@ -19,13 +20,15 @@ from __future__ import annotations
 
 import ast
 import json
+import re
+import warnings
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text
+from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text, require_moderate
 from ncs_gym.validation import shown
 
 # The package of each algorithm, which has a class of the same name.
@@ -39,6 +42,11 @@ ALGORITHMS = {
     "CrossQ": "sb3_contrib",
 }
 # Numbers that are counted from 1: of a wrong one the library complains only while it trains, or never.
+# Keys of rl-zoo3's files that are no hyperparameters of an algorithm: what is put around environments, and callbacks.
+RL_ZOO_KEYS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "env_kwargs", "monitor_kwargs", "callback")
+# Names of torch.nn as rl-zoo3's files write them, and what is no part of a literal.
+_OF_TORCH = re.compile(r"(?:(?:torch|th)\.)?nn\.([A-Za-z]\w*)")
+_NO_LITERALS = (ast.Call, ast.Name, ast.Attribute, ast.Lambda, ast.comprehension, ast.Starred)
 # The largest: of ten million transitions a buffer takes gigabytes.
 MOST_TRANSITIONS = 10_000_000
 _COUNTS = {"n_envs": 100_000, "n_steps": MOST_TRANSITIONS, "n_epochs": 100_000, "buffer_size": MOST_TRANSITIONS}
@@ -174,14 +182,16 @@ def _tuned() -> dict[str, dict[str, Any]]:
 def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
     """Returns the hyperparameters of an environment in a file like those of rl-zoo3.
 
+    What rl-zoo3 does itself with a key (`RL_ZOO_KEYS`) is not done here: a warning names such keys.
+
     Args:
         file: YAML (.yml, .yaml) or JSON: hyperparameters by environment id, or under "default" for all others. Texts
-            such as `dict(net_arch=[64, 64])` are read as Python's literals. At most 256 KiB, and 100,000 values once
-            all aliases are written out.
+            such as `dict(net_arch=[64, 64], activation_fn=nn.ReLU)` are read as Python's literals. At most 256 KiB, and
+            100,000 values once all aliases are written out.
         env_id: Id by which the environment is registered.
 
     Raises:
-        ValueError: If the file has no entry for the environment, or is damaged.
+        ValueError: If the file has no entry for the environment, is damaged, or has an expression that is no literal.
         OSError: If it cannot be read.
     """
     path = Path(file)
@@ -194,47 +204,84 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
     entry = entries.get(env_id, entries.get("default"))
     if not isinstance(entry, dict):
         raise ValueError(f"{path} has no hyperparameters for {env_id}, nor for default")
-    return {name: literal(value) if isinstance(value, str) else value for name, value in entry.items()}
+    left_out = sorted(name for name in RL_ZOO_KEYS if entry.get(name) is not None)
+    if left_out:
+        warnings.warn(f"{', '.join(left_out)} in {path}: only rl-zoo3 reads that, it is left out here", stacklevel=2)
+    try:
+        return {name: value_of(name, value) for name, value in entry.items() if name not in RL_ZOO_KEYS}
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _yaml(text: str) -> Any:
     import yaml  # of the extra "train", as everything that is trained needs
 
     try:
-        _require_moderate(yaml.compose(text, Loader=yaml.SafeLoader))
+        require_moderate(yaml.compose(text, Loader=yaml.SafeLoader), _parts_of_node, MOST_HYPERPARAMS)
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
 
 
-def _require_moderate(root: Any) -> None:
-    """Raises ValueError if a YAML document has too many values once all of its aliases are written out."""
-    sizes: dict[int, int] = {}
+def _parts_of_node(node: Any) -> list[Any]:
+    """Returns the nodes in a node of YAML: of a list its entries, of a dictionary keys and values."""
+    parts = node.value if node is not None and isinstance(node.value, list) else []
+    return [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
 
-    def size_of(node: Any) -> int:
-        if id(node) not in sizes:
-            sizes[id(node)] = MOST_HYPERPARAMS + 1  # of one that holds itself
-            parts = node.value if isinstance(node.value, list) else ()
-            flat = (each for part in parts for each in (part if isinstance(part, tuple) else (part,)))
-            sizes[id(node)] = 1 + sum(map(size_of, flat))
-        return sizes[id(node)]
 
-    if root is not None and size_of(root) > MOST_HYPERPARAMS:
-        raise ValueError(f"with its aliases written out it has more than {MOST_HYPERPARAMS:,} values")
+def value_of(name: str, value: Any) -> Any:
+    """Returns what a hyperparameter that is given as a text stands for, and any other value as it is.
+
+    Raises:
+        ValueError: If it is an expression that `literal` cannot read; the message names the part that it cannot.
+    """
+    if not isinstance(value, str):
+        return value
+    found = literal(value)
+    if found is value and (culprit := _unreadable(value)) is not None:
+        raise ValueError(
+            f"cannot read {shown(culprit)} in {name}: numbers, texts, lists, dictionaries and activation functions "
+            "(nn.ReLU) are read, nothing is evaluated"
+        )
+    return found
 
 
 def literal(text: str) -> Any:
     """Returns what a text stands for in Python: a number, a list, a dictionary (also `dict(a=1)`), True, False or None.
 
+    Inside, `nn.ReLU` and its like stand for themselves, as texts, from which `agents.algorithms` takes the class.
+
     Returns:
         JSON values; the text itself if it stands for nothing that JSON can keep.
     """
     try:
-        node = ast.parse(text.strip(), mode="eval").body
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "dict" and not node.args:
-            value: Any = {str(each.arg): ast.literal_eval(each.value) for each in node.keywords}
-        else:
-            value = ast.literal_eval(node)
+        value = ast.literal_eval(_Plain().visit(ast.parse(text.strip(), mode="eval")).body)
         return json.loads(json.dumps(value, allow_nan=False))
     except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
         return text
+
+
+class _Plain(ast.NodeTransformer):
+    """Writes `dict(a=1)` as `{"a": 1}`, and the names of `torch.nn` as texts."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        names = [each.arg for each in node.keywords]
+        if ast.unparse(node.func) != "dict" or node.args or None in names or len(set(names)) < len(names):
+            return node
+        values = [self.visit(each.value) for each in node.keywords]
+        return ast.Dict(keys=[ast.Constant(name) for name in names], values=values)
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
+        found = _OF_TORCH.fullmatch(ast.unparse(node))
+        return node if found is None else ast.Constant(f"nn.{found[1]}")
+
+
+def _unreadable(text: str) -> str | None:
+    """Returns the first part of an expression that is no literal; None for a word such as "auto" or "lin_0.003"."""
+    try:
+        tree = _Plain().visit(ast.parse(text.strip(), mode="eval")).body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return text if "(" in text or text.lstrip().startswith(("{", "[")) else None
+    if not isinstance(tree, ast.Call | ast.Dict | ast.List | ast.Tuple | ast.Set):
+        return None
+    return next((ast.unparse(each) for each in ast.walk(tree) if isinstance(each, _NO_LITERALS)), text)

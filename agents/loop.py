@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ncs_gym import Channel
-from ncs_gym.registration import from_json
+from ncs_gym.envs.json_settings import from_json
 from ncs_gym.validation import shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee

@@ -1,4 +1,4 @@
-"""Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
+"""Imperfect networks around any Gymnasium environment, and plants behind them; importing registers the ids."""
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
@@ -15,6 +15,7 @@ from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.gaussian_bound import bound_violation_probability as escape_probability  # noqa: F401  its former name
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
+from ncs_gym.networked import Networked, VectorNetworked
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.convoy import convoy
@@ -69,6 +70,7 @@ __all__ = [
     "LinearProcess",
     "NCSEnv",
     "NCSVectorEnv",
+    "Networked",
     "NoNoiseWarning",
     "Packet",
     "PacketLog",
@@ -85,6 +87,7 @@ __all__ = [
     "TraceChannel",
     "UnstablePlantError",
     "UnusedPacketsWarning",
+    "VectorNetworked",
     "VectorRandomChannel",
     "VectorRequestActions",
     "batch_reactor",

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.json_settings import JSON_SETTINGS, from_json, read_plant, to_json
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
@@ -39,22 +39,10 @@ from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
 from ncs_gym.uncertainty.disturbances import BallDisturbance, BoxDisturbance, Disturbance, SinusoidDisturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, shown
+from ncs_gym.validation import as_count
 
 # Steps per episode of every registered environment (Liu et al. Section 5).
 EPISODE_STEPS = 200
-# What a dictionary of fields stands for in the settings that may be JSON values, as `EnvSpec.to_json` makes them of the
-# objects; several classes are told apart by the names of their fields.
-_JSON_SETTINGS: dict[str, tuple[type, ...]] = {
-    "channel": (Channel,),
-    "task": (Regulation, SpeedTracking, SetpointTracking),
-    "disturbance": (BoxDisturbance, SinusoidDisturbance),
-    "initial_set": (Ellipsoid,),
-    "contract": (ChannelContract,),
-    "process": (CartPoleProcess, PendulumProcess, InvertedPendulumProcess),
-    "downlink": (Channel,),
-    "downlink_contract": (ChannelContract,),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,14 +86,14 @@ class Factory:
     def settings(
         self,
         *,
-        plant: LinearPlant | str | os.PathLike[str] | None = None,
+        plant: LinearPlant | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         between_samples: int | None = None,
         **given: Any,
     ) -> dict[str, Any]:
         """Returns the arguments of `NCSEnv`.
 
-        Settings may be JSON values, so that an `EnvSpec` may: dictionaries of fields (`Channel(**channel)`), a
-        disturbance by its name, a plant by the path of a file that `LinearPlant.save` wrote.
+        Settings may be JSON values, as those of an `EnvSpec` are: dictionaries of fields (`Channel(**channel)`), a
+        disturbance by its name, a plant by its `document` or the path of its file.
 
         Args:
             plant: The plant; None for the default one.
@@ -116,8 +104,7 @@ class Factory:
         Raises:
             ValueError: If there is no default plant and none is given, or a JSON value is wrong.
         """
-        if isinstance(plant, (str, os.PathLike)):
-            plant = LinearPlant.load(Path(plant))
+        read: Any = read_plant(plant)
         own: dict[str, Any] = {
             "channel": self.channel,
             "task": self.task,
@@ -126,17 +113,17 @@ class Factory:
             "process": self.process,
             "horizon": EPISODE_STEPS,
         }
-        kinds = _JSON_SETTINGS if self.process is None else _JSON_SETTINGS | {"process": (type(self.process),)}
-        if plant is None:
+        kinds = JSON_SETTINGS if self.process is None else JSON_SETTINGS | {"process": (type(self.process),)}
+        if read is None:
             if self.plant is None:
                 raise ValueError(
                     "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
                 )
-            plant, own["contract"] = self.plant(), self.contract or contract_of(self.channel)
+            read, own["contract"] = self.plant(), self.contract or contract_of(self.channel)
         if between_samples is not None:
-            plant = replace(plant, between_samples=between_samples)
-        own |= {"plant": plant, "disturbance": self._disturbance(plant)}
-        if self.start is not None and getattr(plant, "n", 0) == 2:
+            read = replace(read, between_samples=between_samples)
+        own |= {"plant": read, "disturbance": self._disturbance(read)}
+        if self.start is not None and getattr(read, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
         if misplaced := sorted(given.keys() & Channel.__dataclass_fields__.keys()):
             name = misplaced[0]
@@ -170,32 +157,6 @@ class Factory:
         if not isinstance(plant, LinearPlant) or own.check(plant) or own.excess(plant):
             return "ball"
         return own
-
-
-def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
-    """Returns the object whose fields a dictionary holds; a value that is no dictionary as it is.
-
-    Args:
-        value: The value of a setting.
-        kinds: Dataclasses that a dictionary may hold the fields of.
-        name: Name of the setting.
-
-    Raises:
-        ValueError: If the dictionary holds the fields of none of them, or of several, or a wrong value.
-    """
-    if not isinstance(value, dict):
-        return value
-    if Ellipsoid in kinds and set(value) == {"shape"}:  # the former name of its field
-        return Ellipsoid(value["shape"])
-    names = {kind: {entry.name for entry in fields(kind)} for kind in kinds}
-    fitting = [kind for kind in kinds if set(value) <= names[kind]]
-    try:
-        if len(fitting) == 1:
-            return fitting[0](**value)
-    except TypeError:  # a field without a default is missing
-        pass
-    known = " or ".join(f"a {kind.__name__} ({', '.join(sorted(names[kind]))})" for kind in kinds)
-    raise ValueError(f"{name} must be the settings of {known}, got {shown(value)}")
 
 
 # The four impairments of Liu et al. Section 5, all at once.
@@ -360,7 +321,7 @@ def needing_extras() -> list[str]:
 
 def register_plant(
     env_id: str,
-    plant: LinearPlant | str | os.PathLike[str],
+    plant: LinearPlant | Mapping[str, Any] | str | os.PathLike[str],
     *,
     channel: Channel | dict[str, Any] | None = None,
     task: Task | dict[str, Any] | None = None,
@@ -395,7 +356,8 @@ def register_plant(
 
     Args:
         env_id: Id, such as "Plants/Tanks-v0".
-        plant: The plant, or the path of a file that `LinearPlant.save` wrote: with a path the spec is JSON.
+        plant: The plant, its `document`, or the path of a file that `LinearPlant.save` wrote. The spec holds the
+            document of a plant, so that it is JSON.
         channel: The network; a perfect one by default.
         task: The reward; `Regulation` by default.
         contract: What the channel promises; by default that of the channel if the plant is unstable, else none.
@@ -414,6 +376,7 @@ def register_plant(
     steps = as_count(max_episode_steps, "max_episode_steps", low=1)
     given = {"channel": channel, "task": task, "contract": contract} | settings
     given = {name: value for name, value in given.items() if value is not None}
-    given |= {"plant": plant if isinstance(plant, LinearPlant) else os.path.abspath(plant), "horizon": steps}
+    is_path = isinstance(plant, (str, os.PathLike))
+    given |= {"plant": os.path.abspath(plant) if is_path else plant, "horizon": steps}
     ENVIRONMENTS[_LINEAR_NCS](**given)  # wrong settings are noticed here rather than when the first environment is made
-    gym.register(id=env_id, max_episode_steps=steps, kwargs=given, **_entry_points(_LINEAR_NCS))
+    gym.register(id=env_id, max_episode_steps=steps, kwargs=to_json(given), **_entry_points(_LINEAR_NCS))

@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, read_only, shown
+from ncs_gym.plants.between_samples import MOST_POINTS
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, own_error_state, read_only, shown
 from shields.errors import CertificateError
 
 # A polytope has at most so many rows, so that a decision and a verification stay fast; each stands for two faces.
 MOST_ROWS = 400
+# Multipliers belong to its rows, to as many inputs at most, and to the rows of a box at every time of a step.
+MOST_MULTIPLIERS = (MOST_POINTS + 2) * MOST_ROWS
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,10 +36,11 @@ class Polytope(ReadOnlyArrays):
     multipliers: np.ndarray
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if the shapes do not fit or a number is not finite."""
+        """Raises CertificateError if the shapes do not fit, a number is not finite, or there are too many rows."""
         try:
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
+            require_size(len(rows), len(multipliers))
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
         object.__setattr__(self, "rows", rows)
@@ -53,6 +57,7 @@ class Polytope(ReadOnlyArrays):
         """The dimension n."""
         return self.rows.shape[1]
 
+    @own_error_state
     def gauge(self, points: Any) -> Any:
         """Returns max |g x| over the rows: 0 at the center, 1 on the boundary.
 
@@ -62,6 +67,7 @@ class Polytope(ReadOnlyArrays):
         gauges = np.abs(np.asarray(points, dtype=np.float64) @ self.rows.T).max(axis=-1)
         return float(gauges) if gauges.ndim == 0 else gauges
 
+    @own_error_state
     def support(self, directions: Any) -> Any:
         """Returns max of a'x over the polytope for a direction a (n,), or for each of shape (count, n), by a solver.
 
@@ -81,6 +87,7 @@ class Polytope(ReadOnlyArrays):
             found.append(-solution.fun * size)
         return float(found[0]) if np.ndim(directions) == 1 else np.array(found)
 
+    @own_error_state
     def outline(self, pair: tuple[int, int]) -> np.ndarray:
         """Returns corners of a polygon around the projection onto two coordinates, shape (k, 2); for pictures.
 
@@ -96,15 +103,26 @@ class Polytope(ReadOnlyArrays):
         heights = np.stack([heights, np.roll(heights, -1)], axis=1)
         return np.linalg.solve(normals, heights[..., None])[..., 0]
 
+    @own_error_state
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
 
+    @own_error_state
     def sample_boundary(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns points of the boundary in random directions, shape (count, n)."""
         scale = 1.0 / np.maximum(np.abs(self.rows).max(axis=0), np.finfo(float).tiny)
         directions = rng.standard_normal((count, self.dim)) * scale
         return directions / self.gauge(directions)[:, None]
+
+
+def require_size(rows: int, multipliers: int) -> None:
+    """Raises ValueError if a polytope would have more rows, or rows of multipliers, than any may have."""
+    if rows > MOST_ROWS or multipliers > MOST_MULTIPLIERS:
+        raise ValueError(
+            f"a polytope has at most {MOST_ROWS} rows and {MOST_MULTIPLIERS} rows of multipliers, got {rows} and "
+            f"{multipliers}"
+        )
 
 
 def polytope_content(polytope: Polytope) -> dict[str, Any]:
@@ -120,8 +138,7 @@ def polytope_of(content: Any) -> Polytope:
         KeyError, TypeError, ValueError: If an entry is missing or of a wrong kind.
     """
     rows, pairs = as_matrix(content["rows"], (None, None), "the rows of the polytope"), content["multipliers"]
-    if len(rows) > MOST_ROWS or not len(rows) < len(pairs) <= 2 * MOST_ROWS:
-        raise ValueError(f"a polytope has at most {MOST_ROWS} rows, and multipliers for each and for every input")
+    require_size(len(rows), len(pairs))
     multipliers = np.zeros((len(pairs), len(rows)))
     for row, entries in zip(multipliers, pairs, strict=True):
         if len({index for index, _ in entries}) < len(entries):

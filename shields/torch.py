@@ -10,6 +10,7 @@ from scipy.linalg import null_space
 from torch import nn
 
 from ncs_gym import LinearPlant
+from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.one_step import ReachableSets
 from shields.runtime.polytope_step import PolytopeSets, SetsOnGrid
@@ -44,6 +45,7 @@ class SafeLayer(nn.Module):
         ValueError: If the error shape is no positive semidefinite matrix, or there is none.
     """
 
+    @own_error_state
     def __init__(self, certificate: Certificate, plant: LinearPlant, error_shape: Any = None) -> None:
         super().__init__()
         self.filter = SafetyFilter(certificate, plant)
@@ -57,23 +59,28 @@ class SafeLayer(nn.Module):
     def __deepcopy__(self, memo: dict[int, Any]) -> SafeLayer:
         return self  # nothing in it is learned
 
+    @own_error_state
     def forward(
         self, actions: torch.Tensor, estimates: torch.Tensor, error_shapes: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Returns the actions that are applied, shape (N, m), of the type and on the device of those given.
+        """Returns the actions that are applied, shape (N, m), on the device of those given and of their type.
+
+        Of types that round more coarsely than float32, as under `torch.autocast`, they are float32: rounding to that is
+        inside the margins and proofs, coarser rounding is not.
 
         Args:
             actions: Shape (N, m), in units of the limits; clipped to [-1, 1] first.
-            estimates: x_hat, shape (N, n) [physical units].
-            error_shapes: Sigma_k, shape (N, n, n), or (n, n) for all; None for that of the layer.
+            estimates: x_hat, shape (N, n) [physical units]; not of a type coarser than float32.
+            error_shapes: Sigma_k, shape (N, n, n), or (n, n) for all; None for that of the layer. As fine.
 
         Raises:
-            ValueError: If the actions are no tensor of floats, a shape is wrong, or a number is NaN or infinite: the
-                shield would apply K x_hat, and the model learn nothing of its mistake.
+            ValueError: If the actions are no tensor of floats, a shape or a type is wrong, or a number is NaN or
+                infinite: the shield would apply K x_hat, and the model learn nothing of its mistake.
         """
         if not isinstance(actions, torch.Tensor) or not actions.is_floating_point():
             got = f"one of {actions.dtype}" if isinstance(actions, torch.Tensor) else type(actions).__name__
             raise ValueError(f"actions must be a tensor of floats, shape (N, {self.filter.plant.m}), got {got}")
+        actions = actions.float() if _is_coarse(actions) else actions
         given = {"actions": actions, "estimates": estimates}
         given |= {"error_shapes": self._shape if error_shapes is None else error_shapes}
         numbers = {name: _numbers(value, name) for name, value in given.items()}
@@ -111,9 +118,11 @@ class _Projected(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
         (jacobians,) = ctx.saved_tensors
-        return torch.einsum("ki,kij->kj", gradients[0], jacobians), None, None, None
+        # No product of matrices, which autocast would round.
+        return (gradients[0][:, :, None] * jacobians).sum(dim=1), None, None, None
 
 
+@own_error_state
 def projection_jacobians(
     shield: SafetyFilter, estimates: np.ndarray, error_shapes: np.ndarray, proposals: np.ndarray
 ) -> np.ndarray:
@@ -175,8 +184,19 @@ def _jacobian(free: np.ndarray, ball: tuple[np.ndarray, np.ndarray] | None, move
     return free @ (inverse - np.outer(along, along) / float(normal @ along)) @ free.T
 
 
+def _is_coarse(value: Any) -> bool:
+    """Returns whether a tensor or an array is of a floating-point type that rounds more coarsely than float32."""
+    dtype = getattr(value, "dtype", None)
+    is_float = dtype.is_floating_point if isinstance(dtype, torch.dtype) else getattr(dtype, "kind", "") == "f"
+    return is_float and getattr(dtype, "itemsize", 8) < 4
+
+
 def _numbers(value: Any, name: str) -> np.ndarray:
-    """Returns the numbers of a tensor or of nested lists; raises ValueError if they are none."""
+    """Returns the numbers of a tensor or of nested lists; raises ValueError if they are none, or coarsely rounded."""
+    if _is_coarse(value):
+        raise ValueError(
+            f"{name} must be float32 or float64, got {value.dtype}: no error set holds what that rounds off"
+        )
     try:
         return np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
     except (TypeError, ValueError) as error:

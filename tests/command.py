@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
@@ -17,6 +18,11 @@ from unittest import mock
 from experiments.__main__ import main
 
 ROOT = Path(__file__).resolve().parent.parent
+# Commands whose files many tests look at (the fixtures `smoke` and `attacked`). The unshielded agents of the first
+# explore enough to violate in training; the second has a batch of each kind, more than one of each.
+SMOKE = ("compare", "--smoke", "--arms", "unshielded", "shielded", "--baselines", "zero input", "proportional+shielded")
+SMOKE += ("--hyperparams", "policy_kwargs=dict(log_std_init=0.0)", "n_epochs=2")
+ATTACK = ("attack", "--env", "ncs_gym/TruckTrailer-v0", "--channel", "overtaking", "--steps", 9 * 8 * 200, "--envs", 8)
 
 
 class Run(NamedTuple):
@@ -67,12 +73,51 @@ def assert_one_sentence(run, *words):
     assert all(word in lines[0] for word in words), lines[0]
 
 
+def killed(*arguments, once: Callable[[], bool]) -> None:
+    """Starts `ncs` in a process of its own, kills it in its work, and waits until none of its workers is left."""
+    command = [sys.executable, "-m", "experiments", *map(str, arguments)]
+    run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 200.0
+    while not once():
+        assert run.poll() is None, "it ended before it was killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    children = _children_of(run.pid)
+    assert len(children) >= 2
+    run.kill()
+    run.wait()
+    while any(_is_alive(child) for child in children):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.1)
+
+
+def _children_of(pid: int) -> list[int]:
+    """Process ids of direct children, from /proc."""
+    stats = [path.read_text().rsplit(")", 1) for path in Path("/proc").glob("[0-9]*/stat") if path.exists()]
+    return [int(head.split()[0]) for head, tail in stats if int(tail.split()[1]) == pid]
+
+
+def _is_alive(pid: int) -> bool:
+    """Whether a process runs (a zombie does not)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 def _exit_code() -> int:
     try:
         main()
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     return 0
+
+
+@contextlib.contextmanager
+def without_pictures() -> Iterator[None]:
+    """Commands draw their figures and leave files without a picture, which takes most of the time."""
+    with mock.patch("experiments.plots.figure_style.CaptionedFigure.png", b"\x89PNG"):
+        yield
 
 
 @contextlib.contextmanager

@@ -59,6 +59,10 @@ class ProcessorTimes:
 
     def __init__(self) -> None:
         self.by_test: dict[str, float] = defaultdict(float)
+        self.reported = 0.0
+
+    def pytest_collection_finish(self) -> None:
+        """Tests are about to begin."""
         self.reported = processor_seconds()
 
     @pytest.hookimpl(wrapper=True)
@@ -71,7 +75,7 @@ class ProcessorTimes:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Adds up the reports of set-up, call and tear-down."""
-        self.by_test[report.nodeid] += report.processor_seconds
+        self.by_test[report.nodeid] += getattr(report, "processor_seconds", 0.0)  # a crashed worker tells none
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
         """Prints the slowest tests and the sum."""
@@ -81,6 +85,7 @@ class ProcessorTimes:
         for test, seconds in sorted(self.by_test.items(), key=lambda each: -each[1])[:SLOWEST]:
             terminalreporter.write_line(f"{seconds:8.1f}  {test}")
         terminalreporter.write_line(f"{sum(self.by_test.values()):8.1f}  all {len(self.by_test):,} tests")
+        terminalreporter.write_line(f"{processor_seconds():8.1f}  with imports and the collection of tests")
 
 
 def processor_seconds() -> float:

@@ -1,10 +1,13 @@
-"""Plants for property tests."""
+"""Plants of tests: random ones, and some with a name that share their certificates."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 
-from ncs_gym import LinearPlant
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
 
 
 def random_plant(seed: int, n: int, m: int, p: int | None = None, gamma: float = 1e-3) -> LinearPlant:
@@ -24,3 +27,62 @@ def random_plant(seed: int, n: int, m: int, p: int | None = None, gamma: float =
         measurement_noise_cov=1e-4 * np.eye(n if p is None else p),
         initial_cov=1e-5 * np.eye(n),
     )
+
+
+def small(A: object, **changes: object) -> LinearPlant:
+    """Two states and one input, in the unit box; without changes everything is Gaussian but a ball of disturbances."""
+    sizes = {"B": [[0.1], [0.2]], "box": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-5}
+    noises = dict.fromkeys(("process_noise_cov", "measurement_noise_cov", "initial_cov"), 1e-6 * np.eye(2))
+    return LinearPlant(**{"A": A} | sizes | noises | changes)
+
+
+def with_remainder() -> LinearPlant:
+    """The linear model of another process."""
+    left_out = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
+    bounds = {"disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
+    return LinearPlant(
+        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], box=[1.0, 1.0], u_max=1.0, dt=0.1, remainder=left_out, **bounds
+    )
+
+
+def oscillator(between_samples: int | None = 3) -> LinearPlant:
+    """A mass on a spring, with few samples per period; its box counts between them, too."""
+    model = [[0.0, 1.0], [-1.0, -0.4]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))
+    bounds = {"disturbance_bound": 0.01, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    return LinearPlant.from_statespace(
+        model, dt=0.5, box=[1.0, 1.0], u_max=1.0, between_samples=between_samples, **bounds
+    )
+
+
+def servo(factor: float = 1.2, **changes: object) -> LinearPlant:
+    """A DC servo; of these radii an ellipsoid bears up to about 1.04 times those of factor 1, a polytope more."""
+    motor = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])
+    bounds = {"disturbance_bound": [0.0, 0.25], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
+    scaled = {name: factor * np.array(bound) for name, bound in bounds.items()}
+    return LinearPlant.from_statespace(motor, **{"dt": 0.005, "box": [0.2, 4.0], "u_max": 12.0} | scaled | changes)
+
+
+def delayed(steps: int) -> LinearPlant:
+    """A damped oscillator whose inputs arrive some steps late."""
+    model = [[0.0, 1.0], [-0.2, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]], None
+    bounds = {"disturbance_bound": [0.0005, 0.003], "sensor_bound": 0.01, "initial_bound": 0.02}
+    return LinearPlant.from_statespace(model, dt=0.1, box=[1.0, 1.5], u_max=0.8, input_delay=steps, **bounds)
+
+
+# Plants with contracts, whose certificates with polytopes are checked in: data/certificates.
+NAMED: dict[str, Callable[[], tuple[LinearPlant, ChannelContract | None]]] = {
+    "stable": lambda: (small([[0.9, 0.1], [0.0, 0.8]]), None),
+    "unstable": lambda: (small([[1.02, 0.1], [0.0, 0.8]]), ChannelContract(1, 0.001)),
+    "remainder": lambda: (with_remainder(), None),
+    "oscillator": lambda: (oscillator(), ChannelContract(1)),
+    "delayed": lambda: (delayed(1), None),
+    "servo": lambda: (servo(), ChannelContract(3)),
+    "servo, bearable": lambda: (servo(0.8), ChannelContract(3)),
+    "servo, at all times": lambda: (servo(1.1, between_samples=4), ChannelContract(3)),
+}
+
+
+@cache
+def named(name: str) -> tuple[LinearPlant, ChannelContract | None]:
+    """A plant of `NAMED`, and the contract of its certificate."""
+    return NAMED[name]()

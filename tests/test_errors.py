@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from ncs_gym.envs.env import NCSEnv, RenderModeError
 from shields import Infeasible
 from tests.test_docs import PACKAGES, ROOT, exceptions, resolved
 
@@ -52,8 +51,3 @@ def test_every_class_of_ours_says_what_it_is_and_survives_pickling(name):
     copy = pickle.loads(pickle.dumps(error))
     assert type(copy) is kind
     assert str(copy) == str(error)
-
-
-def test_a_wrong_render_mode_is_refused(plant):
-    with pytest.raises(RenderModeError, match="render_mode must be None or one of"):
-        NCSEnv(plant, render_mode="cinema")

@@ -33,6 +33,11 @@ RUNS = {
             r"proved in 24\d\d of 9600 steps, outside the box in 0; now: True; the newest sample is older",
         ],
     ),
+    "delayed_classics.py": (
+        ["--smoke", "--only", "CartPole-v1"],
+        [rf"CartPole +PPO +bursts +{NUMBER} +{NUMBER}"],
+    ),
+    "pettingzoo_network.py": ([], [rf"both see three steps late: {NUMBER}"]),
     "mpc_loop.py": (
         [],
         [r"monitor: outside the box in [1-9]\d* steps", r"project: outside the box in 0 steps, [1-9].* in 300 of 300"],
@@ -97,6 +102,8 @@ TRAINING = {
     "single_file_sac.py",
     "your_gym_env.py",
 }
+# They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
+LONG = {"both_directions.py", "lost_hour.py", "unstable_plant_loop.py"}
 # Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},
@@ -136,7 +143,7 @@ def test_versions_of_foreign_packages_are_those_that_the_page_names():
         assert all(version in row for version in packages.values() if version)
 
 
-@pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - FOREIGN.keys()))
+@pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - LONG - FOREIGN.keys()))
 def test_example_prints_what_it_is_about(name):
     assert_expected(name, output_of_file(ROOT / "examples" / name, *RUNS[name][0]))
 

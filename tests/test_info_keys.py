@@ -45,6 +45,7 @@ def assert_is(value, kind, plant):
     else:
         sizes = {"n": plant.n, "m": plant.m, "k": len(plant.box_rows)}
         assert value.shape == tuple(sizes[size] for size in re.findall("[nmk]", kind))
+        assert value.dtype == np.float64
 
 
 @pytest.fixture(params=ENVIRONMENTS)
@@ -71,6 +72,8 @@ def test_docstrings_have_every_key_of_one_environment(loop, mode):
         assert set(info) == set(expected)
         for key, kind in expected.items():
             assert_is(info[key], kind, env.unwrapped.plant)
+        if env.unwrapped.downlink is None:  # else the estimate is that of a later state
+            np.testing.assert_array_equal(info["estimation_error"], info["estimate"] - info["state"])
 
 
 @pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])

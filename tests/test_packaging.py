@@ -34,6 +34,7 @@ LAYERS = {
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
         {"envs"},
+        {"networked"},
         {"registration"},
     ),
     "shields": (
@@ -46,9 +47,10 @@ LAYERS = {
         {"nodes", "torch"},
     ),
     "agents": (
-        {"hyperparams", "results", "sb3_vec_env"},
+        {"hyperparams", "pickled_data", "results", "sb3_vec_env"},
         {"loop"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
+        {"normalization", "sb3_zip"},
         {"agent"},
         {"training"},
     ),

@@ -25,7 +25,6 @@ class _Here(LocalWorkers):
     def __init__(self, log_folder: Path | None) -> None:
         super().__init__(log_folder)
         self._folder, self._sent = log_folder, []
-        monte_carlo_batch._shields.cache_clear()  # a new process has prepared none
 
     def submit(self, run: Any) -> Future:
         future: Future = Future()

@@ -101,10 +101,10 @@ def _tables(summary: dict[str, Any]) -> str:
 
 
 def _training_runs(settings: CompareSettings, loop: LoopConfig, certificate: Certificate) -> list[TrainingRun]:
-    """Returns the runs of every arm and of the baselines, those that train first because they take longer."""
+    """Returns the runs of every arm and of the baselines, first those that are evaluated only: they take a second."""
     names = settings.arms + settings.baselines
     runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
-    return sorted(runs, key=lambda run: run.policy_kind != "trained")
+    return sorted(runs, key=lambda run: run.trains)
 
 
 def _summary(

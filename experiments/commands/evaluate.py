@@ -33,7 +33,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.env is not None:
         registered_env(settings.env)
         env_id = id_alone(settings.env)
-    agent, folder = agent_named(str(settings.model), env_id)
+    agent, folder = agent_named(str(settings.model), env_id, settings.vec_normalize)
     if env_id is None:
         registered_env(agent.env)
     kwargs = {"channel": agent.channel, "between_samples": settings.between_samples}
@@ -54,7 +54,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     shield_name = mode or "none"
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
     arms = {f"shield: {shield_name}": arm_summary(episodes_table([result]), mode, fixed_policy=True)}
-    print(f"{agent.algorithm} of {folder} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
+    statistics = "" if settings.vec_normalize is None else f" with --vec-normalize {settings.vec_normalize}"
+    print(f"{agent.algorithm} of {folder}{statistics} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
     print(summary_text(arms, {}))
     if settings.out is not None:
         content = {
@@ -64,7 +65,11 @@ def evaluate(settings: EvaluateSettings) -> None:
             "horizon": shield and shield.horizon,
             "episodes": settings.episodes,
             "seed": settings.seed,
-            "model": {"folder": str(folder), "sha256": agent.checksum},
+            "model": {
+                "folder": str(folder),
+                "sha256": agent.checksum,
+                "vec_normalize": settings.vec_normalize and str(settings.vec_normalize),
+            },
             "plant": ncs_env(loop.single()).plant.fingerprint,
             "certificate": certificate.checksum,
             "versions": versions(),

@@ -259,7 +259,7 @@ async def _controller(
     columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "microseconds"]
     log = StepLog(settings.out, "controller", columns)
     packets = StepLog(settings.out, "packets", ["episode", "sent", "received"])
-    propose = controller_named(settings.policy, settings.env, env, settings.seed)
+    propose = controller_named(settings.policy, settings.env, env, settings.seed, settings.vec_normalize)
     steps = unproved = 0
 
     def on_step(node: ControllerNode, proposed: Any) -> None:
@@ -309,7 +309,9 @@ def waiting_text(refused: Mapping[str, int]) -> str:
     )
 
 
-def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable[[np.ndarray], np.ndarray]:
+def controller_named(
+    name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize: Path | None = None
+) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries."""
     plant = env.plant
     if name == "push":
@@ -321,7 +323,8 @@ def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable
             return plant.u_max * (1.0 if (count - 1) // PUSH % 2 == 0 else -1.0)
 
         return push
-    policy, rng, task = policy_by_name(name, env_id, env, seed), np.random.default_rng([seed, 3]), env.task
+    policy = policy_by_name(name, env_id, env, seed, vec_normalize)
+    rng, task = np.random.default_rng([seed, 3]), env.task
     goal = task.begin(rng, plant)
     low, high = env.observation_space.low, env.observation_space.high  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -27,7 +27,7 @@ _MOST_LISTED = 4
 Policy = Callable[[np.ndarray, dict], np.ndarray]
 
 
-def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
+def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize: Path | None = None) -> Policy:
     """Returns a policy for an environment.
 
     Args:
@@ -36,29 +36,33 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         env_id: Id of the environment.
         env: The environment.
         seed: Seed of the random policy.
+        vec_normalize: As for `agent_named`.
 
     Raises:
         AgentError: If there is no agent for this environment.
-        ValueError: If the folder of a run holds several agents.
+        ValueError: If the folder of a run holds several agents, or statistics are given for what is no zip.
     """
     if name in UNTRAINED_POLICIES:
+        _require_none(vec_normalize, name)
         no_gain = np.zeros((env.plant.m, env.plant.n))
         act = controller(_SHORT.get(name, name), env, no_gain, seed, tuned_weights(env_id, name))
         return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
-    agent, _ = agent_named(name, env_id)
+    agent, _ = agent_named(name, env_id, vec_normalize)
     return lambda observation, info: agent.act(observation[None])[0]
 
 
-def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
+def agent_named(name: str, env_id: str | None, vec_normalize: Path | None = None) -> tuple[Agent, Path]:
     """Returns a trained agent, and the folder or zip that it is in.
 
     Args:
         name: As for `policy_by_name`.
         env_id: Id of the environment that it has to be of; None for any.
+        vec_normalize: Statistics beside a zip of stable-baselines3, as `agents.agent.load_sb3_zip` takes them.
 
     Raises:
-        AgentError: If there is no agent, or it is of another environment.
-        ValueError: If the folder of a run holds several agents, or nothing says of which environment the agent is.
+        AgentError: If there is no agent, it is of another environment, or a zip needs what is not given.
+        ValueError: If the folder of a run holds several agents, nothing says of which environment the agent is, or
+            statistics are given for what is no zip.
     """
     from agents.agent import Agent, is_sb3_zip, load_sb3_zip  # imports torch
 
@@ -68,11 +72,17 @@ def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
     if env_id is not None and name == PRETRAINED:
         path = pretrained_folder(env_id)
     if env_id is not None and is_sb3_zip(path):
-        return load_sb3_zip(path, env_id), path
+        return load_sb3_zip(path, env_id, vec_normalize), path
+    _require_none(vec_normalize, name)
     agent = Agent.load(path)
     if env_id not in (None, agent.env):
         raise AgentError(f"the agent in {path} was trained in {agent.env}, not in {env_id}")
     return agent, path
+
+
+def _require_none(vec_normalize: Path | None, name: str) -> None:
+    if vec_normalize is not None:
+        raise ValueError(f"--vec-normalize is for zips of stable-baselines3, {name} needs no statistics")
 
 
 def _only_agent(folder: Path) -> Path:

@@ -309,7 +309,9 @@ class RenderSettings:
         log: Folder of the logs of `ncs loop`: draws the last steps of its newest episode, of the plant that `--env`
             names, into a .png.
         policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", a regulator ("lqr", "governor",
-            "mpc"), "pretrained" (the small agent that comes with the package), or the folder of a trained agent.
+            "mpc"), "pretrained" (the small agent that comes with the package), the folder of a trained agent, or a zip
+            that `model.save` of stable-baselines3 wrote.
+        vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
@@ -327,6 +329,7 @@ class RenderSettings:
     out: Path = Path("episode.gif")
     log: Path | None = None
     policy: str = "greedy"
+    vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None
     side_by_side: bool = False
@@ -355,7 +358,8 @@ class LoopSettings:
             loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
         downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
         policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", a regulator ("lqr",
-            "governor", "mpc"), or the folder of a trained agent.
+            "governor", "mpc"), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
+        vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         certificate: Certificate file to use instead of synthesizing one; both machines need the same.
@@ -383,6 +387,7 @@ class LoopSettings:
     channel: Assignments = field(default_factory=dict)
     downlink: Assignments = field(default_factory=dict)
     policy: str = "push"
+    vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     horizon: int | None = None
     certificate: Path | None = None

@@ -254,6 +254,8 @@ class EvaluateSettings:
             `ncs train`; or the zip that `model.save` of stable-baselines3 wrote, with --env; or "pretrained", for the
             agent of --env that comes with the package.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
+        vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, of which numbers alone
+            are read; "none" if the agent saw observations as they are and a file of that kind lies beside it.
         shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
             nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
@@ -269,6 +271,7 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
+    vec_normalize: Path | None = None
     shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
     horizon: int | None = None
     episodes: int = 200

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -12,6 +11,7 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
+from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import (
     CHANNELS,
     expect,
@@ -38,7 +38,7 @@ from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, as_flag, setting, shown
+from ncs_gym.validation import as_count, as_flag, own_error_state, setting, shown, warn_caller
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
@@ -52,7 +52,7 @@ class RenderModeError(ValueError, TypeError):
     """An unknown render mode; a TypeError too, because stable-baselines3 asks for "rgb_array" and retries on that."""
 
 
-class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
+class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     """A plant behind an imperfect network; the controller sees an estimate of the state.
 
     ## Action space
@@ -171,6 +171,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     downlink_contract: ChannelContract | None = setting("downlink_contract")
     downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
 
+    @own_error_state
     def __init__(
         self,
         plant: LinearPlant,
@@ -214,11 +215,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         histories = arrival_histories(plant, self._channel, self._certificate_contract)
         self._error_set = histories.recursion.error_set
         if not histories.uses_samples:
-            warnings.warn(
+            warn_caller(
                 f"no packet is of use: with a quantization step of {self._channel.quantization_step:g} and this sensor "
                 "noise samples move the estimate by less than 1 % of what they differ by, so that it is a prediction",
                 UnusedPacketsWarning,
-                stacklevel=3,
             )
         self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
@@ -241,6 +241,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.start: Ellipsoid | np.ndarray = self._initial_set
         self._consistent = False
 
+    @own_error_state
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -289,6 +290,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             self.renderer.begin(info, self._task_state)
         return self._observation(), info
 
+    @own_error_state
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Applies u = u_max * action for one step.
 
@@ -348,6 +350,22 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         return int(require_on_request(self._requests).outstanding(self._estimator.age))
 
+    @property
+    def request_state(self) -> tuple[int, int]:
+        """The age of the newest sample used, and `outstanding` [steps, samples]."""
+        return self._estimator.age, self.outstanding
+
+    @property
+    def request_limits(self) -> np.ndarray:
+        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
+        input_delay = len(self._pending)
+        if self._contract is None:
+            most = self._horizon, max(self._channel.longest_delay + input_delay, 1)
+        else:
+            most = self._contract.max_age, self._contract.max_age + input_delay
+        return np.array(most, dtype=np.float64).clip(min=1.0)
+
+    @own_error_state
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
 
@@ -382,6 +400,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         """What a shield decides on, as copies: no wrapper stands between."""
         return Known(*(each.copy() if isinstance(each, np.ndarray) else each for each in self._known))
 
+    @own_error_state
     def estimates_ahead(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns estimate and error shape of now and of every step until the next decision takes effect."""
         return [self._estimator.predicted(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
@@ -424,7 +443,12 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         constraints = Constraints(values, worst, cost, self._violations)
         estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         self._known = Known(
-            *self._predicted_estimate(), estimator.age, alarm, inputs.applied.copy(), inputs.committed.copy()
+            *self._predicted_estimate(),
+            estimator.age,
+            alarm,
+            estimator.damaged,
+            inputs.applied.copy(),
+            inputs.committed.copy(),
         )
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:

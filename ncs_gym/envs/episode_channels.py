@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorWrapper
 
+from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
 from ncs_gym.validation import shown
@@ -121,9 +122,9 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
     outside. What the environment was made for bounds what may be drawn; see `NCSEnv.reset`.
 
     Args:
-        env: An `NCSEnv`, possibly wrapped.
-        channel: A function (rng) -> Channel, or a list of channels of which each is equally likely; None for the
-            environment's own.
+        env: An `NCSEnv`, or another environment in `Networked`, possibly wrapped.
+        channel: A function (rng) -> Channel, or a list of channels (or dictionaries of their fields) of which each is
+            equally likely; None for the environment's own.
         downlink: The same for the commands.
 
     Raises:
@@ -131,10 +132,10 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
-        RecordConstructorArgs.__init__(self, channel=channel, downlink=downlink)
+        RecordConstructorArgs.__init__(self, channel=to_json(channel), downlink=to_json(downlink))
         gym.Wrapper.__init__(self, env)
-        if not hasattr(env.unwrapped, "episode_channel"):
-            raise ValueError(f"RandomChannel is for an NCSEnv, got {env.unwrapped}")
+        if not env.has_wrapper_attr("episode_channel"):
+            raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")
         self._drawn = _drawn(channel, downlink)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -146,7 +147,7 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
     """`RandomChannel` for an `NCSVectorEnv`: one is drawn for every episode of every one, in any autoreset mode.
 
     Args:
-        env: An `NCSVectorEnv`, possibly wrapped.
+        env: An `NCSVectorEnv`, or another one in `VectorNetworked`, possibly wrapped.
         channel: See `RandomChannel`.
         downlink: See `RandomChannel`.
 
@@ -155,7 +156,7 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
-        RecordConstructorArgs.__init__(self, channel=channel, downlink=downlink)
+        RecordConstructorArgs.__init__(self, channel=to_json(channel), downlink=to_json(downlink))
         VectorWrapper.__init__(self, env)
         self._drawn = _drawn(channel, downlink)
 
@@ -177,7 +178,7 @@ def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generat
 def _draw(source: Any, name: str) -> Callable[[np.random.Generator], Any]:
     if callable(source):
         return source
-    choices = tuple(source) if isinstance(source, (list, tuple)) else ()
+    choices = tuple(from_json(each, (Channel,), name) for each in source) if isinstance(source, (list, tuple)) else ()
     if not choices or not all(isinstance(each, Channel) for each in choices):
         raise ValueError(f"{name} must be a function (rng) -> Channel or a list of channels, got {shown(source)}")
     return partial(_chosen, choices)

@@ -20,6 +20,7 @@ class Known(NamedTuple):
         error_shape: Sigma_k of the same time, shape (n, n) or (N, n, n).
         age: Steps since the newest sample used was taken, an int or shape (N,).
         alarm: Whether an assumption was seen to be violated, a bool or shape (N,).
+        damaged: Whether one was because a sample was no finite numbers, a bool or shape (N,).
         applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
         committed: The input decided in the last step, of the same shape.
     """
@@ -28,6 +29,7 @@ class Known(NamedTuple):
     error_shape: np.ndarray
     age: Any
     alarm: Any
+    damaged: Any
     applied: np.ndarray
     committed: np.ndarray
 

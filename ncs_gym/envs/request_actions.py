@@ -6,12 +6,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.validation import as_number, as_numbers, shown
 
@@ -25,7 +24,8 @@ class RequestActions(gym.Wrapper, RecordConstructorArgs):
     also of those that the contract forces. Wrap it around the shield, whose actions stay as they are.
 
     Args:
-        env: An `NCSEnv` whose channel takes samples on request, possibly wrapped.
+        env: An `NCSEnv` whose channel takes samples on request, or another environment in such a `Networked`, possibly
+            wrapped; actions are a vector of numbers, or a number from 0 on (`Discrete`), which becomes a pair.
         cost: Of a packet, in units of the reward, >= 0.
 
     Raises:
@@ -35,10 +35,10 @@ class RequestActions(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, cost: float = 0.0) -> None:
         RecordConstructorArgs.__init__(self, cost=cost)
         gym.Wrapper.__init__(self, env)
-        self._inner = _on_request(env, NCSEnv)
+        self._inner = _on_request(env)
         self.cost = as_number(cost, "cost", low=0.0)
-        self._most = _bounds(self._inner)
-        self.action_space = _wider(env.action_space, [-1.0], [1.0])
+        self._most = self._inner.request_limits
+        self.action_space = _with_request(env.action_space)
         self.observation_space = _wider(env.observation_space, np.zeros(2), self._most)
         self._packets = 0
 
@@ -54,14 +54,14 @@ class RequestActions(gym.Wrapper, RecordConstructorArgs):
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
         """
-        inputs, asked = _parted(action, self.action_space.shape)
+        inputs, asked = _parted(action, self.action_space)
         self._inner.request(bool(asked))
         observation, reward, terminated, truncated, info = self.env.step(inputs)
         sent, self._packets = info["packets"] - self._packets, info["packets"]
         return self._seen(observation), float(reward) - self.cost * sent, terminated, truncated, info
 
     def _seen(self, observation: np.ndarray) -> np.ndarray:
-        more = np.minimum([self._inner.known.age, self._inner.outstanding], self._most)
+        more = np.minimum(self._inner.request_state, self._most)
         return np.concatenate([observation, more.astype(np.float32)])
 
 
@@ -79,12 +79,14 @@ class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
     def __init__(self, env: Any, cost: float = 0.0) -> None:
         RecordConstructorArgs.__init__(self, cost=cost)
         VectorWrapper.__init__(self, env)
-        self._inner = _on_request(env, NCSVectorEnv)
+        self._inner = _on_request(env)
+        if not isinstance(self._inner, NCSVectorEnv):
+            raise ValueError(f"expected an NCSVectorEnv inside, got {type(self._inner).__name__}")
         if self._inner.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("with SAME_STEP autoreset the age at an episode's end is not known: use NEXT_STEP")
         self.cost = as_number(cost, "cost", low=0.0)
-        self._most = _bounds(self._inner.single)
-        self.single_action_space = _wider(env.single_action_space, [-1.0], [1.0])
+        self._most = self._inner.single.request_limits
+        self.single_action_space = _with_request(env.single_action_space)
         self.single_observation_space = _wider(env.single_observation_space, np.zeros(2), self._most)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -105,7 +107,7 @@ class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
         Raises:
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
         """
-        inputs, asked = _parted(actions, self.action_space.shape)
+        inputs, asked = _parted(actions, self.action_space)
         self._inner.request(asked)
         observations, rewards, terminated, truncated, info = self.env.step(inputs)
         sent = np.maximum(info["packets"] - self._packets, 0)  # nothing in a step that only begins an episode
@@ -117,22 +119,24 @@ class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
         return np.concatenate([observations, more.astype(np.float32)], axis=1)
 
 
-def _on_request(env: Any, kind: type) -> Any:
-    """Returns the environment inside all wrappers."""
-    inner = env.unwrapped
-    if not isinstance(inner, kind):
-        raise ValueError(f"expected an {kind.__name__} inside, got {type(inner).__name__}")
-    if not inner.channel.on_request:
-        raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
-    return inner
+def _on_request(env: Any) -> Any:
+    """Returns the layer that takes requests: the environment inside all wrappers, or the network around it."""
+    layer = env
+    while not hasattr(type(layer), "request") and layer is not env.unwrapped:
+        layer = layer.env
+    if not hasattr(type(layer), "request"):
+        raise ValueError(f"expected an NCSEnv inside, or Networked around another one, got {type(layer).__name__}")
+    layer.request(False)  # raises where samples are sent by themselves
+    return layer
 
 
-def _bounds(env: NCSEnv) -> np.ndarray:
-    """Returns the largest age and the largest number of outstanding samples that are told apart, shape (2,)."""
-    input_delay = 0 if env.downlink_protocol is None else env.downlink_protocol.input_delay
-    if env.contract is None:
-        return np.array([env.horizon, max(env.channel.longest_delay + input_delay, 1)], dtype=np.float64)
-    return np.array([env.contract.max_age, env.contract.max_age + input_delay], dtype=np.float64).clip(min=1.0)
+def _with_request(actions: Any) -> Any:
+    """Returns actions with one entry more, which asks for a sample."""
+    if isinstance(actions, Discrete) and actions.start == 0:
+        return MultiDiscrete([actions.n, 2])
+    if not (isinstance(actions, Box) and len(actions.shape) == 1):
+        raise ValueError(f"a request is one entry more of a vector of numbers or a number from 0 on, got {actions}")
+    return _wider(actions, [-1.0], [1.0])
 
 
 def _wider(space: Any, low: Any, high: Any) -> Box:
@@ -140,10 +144,10 @@ def _wider(space: Any, low: Any, high: Any) -> Box:
     return Box(least, most, dtype=np.float32)
 
 
-def _parted(actions: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the entries of actions that are inputs, and whether a sample is asked for."""
+def _parted(actions: Any, space: Any) -> tuple[Any, np.ndarray]:
+    """Returns what actions are without a request, and whether a sample is asked for."""
     numbers = as_numbers(actions)
-    if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all():
-        raise ValueError(f"actions must be finite with shape {shape}, got {shown(actions)}")
-    given = np.asarray(actions)
-    return given[..., :-1].copy(), np.asarray(numbers[..., -1] > 0.0)
+    if numbers is None or numbers.shape != space.shape or not np.isfinite(numbers).all():
+        raise ValueError(f"actions must be finite with shape {space.shape}, got {shown(actions)}")
+    given, asked = np.asarray(actions), np.asarray(numbers[..., -1] > 0.0)
+    return (given[..., 0] if isinstance(space, MultiDiscrete) else given[..., :-1].copy()), asked

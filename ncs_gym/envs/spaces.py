@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from math import isfinite
 from typing import Any
 
@@ -14,7 +13,7 @@ from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_numbers, shown
+from ncs_gym.validation import as_numbers, shown, warn_caller
 
 # What can be observed besides estimate and task.
 OBSERVED = "age", "error"
@@ -162,12 +161,11 @@ class Observer:
 
     def _warn(self, first: int, entry: int) -> None:
         bound = float(np.ravel(self._high)[first + entry])
-        warnings.warn(
+        warn_caller(
             f"entry {entry} of {type(self._task).__name__} is beyond its observation_bound of {bound:.6g} and is "
             f"clipped in observations: bound what {self._horizon} steps can reach, and give horizon=... if episodes "
             "are longer",
             ClippedObservationWarning,
-            stacklevel=5,
         )
 
 

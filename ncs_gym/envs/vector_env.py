@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
+from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
@@ -30,10 +31,10 @@ from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, setting, shown
+from ncs_gym.validation import as_count, own_error_state, setting, shown
 
 
-class NCSVectorEnv(VectorEnv):
+class NCSVectorEnv(SpecOfJson, VectorEnv):
     """N copies of `NCSEnv` with the same semantics, spaces and info keys; every info value has N as its first axis.
 
     Inside, the environment is the last axis, so that A x + B u stands as in the formulas. What depends only on when
@@ -87,6 +88,7 @@ class NCSVectorEnv(VectorEnv):
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
 
+    @own_error_state
     def __init__(
         self,
         num_envs: int = 1,
@@ -175,11 +177,13 @@ class NCSVectorEnv(VectorEnv):
         done, known = self._ended
         return done.copy(), Known(*(each.copy() for each in known))
 
+    @own_error_state
     def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), `error_shapes`."""
         pending = self._downlink_state.committed.pending
         return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
 
+    @own_error_state
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -216,6 +220,7 @@ class NCSVectorEnv(VectorEnv):
         self._draw(info, begins=mask, moved=False)
         return self._observation(), info
 
+    @own_error_state
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies u = u_max * action, actions of shape (N, m), for one step of every environment.
 
@@ -269,6 +274,7 @@ class NCSVectorEnv(VectorEnv):
         """
         return require_on_request(self._requests).outstanding(self._estimator.age)
 
+    @own_error_state
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
 
@@ -341,7 +347,8 @@ class NCSVectorEnv(VectorEnv):
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
                 damaged = np.asarray(~np.isfinite(samples).all(axis=0))
                 self._channel_state.discard(damaged)
-                estimator.alarm |= sends & damaged
+                estimator.damaged |= sends & damaged
+                estimator.alarm |= estimator.damaged
                 samples[:, damaged] = 0.0  # times a gain of zero it is to be nothing
         arrivals = self._channel_state.arrivals()
         estimator.advance(u.copy(), samples, arrivals)
@@ -436,7 +443,8 @@ class NCSVectorEnv(VectorEnv):
         predicted = self._estimate[0], table.shapes.take(numbers, axis=0)
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        self._known = Known(*predicted, self._estimator.age.copy(), alarm, *(each.copy() for each in inputs[:2]))
+        own = self._estimator.age.copy(), alarm, self._estimator.damaged.copy()
+        self._known = Known(*predicted, *own, *(each.copy() for each in inputs[:2]))
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
@@ -456,7 +464,7 @@ class NCSVectorEnv(VectorEnv):
         self._worst = self._plant.constraint_values(self._state)
         fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
-        self._known = Known(*self._known[:4], *inputs)
+        self._known = Known(*self._known[:5], *inputs)
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

@@ -375,9 +375,10 @@ class ArrivalHistories:
                     table = self.table.recurring(MAX_BYTES // (4 * self.table.bytes_each))
                 successor = ArrivalHistories(recursion, self.channel, table, self.coarsens)
                 self._successor = weakref.ref(successor)
-            for key, shared in list(_shared.items()):
-                if shared is self:
-                    _shared[key] = successor
+            with _shared_lock:
+                for key, shared in _shared.items():
+                    if shared is self:
+                        _shared[key] = successor
         return successor, successor.taking_over(self, histories)
 
     def taking_over(self, other: ArrivalHistories, histories: np.ndarray) -> np.ndarray:
@@ -451,6 +452,7 @@ def _with_room(array: np.ndarray, count: int, axis: int = -1) -> np.ndarray:
 
 
 _shared: dict[tuple[str, Channel, ChannelContract | None, bool], ArrivalHistories] = {}
+_shared_lock = threading.Lock()
 
 
 def arrival_histories(
@@ -468,12 +470,13 @@ def arrival_histories(
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
     key = plant.fingerprint, kept, contract, coarsens
-    histories = _shared.pop(key, None)
+    histories = _shared.get(key)
     if histories is None:
         histories = histories_of(plant, kept, certified_error_set(plant, contract), coarsens)
-    _shared[key] = histories
-    if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
-        _shared.pop(next(iter(_shared)), None)
+    with _shared_lock:
+        histories = _shared[key] = _shared.pop(key, histories)
+        if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
+            del _shared[next(iter(_shared))]
     return histories
 
 

@@ -13,7 +13,7 @@ from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, congruence_su
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import ReadOnlyArrays
+from ncs_gym.validation import ReadOnlyArrays, own_error_state
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (docs/shield_proof.md).
 GROWTH = 1.1
@@ -73,6 +73,7 @@ class ErrorSet(ReadOnlyArrays):
         return self.rate if self.ages is None else float(self.ages.rates[age])
 
 
+@own_error_state
 def certified_error_set(plant: LinearPlant, contract: ChannelContract | None = None) -> ErrorSet:
     """Returns the error set of a plant: of a stable one without a contract, of any under one.
 

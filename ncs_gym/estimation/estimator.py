@@ -20,7 +20,7 @@ from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import frozen, setting
+from ncs_gym.validation import again_if_interrupted, frozen, own_error_state, setting
 
 
 class Estimate(NamedTuple):
@@ -59,6 +59,7 @@ class Estimator:
         step: Steps since the start of the episode.
         episode: Number of the episode, counted from 0; packets of any other are discarded.
         alarm: Whether a measurement contradicted the assumed bounds in this episode.
+        damaged: Whether one did because it was no finite numbers.
 
     Raises:
         UnstablePlantError: If no error set is given and the plant is not Schur stable.
@@ -71,6 +72,7 @@ class Estimator:
     buffer: int = setting("buffer")
     error_set: ErrorSet = setting("error_set")
 
+    @own_error_state
     def __init__(
         self,
         plant: LinearPlant,
@@ -112,6 +114,7 @@ class Estimator:
         self._histories = self._usual
         self._begin(mean)
 
+    @own_error_state
     def restart(self, mean: np.ndarray, inputs: Sequence[np.ndarray]) -> None:
         """Begins anew with an estimate of an earlier step of the episode: that of the newest sample it was made of.
 
@@ -133,7 +136,7 @@ class Estimator:
     def _begin(self, mean: np.ndarray, step: int = 0) -> None:
         """Forgets everything but an estimate, shape (n,), at a step."""
         self.step, self.age = step, 0
-        self.alarm = False
+        self.alarm = self.damaged = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self._history = self._histories.root
         # By age: means before updates, inputs that led there, and samples.
@@ -218,12 +221,12 @@ class Estimator:
         if after == history:
             return history
         if not np.isfinite(packet.measurement).all():
-            self.alarm = True  # no sensor within the assumptions sends this
+            self.alarm = self.damaged = True  # no sensor within the assumptions sends this
             return history
         self._samples[age] = packet.measurement
         return after
 
-    @np.errstate(invalid="ignore", over="ignore")  # an infinite weight of a residual of zero, a huge residual
+    @own_error_state  # an infinite weight of a residual of zero, a huge residual
     def _replayed(self, history: int) -> int:
         """Replays from the oldest new sample on, keeps whichever history is better, and returns the history then."""
         histories, H = self._histories, self._plant.H
@@ -249,6 +252,7 @@ class Estimator:
             self.age = new_age
         return target
 
+    @again_if_interrupted
     def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x_hat + B u, shape (n,); an unstable plant's within the limit of its states."""
         mean = self._plant.A.dot(mean) + self._plant.B.dot(u)

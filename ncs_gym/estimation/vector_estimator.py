@@ -27,6 +27,7 @@ class VectorEstimator:
         mean: x_hat, shape (n, N).
         age: Steps since the newest sample used was taken, shape (N,).
         alarm: Whether a measurement contradicted the assumed bounds in the episode, shape (N,).
+        damaged: Whether one was no finite numbers, which the environment sees, shape (N,).
         histories: The graph in use; another one after histories were forgotten.
         history: Number of each environment's history, shape (N,).
     """
@@ -34,7 +35,8 @@ class VectorEstimator:
     def __init__(self, plant: LinearPlant, histories: ArrivalHistories, size: int) -> None:
         self.plant, self.histories = plant, histories
         self.mean, self.age = np.zeros((plant.n, size)), np.zeros(size, np.int64)
-        self.alarm, self.history = np.zeros(size, np.bool_), np.full(size, histories.root)
+        self.alarm, self.damaged = np.zeros((2, size), np.bool_)
+        self.history = np.full(size, histories.root)
         self._limit = plant.state_limit[:, None] if np.isfinite(plant.state_limit).all() else None
         # By age: means before updates, inputs that led there, and samples (None where nobody sent).
         self._priors: deque[np.ndarray] = deque(maxlen=histories.buffer + 1)
@@ -57,7 +59,8 @@ class VectorEstimator:
         self.mean = self.mean.copy()  # the old array is kept as a mean before an update
         self.mean[:, chosen] = mean
         frozen(self.mean)
-        self.age[chosen], self.alarm[chosen], self.history[chosen] = 0, False, self.histories.root
+        self.age[chosen], self.history[chosen] = 0, self.histories.root
+        self.alarm[chosen] = self.damaged[chosen] = False
 
     def advance(self, u: np.ndarray, samples: np.ndarray | None, arrivals: list[tuple[int, np.ndarray]]) -> None:
         """Moves one step on: predicts with the inputs really applied, then takes in what arrived.

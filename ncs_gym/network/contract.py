@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 from ncs_gym.network.channel import Channel, in_steps
-from ncs_gym.validation import as_count, as_number
+from ncs_gym.validation import as_count, as_number, warn_caller
 
 # There is an error set for every age.
 MAX_AGE = 1000
@@ -70,9 +69,8 @@ def warn_of_broken_contract(
     input_delay: int,
     *,
     counts_losses: bool = False,
-    stacklevel: int = 3,
 ) -> None:
-    """Warns the caller of the calling constructor if a channel cannot keep the contract that a certificate assumes.
+    """Warns the caller if a channel cannot keep the contract that a certificate assumes.
 
     Args:
         contract: That of the certificate; None for none.
@@ -81,17 +79,15 @@ def warn_of_broken_contract(
         counts_losses: Whether losses and jitter count, as of a real channel; one that may lose any number of packets
             in a row promises nothing. Without them it is warned only of what breaks the contract although no packet is
             lost.
-        stacklevel: As for `warnings.warn`.
     """
     if contract is None:
         return
     if counts_losses and channel.most_consecutive_losses is None:
-        warnings.warn(
+        warn_caller(
             "the channel may lose any number of packets in a row, but the certificate's contract allows the newest "
             f"sample to be {in_steps(contract.max_age)} old in all, so that the guarantee is likely to be lost: say "
             "what the network promises by max_consecutive_losses",
             BrokenContractWarning,
-            stacklevel=stacklevel,
         )
         return
     promised = contract_of(channel) if counts_losses else None
@@ -99,10 +95,9 @@ def warn_of_broken_contract(
     if age + input_delay <= contract.max_age:
         return
     later = f", and what is decided takes effect {in_steps(input_delay)} later" if input_delay else ""
-    warnings.warn(
+    warn_caller(
         f"the channel lets the newest sample become {in_steps(age)} old{later}, but the certificate's contract allows "
         f"{in_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
         f"ChannelContract(max_age={age + input_delay}), or of a larger max_age where packets are lost",
         BrokenContractWarning,
-        stacklevel=stacklevel,
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import os
 import re
-import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self
@@ -14,7 +13,7 @@ import numpy as np
 
 from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel
 from ncs_gym.reading import LARGEST_LOG, MOST_PACKETS, MOST_STEPS, read_text
-from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, shown
+from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, shown, warn_caller
 
 # A line of ping: the stamp that -D prints, the number of the packet, and the time until its answer.
 _PING = re.compile(r"^(?:\[(?P<stamp>\d+\.\d+)\] )?.*\bicmp_seq=(?P<number>\d+)\b(?:.*\btime=(?P<time>[\d.]+) ?ms)?")
@@ -86,11 +85,10 @@ class PacketLog(ReadOnlyArrays):
             return cls._of_steps(lines[1:], names.index("episode"), columns, path, dt)
         log = cls._of_csv(lines, columns, path)
         if log.period >= 1.0 and np.nanmedian(np.append(log.delays, -np.inf)) >= 1.0:
-            warnings.warn(
+            warn_caller(
                 f"the times in {shown(path)} look like milliseconds, but are taken for seconds: packets every "
                 f"{log.period:g} s, most of which take more than a second",
                 UserWarning,
-                stacklevel=2,
             )
         return log
 

@@ -32,9 +32,8 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
             "(low, high), ...); if these are rows, no two of them the same but for their signs, give them as an array, "
             f"got {shown(value)}"
         )
-    if numbers.ndim == 2:
-        rows = as_matrix(numbers, (None, n), "box")
-    else:
+    rows = numbers
+    if numbers.ndim < 2:
         limited = np.isfinite(numbers)
         fits = (numbers >= SMALLEST_NUMBER) & (numbers < LARGEST_NUMBER) | (numbers == np.inf)
         if numbers.shape not in ((), (n,)) or not fits.all() or not limited.any():
@@ -43,6 +42,7 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
                 f"everywhere, or rows of shape (any, {n}), got {shown(value)}"
             )
         rows = np.diag(1.0 / np.broadcast_to(numbers, (n,)))[np.broadcast_to(limited, (n,))]
+    rows = as_matrix(rows, (None, n), "box")
     if (np.abs(rows).max(axis=1) < SMALLEST_NUMBER).any():
         raise ValueError(f"every row of box must limit something, got {shown(rows.tolist())}")
     return rows

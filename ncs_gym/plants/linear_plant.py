@@ -9,9 +9,7 @@ import functools
 import hashlib
 import json
 import os
-import sys
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -37,14 +35,17 @@ from ncs_gym.validation import (
     FILLED_IN_LATER,
     SMALLEST_NUMBER,
     ReadOnlyArrays,
+    again_if_interrupted,
     as_count,
     as_covariance,
     as_matrix,
     as_names,
     as_number,
     as_setting,
+    own_error_state,
     read_only,
     shown,
+    warn_caller,
 )
 
 if TYPE_CHECKING:
@@ -310,6 +311,7 @@ class LinearPlant(ReadOnlyArrays):
         between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt)
 
     @classmethod
+    @own_error_state
     def around(
         cls,
         *,
@@ -340,6 +342,7 @@ class LinearPlant(ReadOnlyArrays):
         return cls(**limits.arguments_around(A, B, point, (state_limits, input_limits), settings))
 
     @classmethod
+    @own_error_state
     def from_statespace(cls, sys: Any, dt: float | None = None, *, input_delay: int = 0, **settings: Any) -> Self:
         """Returns the plant of a state-space model; its C becomes H.
 
@@ -364,6 +367,7 @@ class LinearPlant(ReadOnlyArrays):
         plant = cls.around(**arguments) if given else cls(**arguments)
         return plant if input_delay == 0 else plant._delayed(input_delay)
 
+    @own_error_state
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
 
@@ -449,29 +453,42 @@ class LinearPlant(ReadOnlyArrays):
             state_units=[*self.state_units, *tuple(self.input_units) * delay],
         )
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
+        return {"format": _FORMAT, "plant": {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}}
+
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Returns the plant in a file of `save`, checked like any other.
+    def read(cls, given: Mapping[str, Any] | str | os.PathLike[str]) -> Self:
+        """Returns the plant of a `document`, or of the file at a path, checked like any other.
 
         Raises:
             ValueError: If the file is missing or not that of a plant, or an argument is wrong.
         """
-        try:
-            document = json_values(read_text(path))
-        except (OSError, TypeError, ValueError, RecursionError) as error:
-            reason = getattr(error, "strerror", None) or "it is not valid JSON"
-            raise ValueError(f"cannot read the plant in {shown(path)}: {reason}") from error
-        content = document.get("plant") if isinstance(document, dict) and document.get("format") == _FORMAT else None
-        if not isinstance(content, dict):
-            raise ValueError(f"{shown(path)} is not a plant of format {_FORMAT!r}")
-        arguments = {name: _from_json(value) for name, value in content.items()}
+        document, name = given, "the document"
+        if not isinstance(given, Mapping):
+            name = shown(given)
+            try:
+                document = json_values(read_text(given))
+            except (OSError, TypeError, ValueError, RecursionError) as error:
+                reason = getattr(error, "strerror", None) or "it is not valid JSON"
+                raise ValueError(f"cannot read the plant in {name}: {reason}") from error
+        content = document.get("plant") if isinstance(document, Mapping) and document.get("format") == _FORMAT else None
+        if not isinstance(content, Mapping):
+            raise ValueError(f"{name} is not a plant of format {_FORMAT!r}")
+        arguments = {key: _from_json(value) for key, value in content.items()}
         box = as_setting(arguments.get("box"))
         if box is not None:
             arguments["box"] = box  # an array: `save` wrote computed rows
         try:
             return cls(**arguments)
         except TypeError as error:  # an argument is missing or unknown
-            raise ValueError(f"{shown(path)} is not the file of a plant: {error}") from error
+            raise ValueError(f"{name} is not that of a plant: {error}") from error
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Returns the plant in a file of `save`; see `read`."""
+        return cls.read(path)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every number is exact.
@@ -479,9 +496,7 @@ class LinearPlant(ReadOnlyArrays):
         Raises:
             OSError: If the file cannot be written.
         """
-        content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
-        document = {"format": _FORMAT, "plant": content}
-        Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
         return _describe(self)
@@ -594,6 +609,7 @@ class LinearPlant(ReadOnlyArrays):
         """Returns whether a fingerprint is this plant's, or one that it had before (`FORMER_FINGERPRINTS`)."""
         return fingerprint == self.fingerprint or fingerprint in FORMER_FINGERPRINTS.get(self.fingerprint, ())
 
+    @again_if_interrupted
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
         return abs(self.box_rows.dot(state)) - 1.0
@@ -603,6 +619,7 @@ class LinearPlant(ReadOnlyArrays):
         rows = self.grid_rows
         return None if rows is None else between_samples.GridValues(rows, self.box_rows, self.A, self.B)
 
+    @again_if_interrupted
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
         """Returns the largest |c_j x| - 1 of a step after its beginning, shape (k,) or (k, N).
 
@@ -723,6 +740,7 @@ class LinearPlant(ReadOnlyArrays):
         """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
         return Ellipsoid(inflated(self.nominal_sensor_error.shape_matrix))
 
+    @own_error_state
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
@@ -769,12 +787,14 @@ class LinearPlant(ReadOnlyArrays):
             P0 = P0 + self.initial_bound.shape_matrix / (self.n + 2)
         return read_only(Q), read_only(R), read_only(P0)
 
+    @own_error_state
     def sample_sensor_noise(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
         """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
         return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
 
+    @own_error_state
     def sample_initial_error(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
@@ -839,7 +859,7 @@ def _warn_of_no_noise(is_given: tuple[bool, bool, bool]) -> None:
     if missing:
         assumed = ", and ".join(f"that {sentence} (give {names})" for sentence, names in missing.values())
         message = f"nothing is given for {' and '.join(missing)}: every certificate will assume {assumed}"
-        warnings.warn(f"{message}; a bound of 0 says so on purpose", NoNoiseWarning, stacklevel=_frames_inside())
+        warn_caller(f"{message}; a bound of 0 says so on purpose", NoNoiseWarning)
 
 
 def _describe(plant: LinearPlant) -> str:
@@ -884,6 +904,8 @@ def _as_json(value: Any) -> Any:
         return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
         return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
+    if isinstance(value, tuple):
+        return list(value)
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
@@ -898,16 +920,6 @@ def _from_json(value: Any) -> Any:
             f'a bound in the file of a plant must be a number, a list or {{"shape": ...}}, got {shown(value)}'
         )
     return Ellipsoid(value["shape"])
-
-
-def _frames_inside() -> int:
-    """Returns the stack level, seen from `_warn_of_no_noise`, of the code outside this package that made the plant."""
-    frame, level = sys._getframe(1), 1
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(
-        ("ncs_gym.plants.", "dataclasses")
-    ):
-        frame, level = frame.f_back, level + 1
-    return level
 
 
 def _sized(size: float, unit: str) -> str:

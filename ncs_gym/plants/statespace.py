@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from ncs_gym.validation import as_matrix, as_number, shown
+from ncs_gym.validation import as_matrix, as_number, as_numbers, shown
 
 # Durations of steps that differ by less than this are the same.
 SAME_STEP = 1e-9
@@ -82,10 +82,11 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
     A = as_matrix(A, (len(A), len(A)), "A of the model")
     B = as_matrix(matrices[1], (len(A), None), "B of the model")
     H = as_matrix(matrices[2], (None, len(A)), "C of the model")
-    if matrices[3] is not None and np.any(matrices[3]):
+    D = as_numbers(0.0 if matrices[3] is None else matrices[3])
+    if D is None or D.any():
         raise ValueError(
             "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is known, "
-            f"from what is measured and give D = 0, got {shown(np.asarray(matrices[3]).tolist())}"
+            f"from what is measured and give D = 0, got {shown(matrices[3] if D is None else D.tolist())}"
         )
     is_continuous = own is None or (own is not True and own == 0)
     if dt is None:

@@ -14,7 +14,7 @@ from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, shown
+from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, own_error_state, shown
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
 HELD_OUT = 0.25
@@ -43,6 +43,7 @@ class _Steps(NamedTuple):
     moved: np.ndarray
 
 
+@own_error_state
 def linear_model(
     process: Process | Callable[[np.ndarray, np.ndarray], np.ndarray],
     box: Any,

@@ -25,7 +25,7 @@ _REDUCTION, _ATTEMPTS = 0.99, 20
 _CONFIRMED_POINTS = 100
 
 # Scans of the last few plants by their dynamics, since one takes seconds: who changes bounds asks for them again.
-_known_scans: dict[tuple, tuple[OptimizationProblem, list[tuple[float, float, float]]]] = {}
+_known_scans: dict[tuple, tuple[tuple[float, float, float], ...]] = {}
 _MAX_KNOWN_SCANS = 4
 
 
@@ -57,12 +57,13 @@ class FeasibilityScan:
 
     def __init__(self, plant: LinearPlant) -> None:
         key = tuple((array.shape, array.tobytes()) for array in (plant.A, plant.B, plant.box_rows, plant.u_max))
-        if key not in _known_scans:
-            if len(_known_scans) == _MAX_KNOWN_SCANS:
-                del _known_scans[next(iter(_known_scans))]
-            problem = OptimizationProblem(plant)
-            _known_scans[key] = problem, _scanned(problem)
-        self._problem, self._points = _known_scans[key]
+        self._problem, points = OptimizationProblem(plant), _known_scans.get(key)
+        if points is None:
+            points = _scanned(self._problem)
+            for oldest in list(_known_scans)[: 1 - _MAX_KNOWN_SCANS]:
+                _known_scans.pop(oldest, None)
+            _known_scans[key] = points
+        self._points = points
 
     def best(self, plant: LinearPlant, model: PaperModel | None = None) -> Feasibility:
         """Returns the point of largest ratio for a plant with the scanned dynamics and bounds of its own.
@@ -117,7 +118,7 @@ class FeasibilityScan:
         return 0.0
 
 
-def _scanned(problem: OptimizationProblem) -> list[tuple[float, float, float]]:
+def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], ...]:
     """Returns the points (kappa, rho) at which (C1) has a solution, each with its largest lambda_min(L).
 
     A smaller rho only restricts L further ((C7) is the one constraint with rho in it, the error being left out), so the
@@ -139,7 +140,7 @@ def _scanned(problem: OptimizationProblem) -> list[tuple[float, float, float]]:
                 without += 1
             if without == _POINTS_WITHOUT_SOLUTION:
                 break
-    return sorted(points)
+    return tuple(sorted(points))
 
 
 def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -11,13 +9,14 @@ import numpy as np
 
 from ncs_gym.network import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH, inputs_under_way
-from ncs_gym.validation import shown
+from ncs_gym.validation import shown, warn_caller
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
 from shields.runtime.one_step import FARTHEST, PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 
 ALARM = "a measurement contradicts the assumed bounds"
+NOT_FINITE = "a sample held NaN or infinity: where a sensor has no reading, no packet may be sent"
 OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
@@ -35,7 +34,7 @@ NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies wha
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
-    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED,
+    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED, NOT_FINITE,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 ON_UNPROVED = ("ignore", "warn", "raise")
@@ -49,9 +48,9 @@ class MonitorState(NamedTuple):
         inside: Whether x in S is proved, up to what broke; in mode "lookahead" also if x is proved in the box and the
             inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
-        wait: Number of steps until x in S is proved at present, if `inside` stays true. Behind a downlink `inside` is
-            about the time at which the next input takes effect; where the box counts between samples, too, a step
-            whose way is not proved has to be followed by one whose way is. 0 otherwise.
+        wait: Number of steps until x in S is proved at present, if all that follows is (`steps_until_proved`). Behind a
+            downlink `inside` is about the time at which the next input takes effect. 0 where neither that nor ways
+            between samples count.
     """
 
     broken: Any
@@ -68,12 +67,14 @@ class LoopObservation(NamedTuple):
         errors: What is known of the error shapes, in the same order.
         alarm: Whether the innovation monitor raised an alarm.
         age: Steps since the newest sample used was taken, which is asked for only to explain a large error.
+        damaged: Whether that alarm is about a sample that was no finite numbers.
     """
 
     estimate: np.ndarray
     errors: PredictedErrors
     alarm: Any
     age: Any = 0
+    damaged: Any = False
 
 
 class GuaranteeMonitor:
@@ -116,27 +117,33 @@ class GuaranteeMonitor:
         self._under_way = inputs_under_way(plant) if self._is_local else 0
         self._limits = np.tile(plant.u_max, self._under_way // plant.m)
 
-    def start(self, known_inside: Any, unmoved: Any, report: LoopObservation) -> MonitorState:
-        """Returns the state at the start of an episode.
+    def start(self, known_inside: Any, unmoved: Any, report: LoopObservation, *, is_first: bool = True) -> MonitorState:
+        """Returns the state at the start of an episode, or where the state of one is found.
 
         Args:
             known_inside: Whether every possible start lies in S, or in the box with a certified plan stored.
             unmoved: Whether the environment has not moved since.
             report: What is observed.
+            is_first: Whether no step of the episode led here.
         """
         broken = _first(unmoved * 0, _not(unmoved), OTHER_STEPS)
-        return self._observe(self._within_limits(broken, report), known_inside, report, 0)
+        state = self._observe(self._within_limits(broken, report), known_inside, report, 0)
+        return state if is_first else state._replace(wait=steps_until_proved(state.wait, not self._on_grid, 0))
 
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
 
-        That is of x_0 .. x_{c-1} whether it is known to be in S (`known_inside`), and what is observed of it.
+        That is of x_0 .. x_{c-1} whether it is known to be in S, and the way from it in the box (`known_inside`), and
+        what is observed of it.
         """
         broken, wait = state.broken, state.wait
         for ahead, (inside, report) in enumerate(earlier):
             seen = self._observe(self._within_limits(broken, report), inside, report, 0)
-            proved = inside & seen.inside if self._on_grid else seen.inside
-            broken, wait = seen.broken, np.maximum(wait, _not(proved) * (ahead + 1))
+            broken = seen.broken
+            if self._on_grid:  # what is not proved of x_j is not of the way to x_{j+1}
+                wait = steps_until_proved(wait, inside & seen.inside, ahead + 1)
+            else:
+                wait = steps_until_proved(wait, seen.inside, ahead)
         return state._replace(broken=broken, wait=wait)
 
     def advance(
@@ -200,11 +207,11 @@ class GuaranteeMonitor:
         self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True
     ) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves: not what was on the way."""
-        estimate, errors, alarm, _ = report
+        estimate, errors, alarm, _, damaged = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
-        broken = _first(broken, alarm, ALARM)
+        broken = _first(_first(broken, damaged, NOT_FINITE), alarm, ALARM)
         if not _all(within):
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
@@ -214,9 +221,17 @@ class GuaranteeMonitor:
             if self._is_local:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
         if self._input_delay or self._on_grid:
-            proved = inside & on_the_way if self._on_grid else inside
-            wait = (proved & (wait > 1)) * (wait - 1) + _not(proved) * (self._input_delay + 1)
+            wait = steps_until_proved(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
         return MonitorState(broken, inside, errors.certified, wait)
+
+
+def steps_until_proved(wait: Any, proved: Any, ahead: int) -> Any:
+    """Returns after how many steps x is proved at present: at least `wait`, of single loops or arrays of many.
+
+    At step k that takes x_k .. x_{k+c} and the ways that lead to them (docs/shield_proof.md, "Who proves what"). Where
+    x_{k+ahead} or the way to it is not `proved`, nothing is until that is over, ahead + 1 steps from now.
+    """
+    return np.maximum(wait, _not(proved) * (ahead + 1))
 
 
 class LostGuarantee:
@@ -268,7 +283,7 @@ class LostGuarantee:
             text = f"the state is not proved safe now: {EXPLANATIONS[code]}"
             if self.on_unproved == "raise":
                 raise GuaranteeLostError(text)
-            warnings.warn(text, GuaranteeLostWarning, stacklevel=_levels_to_the_caller())
+            warn_caller(text, GuaranteeLostWarning)
 
     def tell_of(self, reason: str) -> None:
         """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
@@ -295,11 +310,3 @@ def _first(broken: Any, condition: Any, explanation: str) -> Any:
     if condition is False or not np.count_nonzero(condition):  # the usual case
         return broken
     return broken + (broken == 0) * condition * CODES[explanation]
-
-
-def _levels_to_the_caller() -> int:
-    """Returns the stack level, as `warnings.warn` in `tell` counts it, of the first caller outside this package."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shields."):
-        level, frame = level + 1, frame.f_back
-    return level

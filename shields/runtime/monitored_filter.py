@@ -57,6 +57,7 @@ class MonitoredFilter:
         report: LoopObservation,
         known: Sequence[StartKnown],
         unmoved: bool = True,
+        is_first: bool = True,
         earlier: Sequence[tuple[np.ndarray, np.ndarray]] = (),
         pending: tuple[np.ndarray, ...] = (),
     ) -> None:
@@ -66,12 +67,13 @@ class MonitoredFilter:
             report: What is observed.
             known: What is known of x_0 .. x_c (`starts_known`).
             unmoved: Whether the plant has not moved since.
+            is_first: Whether no step of the episode led here.
             earlier: Estimates and error shapes of x_0 .. x_{c-1}, before the first decision takes effect.
             pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self.report = report
         self._stored, is_safe = first_store(self.filter, report.estimate, report.errors, known[-1])
-        self._state = self._monitor.start(is_safe, unmoved, report)
+        self._state = self._monitor.start(is_safe, unmoved, report, is_first=is_first)
         if self._schedule is not None:
             self._schedule.start()
             self._schedule.pending = pending or self._schedule.pending
@@ -115,9 +117,11 @@ class MonitoredFilter:
         self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report, on_time)
         self.report = report
 
-    def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool, age: int = 0) -> LoopObservation:
+    def reported(
+        self, estimate: np.ndarray, error_shape: Any, alarm: bool, age: int = 0, damaged: bool = False
+    ) -> LoopObservation:
         """Returns the report of an estimate, shape (n,), that nobody writes into, and of an error shape, (n, n)."""
-        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm, age)
+        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm, age, damaged)
 
     @property
     def plan_length(self) -> int:

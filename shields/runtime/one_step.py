@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 
 from ncs_gym import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
-from ncs_gym.validation import read_only
+from ncs_gym.validation import frozen, own_error_state, read_only
 from shields.certificate import Certificate, CertificateError
 from shields.runtime.projection import closest_admissible, closest_on_line
 from shields.verification import ACTION_ROUNDING
@@ -77,7 +77,7 @@ class OneStepTest:
         D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
         self.D = read_only(0.5 * (D + D.T))
 
-    @np.errstate(all="ignore")  # what overflows is found below, what underflows does not count
+    @own_error_state  # what overflows is found below, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
         """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
 
@@ -133,7 +133,7 @@ class OneStepTest:
             return None
         return ReachableSet(self, self.moved.dot(estimate), errors.weighting, radius)
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
 
@@ -260,6 +260,10 @@ class PredictedErrors(NamedTuple):
     def single(self, number: int = 0) -> Self:
         """Returns one of them without a last axis."""
         return self._make(array.item(number) if array.ndim == 1 else array[..., number].copy() for array in self)
+
+    def read_only(self) -> Self:
+        """Returns the same, read-only."""
+        return self._make(frozen(each) if isinstance(each, np.ndarray) else each for each in self)
 
     def batch(self) -> Self:
         """Returns a single one as a batch of one."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import read_only
+from ncs_gym.validation import own_error_state, read_only
 from shields.polytope import Polytope
 from shields.runtime.one_step import (
     FARTHEST,
@@ -59,7 +59,7 @@ class PolytopeTest:
         limits: Entries of u_max.
     """
 
-    @np.errstate(all="ignore")  # what is not finite passes no test
+    @own_error_state  # what is not finite passes no test
     def __init__(self, polytope: Polytope | None, plant: LinearPlant) -> None:
         self.plant = plant
         self.limits = plant.u_max.tolist()
@@ -80,7 +80,7 @@ class PolytopeTest:
         disturbed = supports(self.root, D, self.rounding * extent**2)
         self.disturbed = read_only(np.concatenate([disturbed, grid.disturbed]))
 
-    @np.errstate(all="ignore")  # what overflows passes no test, what underflows does not count
+    @own_error_state  # what overflows passes no test, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
         """Returns what the test and the guarantee need of error shapes; see `OneStepTest.predicted`."""
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
@@ -114,13 +114,13 @@ class PolytopeTest:
             return None
         return PolytopeSet(self, estimate, self.moved.dot(estimate), errors.row_limits - rounding)
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |g x_hat| + sqrt(g Sigma_k g') <= 1 - margin for all rows, which proves that x is in P."""
         level = (np.abs(self.root.dot(estimates)) + errors.own).max(axis=0)
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def keeps_between(
         self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
     ) -> bool:
@@ -326,7 +326,7 @@ class GridTest(NamedTuple):
         return states @ self.moved.T + inputs @ self.effect.T
 
 
-@np.errstate(all="ignore")  # what is not finite passes no test
+@own_error_state  # what is not finite passes no test
 def grid_test(plant: LinearPlant) -> GridTest:
     """Returns the test of a plant's grid."""
     rows, grid = plant.box_rows, plant.grid_rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from enum import Enum, auto
@@ -19,7 +18,7 @@ from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
 from ncs_gym.network.downlink import as_echo
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.network.requests import Requests, require_on_request
-from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, setting, shown
+from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, own_error_state, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
@@ -65,7 +64,8 @@ def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Conc
         parts = parts if loop._requests is None else (*parts, loop._requests)
         before = [(part, part.saved()) for part in parts]
         try:
-            return method(loop, *args, **kwargs)
+            with np.errstate(all="ignore"):
+                return method(loop, *args, **kwargs)
         except (GuaranteeLostError, GuaranteeLostWarning, UnusedPacketsWarning):  # warnings where they are errors
             raise
         except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
@@ -145,6 +145,7 @@ class SafeLoop:
     echo_age: int | None = setting("echo_age")
     channel: Channel = setting("channel", "_estimator.channel")
 
+    @own_error_state
     def __init__(
         self,
         certificate: Certificate,
@@ -179,7 +180,7 @@ class SafeLoop:
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
         self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
-        self._discarded, self._told_of_late, self._told_of_other_episode = DiscardedPackets(), False, False
+        self._discarded, self._told_of = DiscardedPackets(), frozenset[str]()
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
@@ -295,28 +296,12 @@ class SafeLoop:
         self._applied.compare(heard, self.steps, self.episode)
         if self._unknown is not None:
             self._find(arrived)
-        oldest = self._estimator.channel.longest_delay
-        before = self._discarded
+        before, oldest = self._discarded, self._estimator.channel.longest_delay
         self._discarded = before.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
         estimate = self.estimate
-        if self._discarded.too_late and not self._told_of_late:
-            self._told_of_late = True
-            warnings.warn(
-                f"a packet was discarded: it came later than the {oldest} steps that the channel of this loop delays "
-                "any; give SafeLoop the channel with its longest delay (`discarded` counts such packets)",
-                UnusedPacketsWarning,
-                stacklevel=3,
-            )
-        from_elsewhere = self._discarded.other_episode > before.other_episode
-        if from_elsewhere and self.steps > oldest and not self._told_of_other_episode:  # none of these is a straggler
-            self._told_of_other_episode = True
-            warnings.warn(
-                f"a packet was discarded: its episode is not that of the loop, {self.episode}; send "
-                "Packet(stamp, measurement, loop.episode) (`discarded` counts such packets)",
-                UnusedPacketsWarning,
-                stacklevel=3,
-            )
+        if self._discarded != before:
+            self._tell_of_discarded(before)
         self._lost.tell_of(self.reason)
         return estimate
 
@@ -444,6 +429,26 @@ class SafeLoop:
         """How many packets were discarded in this episode: too late, stamped ahead, or of another episode."""
         return self._discarded
 
+    def _tell_of_discarded(self, before: DiscardedPackets) -> None:
+        """Warns once of every reason for which packets were discarded in this call."""
+        oldest = self._estimator.channel.longest_delay
+        texts = {
+            "too_late": f"it came later than the {oldest} steps that the channel of this loop delays any; give "
+            "SafeLoop the channel with its longest delay",
+            "ahead": f"its stamp is ahead of the loop, which is at step {self.steps}; stamp samples with the number of "
+            "their control step, counted from 0 at start (loop.steps), by one clock for both",
+            "other_episode": f"its episode is not that of the loop, {self.episode}; send "
+            "Packet(stamp, measurement, loop.episode)",
+        }
+        is_new = {name for name in texts if getattr(self._discarded, name) > getattr(before, name)}
+        if self.steps <= oldest:  # they may be stragglers
+            is_new.discard("other_episode")
+        is_new, self._told_of = is_new - self._told_of, self._told_of | is_new
+        for name in sorted(is_new):
+            warn_caller(
+                f"a packet was discarded: {texts[name]} (`discarded` counts such packets)", UnusedPacketsWarning
+            )
+
     def _require_started(self) -> _Phase:
         if self._phase is _Phase.STOPPED:
             raise RuntimeError(NOT_STARTED)
@@ -453,7 +458,7 @@ class SafeLoop:
         """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
         pending = self._inputs.pending
         earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._input_delay)]
-        self._monitored.begin(self._report(), known, earlier=earlier, pending=pending)
+        self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
 
     def _find(self, packets: Iterable[Packet]) -> None:
         """Takes in samples of a state that is not known, and begins anew where they prove where it is."""
@@ -475,8 +480,10 @@ class SafeLoop:
             self._begin(starts_known(self._filter, None, self._input_delay))
 
     def _report(self) -> LoopObservation:
-        return self._monitored.reported(*self._predicted(), self._estimator.alarm, self._estimator.age)
+        estimator = self._estimator
+        return self._monitored.reported(*self._predicted(), estimator.alarm, estimator.age, estimator.damaged)
 
+    @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
         return self._estimator.predicted(self._inputs.pending[: self._input_delay])

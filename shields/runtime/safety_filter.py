@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
-from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, own_error_state, read_only, shown, warn_caller
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step import (
@@ -170,7 +169,7 @@ class SafetyFilter(ReadOnlyArrays):
             return None
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
-    @np.errstate(all="ignore")  # what is not finite passes no test
+    @own_error_state  # what is not finite passes no test
     def decide_columns(
         self, estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: np.ndarray | None = None
     ) -> Decision:
@@ -201,6 +200,7 @@ class SafetyFilter(ReadOnlyArrays):
             self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
+    @own_error_state
     def decide_many(
         self, estimates: Any, error_shapes: Any, proposals: Any, stored: np.ndarray | None = None
     ) -> Decision:
@@ -248,13 +248,14 @@ class SafetyFilter(ReadOnlyArrays):
         for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self._single, strict=True):
             if (array := _as_array(value)).shape != (size,):
                 got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"
-                warnings.warn(
+                warn_caller(
                     f"decide takes one {name}, numbers of shape ({size},), got {got}: it falls back to K x_hat "
                     "(decide_many takes batches, shields.torch.SafeLayer tensors)",
-                    stacklevel=3,
+                    UserWarning,
                 )
                 return
 
+    @own_error_state
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
         if self.lookahead is None:
@@ -263,36 +264,41 @@ class SafetyFilter(ReadOnlyArrays):
         return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
-        """Returns what is known of one error shape, (n, n), without a last axis; remembered, since shapes recur."""
+        """Returns what is known of one error shape, (n, n), without a last axis, read-only.
+
+        It is remembered, since shapes recur: all loops of this filter share it, in whatever threads they run.
+        """
         shape = _as_array(error_shape)
         key = shape.tobytes() if shape.shape == (self.plant.n, self.plant.n) else b""
         known = self._remembered.get(key)
         if known is None:
             # Of what the key says: somebody may write into the shape.
             usable = np.frombuffer(key) if key else np.full(self.plant.n**2, np.nan)
-            known = self.errors_of_many(usable.reshape(1, self.plant.n, self.plant.n)).single()
+            known = self.errors_of_many(usable.reshape(1, self.plant.n, self.plant.n)).single().read_only()
             if len(self._remembered) >= MOST_REMEMBERED:
                 self._remembered.clear()
             self._remembered[key] = known
         return known
 
+    @own_error_state
     def errors_of_many(self, error_shapes: np.ndarray) -> PredictedErrors:
         """Returns what is known of error shapes, (k, n, n); only mode "lookahead" needs the shapes themselves."""
         known = self.test.predicted(error_shapes, self.certificate.error_shapes)
         return known if self.lookahead is not None else known._replace(shape=known.shape[:0])
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:
         """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""
         x_hat, u = _as_column(_as_array(estimate), self.plant.n), _as_column(_as_array(u), self.plant.m)
         return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).margins(u)[1].item()
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether estimate and error shape prove that x is in the certificate's safe set."""
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
 
+    @own_error_state
     def fallback_input(self, estimate: np.ndarray) -> np.ndarray:
         """Returns K x_hat, shape (m,), clipped to the limits and rounded to what a float32 action can express.
 
@@ -333,7 +339,7 @@ class SafetyFilter(ReadOnlyArrays):
             reason = np.where(unsafe, UNSAFE, FALLBACK)
             decided.reason[some] = np.where(valid & ~np.isnan(sets.radius), reason, INVALID)
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def _gained(self, estimates: np.ndarray) -> np.ndarray:
         """Returns K x_hat as actions can express it, shape (m, N); NaN where it cannot be computed."""
         gained = self.certificate.K @ estimates

@@ -13,6 +13,7 @@ import numpy as np
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.one_step import PredictedErrors
 from shields.runtime.polytope_step import grid_test
@@ -79,7 +80,7 @@ def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
     return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))
 
 
-@np.errstate(all="ignore")  # what is not finite is no verdict
+@own_error_state  # what is not finite is no verdict
 def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
     """Returns whether |g x| <= 1 for all rows g, shape (r, n), and one state; None where rounding could decide it."""
     products, sizes = np.abs(bounds @ state), np.abs(bounds) @ np.abs(state)

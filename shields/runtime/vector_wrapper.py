@@ -14,6 +14,7 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
+from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
@@ -65,6 +66,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
 
     _wanted, _wrappers, _refused = NCSVectorEnv, VectorWrapper, (VectorActionWrapper,)
 
+    @own_error_state
     def __init__(
         self,
         env: VectorEnv,
@@ -94,6 +96,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         self._interrupted = Clock(np.full(count, -1), np.full(count, -1), -2)
         self._clock: Clock | None = None
 
+    @own_error_state
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -134,6 +137,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         self._lost.tell()
         return observation, info
 
+    @own_error_state
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies the actions, or what the shield puts in the place of some.
 
@@ -191,7 +195,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
 
     def _observed(self, known: Known) -> LoopObservation:
         errors = self._errors_of(self._inner.error_shapes[1])
-        return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age)
+        return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age, known.damaged)
 
     def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns what is known of the error shapes with these numbers in the environment's table."""
@@ -254,7 +258,8 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         done = np.flatnonzero(is_done)
         errors = self._filter.errors_of_many(known.error_shape[done])
         known = known._replace(applied=known.applied[:, done], committed=known.committed[:, done])
-        report = LoopObservation(known.estimate[:, done], errors, known.alarm[done], known.age[done])
+        alarms = known.alarm[done], known.age[done], known.damaged[done]
+        report = LoopObservation(known.estimate[:, done], errors, *alarms)
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
         same_input, on_time = _as_decided(known, decided.input, None if due is None else due[:, done])

@@ -17,7 +17,7 @@ from ncs_gym import Annotation, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import as_number, setting, shown
+from ncs_gym.validation import as_number, own_error_state, setting, shown
 from shields.certificate import Certificate
 from shields.certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
@@ -115,9 +115,9 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
                 raise ValueError(f"{why}: wrap the environment in a shield of its own")
 
     def _look_at(self, channels: set[Channel]) -> None:
-        """Warns the caller's caller of channels of the present episodes that are new and break the contract."""
+        """Warns the caller of channels of the present episodes that are new and break the contract."""
         for channel in channels - self._channels:
-            warn_of_broken_contract(self._certificate.contract, channel, self._input_delay, stacklevel=4)
+            warn_of_broken_contract(self._certificate.contract, channel, self._input_delay)
         self._channels = channels
 
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
@@ -186,6 +186,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
 
     _wanted, _wrappers, _refused = NCSEnv, gym.Wrapper, REFUSED
 
+    @own_error_state
     def __init__(
         self,
         env: gym.Env,
@@ -203,6 +204,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
 
+    @own_error_state
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`.
 
@@ -225,7 +227,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         report = self._observed(known)
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._input_delay)
-        self._monitored.begin(report, self._known, clock[1] == 0, self._inner.estimates_ahead()[:-1])
+        self._monitored.begin(report, self._known, clock[1] == 0, earlier=self._inner.estimates_ahead()[:-1])
         self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, known.error_shape, u)
@@ -235,6 +237,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         self._lost.tell_of(info["shield_reason"])
         return observation, info
 
+    @own_error_state
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Applies the action, or what the shield puts in its place.
 
@@ -264,7 +267,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age)
+        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age, known.damaged)
 
     def _read_clock(self) -> tuple[int, int]:
         return self._inner.episodes, self._inner.steps

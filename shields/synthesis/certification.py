@@ -13,7 +13,7 @@ import numpy as np
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
-from ncs_gym.validation import as_flag, shown
+from ncs_gym.validation import as_flag, own_error_state, shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
@@ -65,6 +65,7 @@ _OF_THE_PLANT = ("tolerated_scale",)
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
 
+@own_error_state
 def synthesize(
     plant: LinearPlant,
     method: str = "certified",
@@ -229,6 +230,7 @@ def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: P
     return replace(certificate, provenance=certificate.provenance | size)
 
 
+@own_error_state
 def certify(
     plant: LinearPlant, L: np.ndarray, K: np.ndarray, contract: ChannelContract | None = None
 ) -> Certificate | None:

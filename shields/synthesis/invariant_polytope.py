@@ -106,7 +106,7 @@ def invariant_rows(
         if len(rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
             rows, following = _without_implied(rows, kept, following)
             if len(rows) > _LEAST_PRUNED * MOST_ROWS:
-                raise _none(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
+                raise _too_many()
         if time.thread_time() > deadline:
             raise _none(f"its search took longer than {LONGEST_SEARCH:g} s, less with fewer states or longer steps")
         if following % 50 == 0:
@@ -116,7 +116,10 @@ def invariant_rows(
             rows = np.concatenate([rows, row[None]])
         following += 1
     progress(f"polytope: which of {len(rows)} rows count")
-    return _without_implied(rows, kept)[0]
+    rows = _without_implied(rows, kept)[0]
+    if len(rows) > MOST_ROWS:
+        raise _too_many()
+    return rows
 
 
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
@@ -254,6 +257,10 @@ class _ClosedLoop:
 
 def _none(reason: str) -> Infeasible:
     return Infeasible(reason, "P", 0.0)
+
+
+def _too_many() -> Infeasible:
+    return _none(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
 
 
 def _largest(rows: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray]:

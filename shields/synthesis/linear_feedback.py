@@ -9,11 +9,13 @@ import cvxpy as cp
 import numpy as np
 
 from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym.validation import own_error_state
 from shields.errors import Infeasible
 
 HORIZON = 15
 
 
+@own_error_state
 def linear_feedback_tolerance(plant: LinearPlant, contract: ChannelContract | None, horizon: int = HORIZON) -> float:
     """Returns the factor on all radii that the best linear output feedback bears, up to a solver's precision.
 

@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, contract_of
 from ncs_gym.network.contract import MAX_AGE
-from ncs_gym.validation import as_count, as_number
+from ncs_gym.validation import as_count, as_number, own_error_state
 from shields.certificate import Certificate
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.design_problem import design_problem
@@ -360,6 +360,7 @@ def _contract(age: float, quantization_step: float) -> ChannelContract | None:
 Executor = Callable[[Sequence[Search]], Iterable[Mapping[float, Answer]]]
 
 
+@own_error_state
 def requirements(
     plant: LinearPlant | Callable[[float], LinearPlant],
     *,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import shown
+from ncs_gym.validation import own_error_state, shown
 from shields.certificate import Certificate
 from shields.errors import CertificateError
 from shields.paper.conditions import paper_conditions
@@ -54,6 +54,7 @@ def _line(alike: list[Condition]) -> str:
     return f"{'holds ' if least.holds else 'BROKEN'}  {least.margin:+.3e}  {least.name}{count}"
 
 
+@own_error_state
 def verify(
     certificate: Certificate, plant: LinearPlant, *, engine: Literal["rational", "flint"] = "rational"
 ) -> Report:
@@ -91,6 +92,7 @@ def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
 _valid: set[tuple[str, str]] = set()
 
 
+@own_error_state
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
     """Raises unless a certificate verifies for a plant; what has verified in this process is not verified again.
 

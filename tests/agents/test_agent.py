@@ -1,6 +1,5 @@
 import json
 import pickle
-import re
 import zipfile
 from dataclasses import replace
 
@@ -68,19 +67,6 @@ def test_single_observation_gives_the_action_of_a_batch_of_one(agent, gain):
     assert action.shape == (1,)
     np.testing.assert_array_equal(action, one.act(OBSERVATIONS[7:8])[0])
     np.testing.assert_array_equal(action, one.act(OBSERVATIONS[7].tolist()))
-
-
-@pytest.mark.parametrize("shape", [(4, 5), (5,), (2, 4, 3), (3, 1), ()])
-def test_observations_of_another_environment_are_refused(agent, shape):
-    words = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \(N, 3\), got "
-    with pytest.raises(ValueError, match=f"{words}{re.escape(str(shape))}$"):
-        agent.act(np.zeros(shape))
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_observations_that_are_not_finite_are_refused(agent, value):
-    with pytest.raises(ValueError, match="observations must be finite numbers"):
-        agent.act([value, 0.0, 0.0])
 
 
 def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, tmp_path):

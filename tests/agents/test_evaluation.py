@@ -3,8 +3,9 @@ import copy
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import VectorWrapper
 
-from agents.evaluation import _SEED_STREAM, evaluate
+from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from shields.synthesis.certification import with_polytope
 from tests.certificates import certificate_of
@@ -33,12 +34,19 @@ def scalar(monkeypatch):
     return LoopConfig(env="Scalar-v0")
 
 
-def test_it_counts_what_a_plain_loop_counts(certificate):
-    word = int(np.random.SeedSequence([100, 0, _SEED_STREAM]).generate_state(1)[0] >> 1)
+def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
+    make_vec, seeds = gym.make_vec, []
+
+    class Noting(VectorWrapper):
+        def reset(self, *, seed=None, options=None):
+            seeds.append(seed)
+            return self.env.reset(seed=seed, options=options)
+
+    monkeypatch.setattr(gym, "make_vec", lambda *given, **settings: Noting(make_vec(*given, **settings)))
     played = evaluate(CRUISE, throttle, 8, 100, level_matrix=certificate.M)
-    envs = gym.make_vec(CRUISE.env, num_envs=8)
+    envs = make_vec(CRUISE.env, num_envs=8)
     plant = envs.unwrapped.plant
-    _, info = envs.reset(seed=word)
+    _, info = envs.reset(seed=seeds[0])
     states, estimates, total = [info["state"]], [info["estimate"]], np.zeros(8)
     for _ in range(200):
         _, rewards, _, _, info = envs.step(np.ones((8, 1), np.float32))
@@ -119,13 +127,11 @@ def test_episode_that_ends_early_changes_nothing_for_the_others():
     assert all(r.steps == 200 and r.guaranteed for r in evaluate(loop, push_the_first, 4, 0).episodes)
 
 
-def test_many_episodes_are_played_in_parts(monkeypatch):
-    monkeypatch.setattr("agents.evaluation._MAX_PARALLEL_EPISODES", 3)
-    played = evaluate(CRUISE, zero, 8, 0)
-    assert [record.index for record in played.episodes] == list(range(8))
-    assert len({record.episode_return for record in played.episodes}) == 8
-    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
-        evaluate(CRUISE, zero, 0, 0)
+def test_more_episodes_than_are_played_side_by_side_are_played_in_parts():
+    short = LoopConfig(env=CRUISE.env, kwargs={"max_episode_steps": 2})
+    played = evaluate(short, zero, 1003, 0)
+    assert [record.index for record in played.episodes] == list(range(1003))
+    assert len({record.episode_return for record in played.episodes}) == 1003
 
 
 def test_progress_is_reported_in_steps():

@@ -102,5 +102,3 @@ def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
     np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
     proposed = train(loop, 400, 0, algorithm, REPLAY).agent.model.replay_buffer
     assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
-    with pytest.raises(ValueError, match="stored_action must be"):
-        train(loop, 400, 0, algorithm, REPLAY | {"stored_action": "both"})

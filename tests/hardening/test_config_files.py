@@ -71,17 +71,14 @@ def assert_refused_or_meant(values, folder):
         }
 
 
-@given(values=SETTINGS | NESTED)
-@examples(60)
-def test_values_are_refused_or_meant(tmp_path_factory, values):
-    assert_refused_or_meant(values, tmp_path_factory.getbasetemp())
+@pytest.mark.parametrize("count", [20, pytest.param(3000, marks=pytest.mark.slow)])
+def test_values_are_refused_or_meant(count, tmp_path):
+    @given(values=SETTINGS | NESTED)
+    @examples(count, same=count < 100)
+    def check(values):
+        assert_refused_or_meant(values, tmp_path)
 
-
-@pytest.mark.slow
-@given(values=SETTINGS | NESTED)
-@examples(3000, same=False)
-def test_many_values_are_refused_or_meant(tmp_path_factory, values):
-    assert_refused_or_meant(values, tmp_path_factory.getbasetemp())
+    check()
 
 
 @pytest.mark.parametrize("values", [{"steps": "7"}, {"seed": 7.0}, {"smoke": 1}, {"env": 5}, {"arms": "shielded"}])
@@ -91,7 +88,7 @@ def test_values_of_another_kind_are_named(values, tmp_path):
 
 
 @given(whole=JSON)
-@examples(40)
+@examples(15)
 def test_documents_of_any_structure_are_refused(tmp_path_factory, whole):
     folder = tmp_path_factory.getbasetemp()
     for content in (whole, {"format": FORMAT, "command": whole, "settings": {}}, {"format": FORMAT, "settings": whole}):
@@ -102,12 +99,12 @@ def test_documents_of_any_structure_are_refused(tmp_path_factory, whole):
 def test_damaged_files_are_refused_or_meant(command, tmp_path):
     data = document(settings_json(command, GOOD[command])["settings"], command)
     assert outcome(data, tmp_path, command) == GOOD[command]
-    for at in range(0, len(data), 41):
+    for at in range(0, len(data), 97):
         assert outcome(data[:at], tmp_path, command) is None
         assert outcome(data[:at] + bytes([data[at] ^ 0x80]) + data[at + 1 :], tmp_path, command) is None
 
 
 @given(data=st.binary(max_size=200))
-@examples(40)
+@examples(20)
 def test_bytes_are_refused(tmp_path_factory, data):
     assert outcome(data, tmp_path_factory.getbasetemp()) is None

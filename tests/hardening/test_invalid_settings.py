@@ -141,8 +141,13 @@ SETTINGS = [
 ]
 
 
+# Where a message names another setting: the shape of an ellipsoid, what does not fit a matrix, a field of a task.
+NAMED = {"shape_matrix": "shape", "A": "B must have shape", "H": "noise_cov must have shape", "task": ""}
+NAMED |= {"disturbance": "squared length"}
+
+
 def assert_refused(call, what="it"):
-    """One sentence of a ValueError that is ours: numpy's and scipy's say nothing about settings."""
+    """Returns one sentence of a ValueError that is ours: numpy's and scipy's say nothing about settings."""
     try:
         call()
     except ValueError as error:
@@ -156,12 +161,15 @@ def assert_refused(call, what="it"):
     assert "\n" not in text, what
     assert not re.search(r"[.!?] [A-Z]", text), (what, text)
     assert len(text) < 600, (what, text)
+    return text
 
 
 @pytest.mark.parametrize(("make", "name", "wrong"), SETTINGS)
 def test_wrong_values_of_a_setting_are_refused_in_one_sentence(make, name, wrong):
     for number, value in enumerate(wrong):
-        assert_refused(lambda value=value: make(**{name: value}), f"value {number}, of type {type(value).__name__}")
+        what = f"value {number}, of type {type(value).__name__}"
+        text = assert_refused(lambda value=value: make(**{name: value}), what)
+        assert name in text or NAMED.get(name, name) in text, (what, text)
 
 
 @given(data=st.data())

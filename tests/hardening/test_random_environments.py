@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, ChannelContract, ErrorSetError, NCSVectorEnv, cart_pole
+from ncs_gym import Channel, ChannelContract, ErrorSetError, LinearPlant, NCSVectorEnv
 from ncs_gym.envs.env import NCSEnv
 from tests.fuzz import environment_settings, examples, plants
 
@@ -76,13 +76,13 @@ def run_vector(settings, seed, steps, mode):
 
 
 @given(settings=environment_settings(), seed=st.integers(0, 1000))
-@examples(60)
+@examples(25)
 def test_random_environments_run(settings, seed):
     run_scalar(settings, seed, 25)
 
 
 @given(settings=environment_settings(), seed=st.integers(0, 1000), mode=st.sampled_from(["NextStep", "SameStep"]))
-@examples(40)
+@examples(15)
 def test_random_vector_environments_run(settings, seed, mode):
     run_vector(settings, seed, 16, mode)
 
@@ -113,8 +113,8 @@ def test_unstable_plants_are_refused_or_stay_finite_when_their_contract_is_broke
     env, many = made(NCSEnv, **settings), made(NCSVectorEnv, 2, **settings)
     assert (env is None) == (many is None)
     if env is not None:
-        run_away(env, seed, 600)
-        run_away(many, seed, 600)
+        run_away(env, seed, 200)
+        run_away(many, seed, 200)
 
 
 def run_away(env, seed, steps):
@@ -130,9 +130,12 @@ def run_away(env, seed, steps):
 
 @pytest.mark.parametrize("many", [False, True])
 def test_an_unstable_plant_left_alone_stays_finite_for_ever(many):
-    settings = {"plant": cart_pole(), "channel": Channel(1.0), "contract": ChannelContract(1)}
+    # What doubles at every step is larger than the largest float after 1,100 of them.
+    plant = LinearPlant(A=[[2.0]], B=[[1.0]], box=[1.0], u_max=3.0, dt=0.1, gamma=1e-6, sensor_bound=1e-3,
+                        initial_bound=1e-3)  # fmt: skip
+    settings = {"plant": plant, "channel": Channel(1.0), "contract": ChannelContract(1)}
     env = NCSVectorEnv(2, **settings) if many else NCSEnv(**settings)
-    run_away(env, 0, 9000)
+    run_away(env, 0, 1200)
 
 
 def test_registered_environments_need_a_plant_in_one_sentence():

@@ -5,13 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, Estimator, NCSEnv, NCSVectorEnv, Packet
+from ncs_gym import Channel, Estimator, NCSEnv, NCSVectorEnv, Packet, certified_error_set
 from ncs_gym.estimation import arrival_histories
-from ncs_gym.estimation.arrival_histories import ArrivalHistories
+from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
 from ncs_gym.estimation.estimator import Estimate
+from ncs_gym.estimation.vector_estimator import VectorEstimator
+from tests.shields.attacks.adversary import Traffic
 
 EPISODE = 300
-# Environments of the vector whose last episodes are computed again.
+# Columns of a vector whose last episodes are computed again; the first one is also that of a single estimator.
 WATCHED = range(0, 16, 3)
 CHANNEL = Channel(0.3, 0.05, 2, 1, 1)
 # What a process may gain after it has warmed up [MB].
@@ -24,163 +26,103 @@ def resident():
     return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024.0
 
 
-class Diary:
-    """What the estimators of some environments of a vector were told since their episodes began."""
-
-    def __init__(self, env, info):
-        self.env = env
-        self.told = {e: [] for e in WATCHED}
-        self.first = {e: info["estimate"][e].copy() for e in WATCHED}
-        self.episodes = env.episodes.copy()
-        self.in_flight = {e: {} for e in WATCHED}
-
-    def write(self, info):
-        """Reads the channel of each watched environment after a step."""
-        env = self.env
-        delays, samples = env._channel_state._delays[0], env._estimator._samples[0]
-        for e in WATCHED:
-            if env.episodes[e] != self.episodes[e]:
-                self.told[e], self.first[e], self.in_flight[e] = [], info["estimate"][e].copy(), {}
-                continue
-            step, delay = int(env.steps[e]), int(delays[e])
-            if step % env.channel.send_period == 0 and delay >= 0:
-                sample = Packet(step, samples[:, e].copy())
-                self.in_flight[e].setdefault(step + delay, []).append(sample)
-            self.told[e].append((info["input"][e].copy(), self.in_flight[e].pop(step, [])))
-        self.episodes = env.episodes.copy()
-
-    def compare(self, info):
-        """Computes the present episodes again; returns how many packets came in them."""
-        estimator, packets = self.env._estimator, 0
-        for e in WATCHED:
-            fresh = Estimator(self.env.plant, self.env.channel, self.env.error_set)
-            fresh.reset(self.first[e])
-            for u, arrived in self.told[e]:
-                fresh.advance(u, sorted(arrived, key=lambda packet: packet.stamp))
-                packets += len(arrived)
-            statistics = estimator.histories.table.statistics(estimator.statistics[e])
-            np.testing.assert_array_equal(info["error_shape"][e], fresh.estimate.shape)
-            np.testing.assert_array_equal(statistics.covariance, fresh.estimate.covariance)
-            np.testing.assert_allclose(info["estimate"][e], fresh.estimate.mean, rtol=0.0, atol=1e-12)
-            assert info["measurement_age"][e] == fresh.age
-            assert info["assumption_violated"][e] == fresh.alarm
-        return packets
-
-
-def soak_many(plant, count, steps, warm_up):
-    """Runs a vector; returns how much memory it gained after the warm-up."""
-    env = NCSVectorEnv(count, plant=plant, channel=CHANNEL, max_episode_steps=EPISODE)
-    _, info = env.reset(seed=0)
-    rng, before = np.random.default_rng(0), 0.0
-    actions = rng.uniform(-1.0, 1.0, (64, count, plant.m)).astype(np.float32)
-    diary = None
-    for k in range(steps):
-        *_, info = env.step(actions[k % 64])
-        if k == warm_up:
-            before = resident()
-        if k == steps - 2 * EPISODE:
-            diary = Diary(env, info)
-        elif diary is not None:
-            diary.write(info)
-    gained = resident() - before
-    # Every watched episode began after the diary did: nothing in it comes from further back.
-    assert all(0 < len(diary.told[e]) == env.steps[e] for e in WATCHED)
-    assert diary.compare(info) > 10 * len(WATCHED)
-    return gained
-
-
-def soak_one(plant, steps, warm_up):
-    """Runs a scalar environment; compares with a fresh estimator some hundred steps back; returns the memory gained."""
-    env = NCSEnv(plant, CHANNEL)
+def growth(env, steps, warm_up):
+    """How much memory a run of an environment, or of many, takes after the warm-up [MB]."""
     env.reset(seed=0)
-    told, before, advance = [], 0.0, env.estimator.advance
-    rng = np.random.default_rng(0)
-    fresh = None
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (64, *env.action_space.shape)).astype(np.float32)
+    before = 0.0
     for k in range(steps):
+        env.step(actions[k % 64])
+        if isinstance(env, NCSEnv) and k % EPISODE == EPISODE - 1:
+            env.reset()
         if k == warm_up:
             before = resident()
-        if k == steps - 400:
-            fresh = restored(env)
-
-            def listening(u, packets):
-                told.append((u.copy(), list(packets)))
-                advance(u, told[-1][1])
-
-            env.estimator.advance = listening
-        env.step(rng.uniform(-1.0, 1.0, plant.m).astype(np.float32))
-    gained = resident() - before
-    for u, packets in told:
-        fresh.advance(u, packets)
-    assert sum(len(packets) for _, packets in told) > 50
-    for name in Estimate._fields:
-        np.testing.assert_array_equal(
-            getattr(fresh.estimate, name), getattr(env.estimator.estimate, name), err_msg=name
-        )
-    assert len(env.estimator._priors) <= CHANNEL.longest_delay + 1
-    return gained
+    return resident() - before
 
 
-def restored(env):
-    """A fresh estimator, with a graph of its own, in the state of an environment's."""
-    old, new = env.estimator, Estimator(env.plant, env.channel, env.error_set)
-    new.step, new.age, new.alarm, new.mean = old.step, old.age, old.alarm, old.mean
-    new._history = new._histories.taking_over(old._histories, np.array([old._history])).item()
-    new._priors, new._inputs, new._samples = old._priors.copy(), old._inputs.copy(), old._samples.copy()
-    return new
+def many(plant, count):
+    return NCSVectorEnv(count, plant=plant, channel=CHANNEL, max_episode_steps=EPISODE)
 
 
-def test_a_long_run_neither_grows_nor_drifts(loaded):
-    assert soak_many(loaded, 64, 1600, 900) < MOST_GROWTH
-    assert soak_one(loaded, 3000, 1000) < MOST_GROWTH
+def run_estimators(plant, count, episodes):
+    """Runs many estimators and a single one with the same samples; compares their last episodes with fresh ones."""
+    rng, error_set = np.random.default_rng(0), certified_error_set(plant, None)
+    vector = VectorEstimator(plant, histories_of(plant, CHANNEL, error_set), count)
+    single = Estimator(plant, CHANNEL, histories=histories_of(plant, CHANNEL, error_set))
+    for _ in range(episodes):
+        first = 1e-2 * rng.standard_normal((plant.n, count))
+        vector.begin(np.ones(count, np.bool_), first)
+        single.reset(first[:, 0])
+        traffic, samples = Traffic(CHANNEL.longest_delay, None, count), []
+        told = {e: [] for e in WATCHED}
+        for step in range(1, EPISODE + 1):
+            u = 0.1 * rng.uniform(-1.0, 1.0, (plant.m, count))
+            samples = [1e-2 * rng.standard_normal((plant.p, count)), *samples[: traffic.oldest]]
+            arrivals = traffic.arrivals(rng, step)
+            vector.advance(u, samples[0], arrivals)
+            for e in WATCHED:
+                packets = [Packet(step - age, samples[age][:, e]) for age, comes in arrivals if comes[e]]
+                told[e].append((u[:, e], packets))
+            single.advance(u[:, 0], [packet._replace(episode=single.episode) for packet in told[0][-1][1]])
+    shapes, packets = vector.histories.table.shapes.take(vector.statistics, axis=0), 0
+    for e in WATCHED:
+        fresh = Estimator(plant, CHANNEL, error_set)
+        fresh.reset(first[:, e])
+        for u, arrived in told[e]:
+            fresh.advance(u, arrived)
+            packets += len(arrived)
+        np.testing.assert_array_equal(shapes[e], fresh.estimate.shape)
+        np.testing.assert_allclose(vector.mean[:, e], fresh.estimate.mean, rtol=0.0, atol=1e-12)
+        assert (vector.age[e], vector.alarm[e]) == (fresh.age, fresh.alarm)
+        for name in Estimate._fields if e == 0 else ():
+            np.testing.assert_array_equal(getattr(single.estimate, name), getattr(fresh.estimate, name), err_msg=name)
+    assert packets > 10 * len(WATCHED)
 
 
-@pytest.mark.parametrize("kind", ["many", "one"])
-def test_a_graph_that_forgets_histories_does_not_drift(loaded, monkeypatch, kind):
-    monkeypatch.setattr(arrival_histories, "_shared", {})
-    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 300 if kind == "many" else 60)
+@pytest.fixture
+def forgotten(monkeypatch):
+    """Graphs of histories that were forgotten but for those in use; they are forgotten when there are few."""
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 300)
     graphs, keeping = [], ArrivalHistories.keeping
 
     def counted(graph, histories):
-        graphs.append(graph)
+        graphs.append(len(graph))
         return keeping(graph, histories)
 
     monkeypatch.setattr(ArrivalHistories, "keeping", counted)
-    if kind == "many":
-        soak_many(loaded, 16, 1000, 900)
-    else:
-        soak_one(loaded, 3000, 1000)
-    assert len(graphs) > 1
-    assert max(map(len, graphs)) < 600
+    return graphs
+
+
+def test_a_long_run_does_not_grow(loaded):
+    assert growth(many(loaded, 64), 800, 500) < MOST_GROWTH
+    assert growth(NCSEnv(loaded, CHANNEL), 1500, 700) < MOST_GROWTH
+
+
+def test_estimators_whose_graph_forgets_histories_do_not_drift(loaded, forgotten):
+    run_estimators(loaded, 16, 2)
+    assert len(forgotten) > 1
+    assert max(forgotten) < 600
 
 
 @pytest.mark.slow
-def test_ten_million_steps_neither_grow_nor_drift(loaded):
-    assert soak_many(loaded, 1024, 9800, 2000) < MOST_GROWTH
-    assert soak_one(loaded, 100_000, 10_000) < MOST_GROWTH
+def test_long_runs_of_estimators_do_not_drift(loaded):
+    run_estimators(loaded, 64, 40)
 
 
 @pytest.mark.slow
-def test_a_million_steps_of_one_environment_neither_grow_nor_drift(loaded):
-    assert soak_one(loaded, 1_000_000, 20_000) < MOST_GROWTH
+def test_ten_million_steps_do_not_grow(loaded):
+    assert (
+        growth(NCSVectorEnv(1024, plant=loaded, channel=CHANNEL, max_episode_steps=EPISODE), 9800, 2000) < MOST_GROWTH
+    )
+    assert growth(NCSEnv(loaded, CHANNEL), 1_000_000, 20_000) < MOST_GROWTH
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 256])
-def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, monkeypatch):
-    monkeypatch.setattr(arrival_histories, "_shared", {})
+def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, forgotten, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 4000)
     # Where many samples are late, histories hardly recur: the graph is full again and again.
     settings = {"plant": loaded, "channel": Channel(0.5, jitter=4)}
     env = NCSEnv(**settings) if size == 1 else NCSVectorEnv(size, max_episode_steps=EPISODE, **settings)
-    env.reset(seed=0)
-    rng, forgotten, sizes = np.random.default_rng(0), set(), []
-    actions = 0.01 * rng.uniform(-1.0, 1.0, (64, *env.action_space.shape)).astype(np.float32)
-    for k in range(1_000_000 // size):
-        env.step(actions[k % 64])
-        if size == 1 and k % EPISODE == 0:
-            env.reset()
-        if k % (50_000 // size) == 0:
-            sizes.append(resident())
-            forgotten.add(id(env.estimator._histories if size == 1 else env._estimator.histories))
+    assert growth(env, 1_000_000 // size, 400_000 // size) < MOST_GROWTH
     assert len(forgotten) > 3
-    assert max(sizes[8:]) - max(sizes[4:8]) < MOST_GROWTH

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
-from ncs_gym.validation import read_only
+from ncs_gym.validation import own_error_state, read_only
 from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
 from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test, supports
 
@@ -49,27 +49,25 @@ class PlanTest:
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
         self._most = min(MOST_REMEMBERED, max(1, MOST_NUMBERS // (prediction.steps * len(prediction.rows))))
-        # Where in the table the tightenings of a shape are.
-        self._remembered: dict[bytes, int] = {}
-        self._table = tightenings(prediction, np.empty((0, plant.n, plant.n)))
+        # Tightenings, and where among them those of a shape are: both are replaced together and never written into,
+        # since threads share them.
+        self._known: tuple[dict[bytes, int], Tightening] = {}, tightenings(prediction, np.empty((0, plant.n, plant.n)))
 
     def tightenings_of(self, shapes: np.ndarray) -> Tightening:
         """Returns the tightenings of error shapes Sigma_k, shape (E, n, n); remembered, since shapes recur."""
         shapes = np.ascontiguousarray(shapes)
-        keys = [shape.tobytes() for shape in shapes]
-        new = {key: e for e, key in enumerate(keys) if key not in self._remembered}
-        if len(self._remembered) + len(new) > self._most:
-            self._remembered.clear()
-            new = {key: e for e, key in enumerate(keys)}
+        keys, (numbers, table) = [shape.tobytes() for shape in shapes], self._known
+        new = {key: e for e, key in enumerate(keys) if key not in numbers}
+        if len(numbers) + len(new) > self._most:
+            numbers, table, new = {}, table.some(slice(0)), {key: e for e, key in enumerate(keys)}
         if new:
             found = tightenings(self.prediction, shapes[list(new.values())])
-            known = self._table.some(slice(len(self._remembered)))
-            self._table = Tightening(*(np.concatenate(pair) for pair in zip(known, found, strict=True)))
-            self._remembered |= {key: len(self._remembered) + e for e, key in enumerate(new)}
-        numbers = [self._remembered[key] for key in keys]
-        return self._table.some(numbers)
+            table = Tightening(*(np.concatenate(pair) for pair in zip(table, found, strict=True)))
+            numbers = numbers | {key: len(numbers) + e for e, key in enumerate(new)}
+            self._known = numbers, table
+        return table.some([numbers[key] for key in keys])
 
-    @np.errstate(all="ignore")  # what is not finite is not certified
+    @own_error_state  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
         """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN if unknown."""
         size = np.abs(estimates)
@@ -89,7 +87,7 @@ class PlanTest:
             weighted += weighting[:, :, i] * centers[:, i, None]
         return values.reshape(steps, -1, count, number), weighted
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
         """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N)."""
         block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
@@ -109,7 +107,7 @@ class PlanTest:
         allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
         return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
 
-    @np.errstate(all="ignore")
+    @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
         rows, extents = self.prediction.rows[: len(self.prediction.plant.box_rows)], np.sqrt(np.diag(error_shape))
@@ -285,7 +283,7 @@ class Tightening(NamedTuple):
         return Tightening(*(part[chosen] for part in self))
 
 
-@np.errstate(all="ignore")  # what overflows passes no test
+@own_error_state  # what overflows passes no test
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 

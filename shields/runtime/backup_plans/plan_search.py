@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.plants.lqr import lqr_gain
-from ncs_gym.validation import read_only
+from ncs_gym.validation import own_error_state, read_only
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
 from shields.runtime.one_step import OneStepTest
 from shields.runtime.polytope_step import PolytopeTest
@@ -107,7 +107,7 @@ class Planner:
         candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 1, 0]])
         return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
 
-    @np.errstate(all="ignore")  # what is not finite passes no test
+    @own_error_state  # what is not finite passes no test
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
         """Returns proposals followed by either loop, (E, 2, N, m), limited after the prediction: one product for all.
 
@@ -178,12 +178,15 @@ class Planner:
 class PlanProgram:
     """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows, and one cone for an end in S.
 
-    Variables are the inputs in units of their limits. The solver is set up once, with the pattern of the problem; then
-    vectors and the entries of the cone are updated, so that a solution depends on its own data alone.
+    Variables are the inputs in units of their limits. A solver is set up once, with the pattern of the problem; then
+    vectors and the entries of the cone are updated, so that a solution depends on its own data alone. Whoever solves
+    takes the solver away, or sets another one up if somebody has it: threads share none.
 
     Args:
         prediction: Of the plant.
     """
+
+    _solver: Any = None  # while nobody uses it
 
     def __init__(self, prediction: Prediction) -> None:
         plant, length = prediction.plant, prediction.steps
@@ -205,7 +208,6 @@ class PlanProgram:
         pushed = float(np.linalg.norm(root @ self._end, axis=0).sum())
         self._end_margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * pushed
         self._arrange(root)
-        self._solver: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_solver": None}  # set up anew where it is used
@@ -219,15 +221,14 @@ class PlanProgram:
         first = len(linear) + 1  # the row before holds the radius
         cone_rows, cone_columns = (each.ravel() for each in np.indices((len(root), size)))
         rows, columns = np.concatenate([row, first + cone_rows]), np.concatenate([column, cone_columns])
-        self._entries = np.concatenate([linear[row, column], -(root @ self._end).ravel()])
-        self._in_cone = slice(len(row), None)
+        self._linear = read_only(linear[row, column])
         shape = len(linear) + self._cone, size
         numbered = csc_matrix((np.arange(1.0, len(rows) + 1.0), (rows, columns)), shape=shape)
         self._order = numbered.data.astype(np.intp) - 1
-        numbered.data = self._entries[self._order]
+        numbered.data = np.concatenate([self._linear, -(root @ self._end).ravel()])[self._order]
         self._typical = numbered
 
-    @np.errstate(all="ignore")  # what is not finite has no plan
+    @own_error_state  # what is not finite has no plan
     def solve(
         self,
         estimate: np.ndarray,
@@ -259,12 +260,11 @@ class PlanProgram:
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
         q = np.zeros(self._length * self._m)
         q[: self._m] = -2.0 * self._weights * proposed / self._limits
-        self._entries[self._in_cone] = -(weighting @ self._end).ravel()
-        A = self._entries[self._order]
+        A = np.concatenate([self._linear, -(weighting @ self._end).ravel()])[self._order]
         if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
             return None
         try:
-            solver, self._solver = self._set_up() if self._solver is None else self._solver, None
+            solver = vars(self).pop("_solver", None) or self._set_up()  # no other thread gets the same
             solver.update(A=A, b=b, q=q)
             plan = np.array(solver.solve().x, dtype=np.float64)
             self._solver = solver  # what did not come to its end is not used again
@@ -309,7 +309,7 @@ def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate(inputs).T)
 
 
-@np.errstate(all="ignore")  # what is not finite passes no test
+@own_error_state  # what is not finite passes no test
 def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """Returns plans that go on with u_j = gain c_j, saturated and expressible, where a beginning is NaN.
 

@@ -1,16 +1,17 @@
 """Where a channel breaks its contract nothing is claimed; what happens then is counted, and is no failure."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
 
-from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.monte_carlo_batch import MonteCarloBatch, _claimed_and_kept
+from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.commands.attack import attack
 from experiments.settings.certificates import AttackSettings
 from ncs_gym import Channel
+from shields import VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.workers import replace_cases
 
@@ -19,18 +20,19 @@ CAMPAIGN = AttackSettings(seed=0, random_plants=0, envs=16)
 
 
 @pytest.fixture
-def attacked(monkeypatch):
+def attacked(monkeypatch, tmp_path):
     """Counts of a batch behind a channel that replaces the one that keeps the contract of the batch reactor."""
+    folders = count()  # shields are prepared once for settings and the name of a case
 
     def counts_behind(channel, campaign=CAMPAIGN, **changes):
         case = replace(attack_cases(0, 0)[NAME], channel=channel, **changes)
         replace_cases(monkeypatch, {NAME: case})
-        monte_carlo_batch._shields.cache_clear()
         certificate = certificate_of(case.plant, case.certificate_contract)
-        return MonteCarloBatch(campaign, NAME, 0, certificate).execute(lambda steps: None)
+        return MonteCarloBatch(replace(campaign, out=tmp_path / str(next(folders))), NAME, 0, certificate).execute(
+            lambda steps: None
+        )
 
-    yield counts_behind
-    monte_carlo_batch._shields.cache_clear()
+    return counts_behind
 
 
 def test_what_comes_after_a_broken_contract_is_counted_apart(attacked):
@@ -66,31 +68,37 @@ def test_a_downlink_that_breaks_its_contract_is_counted_apart(attacked):
     assert 0 < counts.lapsed < counts.steps
 
 
-def info(**values):
-    return {name: np.array([value]) for name, value in values.items()}
+STEPS, BREAKS, AGAIN = 200, 50, 80
 
 
 @pytest.mark.parametrize(
-    ("kept", "downlink_broken", "contract_broken", "guaranteed", "claimed", "still_kept"),
+    ("broken", "is_proved", "lapsed", "unproved"),
     [
-        (True, False, False, True, True, True),
-        (True, False, False, False, True, True),  # a proof that is lost for no reason is not believed
-        (True, False, True, False, True, False),  # the present state was decided while the contract was kept
-        (True, True, False, False, False, False),
-        (False, False, False, False, False, False),
-        (False, False, False, True, True, False),  # the shield claims it again
-        (True, True, False, True, True, False),
+        # The state after the step was decided while the contract of the samples was kept.
+        ("contract_broken", lambda step: step < BREAKS or step >= AGAIN, AGAIN - BREAKS - 1, 0),
+        ("downlink_broken", lambda step: step < BREAKS or step >= AGAIN, AGAIN - BREAKS, 0),
+        ("contract_broken", lambda step: True, 0, 0),
+        (None, lambda step: step < BREAKS, 0, STEPS - BREAKS),  # a proof lost for no reason is not believed
     ],
 )
-def test_what_is_claimed(kept, downlink_broken, contract_broken, guaranteed, claimed, still_kept):
-    given = info(downlink_broken=downlink_broken, contract_broken=contract_broken, shield_guaranteed=guaranteed)
-    found = _claimed_and_kept(given, np.array([kept]))
-    assert [each.item() for each in found] == [claimed, still_kept]
+def test_what_is_claimed_after_a_step_that_breaks_a_contract(
+    attacked, monkeypatch, broken, is_proved, lapsed, unproved
+):
+    step, taken = VectorSafetyShield.step, count()
+
+    def scripted(self, actions):
+        *rest, found = step(self, actions)
+        at, everywhere = next(taken), np.ones(16, np.bool_)
+        said = {"contract_broken": ~everywhere, "downlink_broken": ~everywhere}
+        said |= {"shield_guaranteed": everywhere & is_proved(at)} | ({broken: everywhere} if at == BREAKS else {})
+        return *rest, found | {key: value for key, value in said.items() if key}
+
+    monkeypatch.setattr(VectorSafetyShield, "step", scripted)
+    counts = attacked(attack_cases(0, 0)[NAME].channel)
+    assert (counts.lapsed, counts.unproved) == (16 * lapsed, 16 * unproved)
 
 
 def test_a_shield_that_claims_too_much_after_a_broken_contract_is_found_out(attacked, monkeypatch):
-    from shields import VectorSafetyShield
-
     step = VectorSafetyShield.step
 
     def boasting(self, actions):

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -18,48 +17,14 @@ import pytest
 from agents.agent import Agent
 from ncs_gym import truck_trailer
 from shields import Certificate, certify
-from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
+from tests.command import SMOKE, assert_one_sentence, environment, killed, ncs, ncs_process, without_pictures
 from tests.verdicts import verified
 from tests.workers import no_worker_processes
 
-# A short comparison whose unshielded agents explore enough to violate in training.
-SMOKE = ("compare", "--smoke", "--hyperparams", "policy_kwargs=dict(log_std_init=0.0)", "n_epochs=2")
-ARM_KEYS = {
-    "train_steps",
-    "train_violation_steps",
-    "eval_episodes",
-    "eval_violation_steps",
-    "eval_violating_episodes",
-    "eval_violation_rate_ci95",
-    "eval_return_mean",
-    "eval_return_ci95",
-    "intervention_rate",
-}
-
-
-def children_of(pid):
-    """Process ids of direct children, from /proc."""
-    stats = [path.read_text().rsplit(")", 1) for path in Path("/proc").glob("[0-9]*/stat") if path.exists()]
-    return [int(head.split()[0]) for head, tail in stats if int(tail.split()[1]) == pid]
-
-
-def is_alive(pid):
-    """Whether a process runs (a zombie does not)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-@pytest.fixture(scope="module")
-def smoke(made_once):
-    def make(folder):
-        with no_worker_processes():  # the run that is killed below has them, and must come to the same
-            run = ncs(*SMOKE, "--out", folder / "out")
-        (folder / "run.json").write_text(json.dumps(run))
-
-    folder = made_once("smoke", make)
-    return folder / "out", Run(*json.loads((folder / "run.json").read_text()))
+ARM_KEYS = {"train_steps", "train_violation_steps", "eval_episodes", "eval_violation_steps", "eval_violating_episodes"}
+ARM_KEYS |= {"eval_violation_rate_ci95", "eval_return_mean", "eval_return_ci95", "intervention_rate"}
+TRAINED, FIXED = ("unshielded", "shielded"), ("zero-input", "proportional+shielded")
+RUNS = 2 * (len(TRAINED) + len(FIXED))
 
 
 def test_smoke_run_leaves_every_file_of_the_contract(smoke):
@@ -68,22 +33,19 @@ def test_smoke_run_leaves_every_file_of_the_contract(smoke):
     left = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in path.parts}
     expected = {"summary.json", "settings.json", "episodes.parquet", "training.parquet", "report.html"}
     expected |= {"certificate.json"}
-    arms = ("shielded", "unshielded", "penalized", "trusting")
-    references = ("zero-input", "K-x_hat", "untrained")
-    references += ("proportional", "proportional+trusting", "proportional+shielded")
-    for arm in arms:
+    for arm in TRAINED:
         expected |= {f"models/{arm}-{i}/{name}" for i in range(2) for name in ("model.zip", "agent.json")}
-    expected |= {f"runs/{name}-{i}.json" for i in range(2) for name in arms + references}
+    expected |= {f"runs/{name}-{i}.json" for i in range(2) for name in TRAINED + FIXED}
     assert {path for path in left if not path.startswith("figures/")} == expected
     assert {f"figures/{name}.png" for name in ("training", "phase", "episode")} <= left
-    assert len(list(out.rglob("events.out.tfevents*"))) == 8
+    assert len(list(out.rglob("events.out.tfevents*"))) == 4
 
 
 def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     out, _ = smoke
     summary = json.loads((out / "summary.json").read_text())
     rows = pq.read_table(out / "episodes.parquet").to_pylist()
-    assert set(summary["arms"]) == {"unshielded", "penalized", "trusting", "shielded"}
+    assert set(summary["arms"]) == set(TRAINED)
     for name, arm in summary["arms"].items():
         assert set(arm) >= ARM_KEYS
         mine = [row for row in rows if row["arm"] == name]
@@ -98,7 +60,7 @@ def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     assert shielded["largest_level"] <= 1.0
     assert unshielded["train_violation_steps"] > 0
     assert summary["paired_differences"]["baseline"] == "unshielded"
-    assert set(summary["paired_differences"]["arms"]) == {"penalized", "trusting", "shielded"}
+    assert set(summary["paired_differences"]["arms"]) == {"shielded"}
 
 
 def test_tables_say_where_they_come_from(smoke):
@@ -122,7 +84,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert "shielded" in run.stdout
     lines = run.stdout.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if "training:" in line) :]
-    assert all(name in {line.split("  ")[0] for line in table} for name in ("trusting", "proportional+shielded"))
+    assert all(name in {line.split("  ")[0] for line in table} for name in ("unshielded", "proportional+shielded"))
     assert max(len(line) for line in lines if not line.startswith("files: ")) <= 100
     prose = " ".join(run.stdout.split())
     assert "% of the largest ellipsoid in the box)" in prose
@@ -147,35 +109,20 @@ def test_saved_certificate_verifies(smoke, loaded):
     assert verified(Certificate.load(out / "certificate.json"), loaded).valid
 
 
-TRAINED = ("unshielded", "penalized", "trusting", "shielded")
-
-
-@pytest.mark.parametrize("finished", [TRAINED, pytest.param((), marks=pytest.mark.slow)], ids=["trained", "none"])
+@pytest.mark.slow
+@pytest.mark.parametrize("finished", [TRAINED, ()], ids=["trained", "none"])
 def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_one(finished, smoke, tmp_path):
     out, runs = tmp_path / "out", tmp_path / "out" / "runs"
     keep_runs(smoke[0], out, finished)
     before = len(list(runs.glob("*.json")))
-    command = [sys.executable, "-m", "experiments", *SMOKE, "--jobs", "1", "--out", str(out)]
-    run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 200.0
-    while len(list(runs.glob("*.json"))) < before + 2:
-        assert run.poll() is None, "it ended before it was killed"
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    children = children_of(run.pid)
-    assert len(children) >= 2
-    run.kill()
-    run.wait()
-    while any(is_alive(child) for child in children):
-        assert time.monotonic() < deadline, "workers outlive their parent"
-        time.sleep(0.1)
+    killed(*SMOKE, "--jobs", "1", "--out", out, once=lambda: len(list(runs.glob("*.json"))) >= before + 2)
     assert not (out / "summary.json").exists()
     left = len(list(runs.glob("*.json")))
-    assert left < 20
+    assert left < RUNS
     with no_worker_processes():
         again = ncs("compare", "--config", smoke[0] / "settings.json", "--out", out)
     assert again.returncode == 0, again.stderr
-    assert f"{left} of 20 runs were finished before" in again.stderr
+    assert f"{left} of {RUNS} runs were finished before" in again.stderr
     assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
 
 
@@ -190,14 +137,17 @@ def keep_runs(source, out, arms):
         shutil.copy(source / "settings.json", out)
 
 
-def test_finished_run_is_not_run_again_and_damage_is_one_sentence(smoke, tmp_path):
-    shutil.copytree(smoke[0], tmp_path / "out")
-    again = ncs(*SMOKE, "--out", tmp_path / "out")
-    assert "20 of 20 runs were finished before" in again.stderr
-    assert again.stdout.splitlines()[:-1] == smoke[1].stdout.splitlines()[:-1]
-    stored = tmp_path / "out" / "runs" / "shielded-1.json"
+def test_interrupted_run_goes_on_by_its_settings_file_and_damage_is_one_sentence(smoke, tmp_path):
+    out = tmp_path / "out"
+    keep_runs(smoke[0], out, (*TRAINED, *FIXED[1:]))
+    with no_worker_processes(), without_pictures():
+        again = ncs("compare", "--config", smoke[0] / "settings.json", "--out", out)
+    assert f"{RUNS - 2} of {RUNS} runs were finished before" in again.stderr
+    assert again.returncode == 0, again.stderr
+    assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
+    stored = out / "runs" / "shielded-1.json"
     stored.write_text(stored.read_text()[:100])
-    run = ncs(*SMOKE, "--out", tmp_path / "out")
+    run = ncs(*SMOKE, "--out", out)
     assert run.returncode == 2
     assert "shielded-1.json is no result of its run" in run.stderr
     assert "Traceback" not in run.stderr
@@ -216,24 +166,19 @@ def test_finished_study_is_not_overwritten(command, smoke):
     assert digests(out) == before
 
 
-def test_finished_study_is_overwritten_by_force(tmp_path, without_workers):
-    small = ["compare", "--arms", "unshielded", "--baselines", "--steps", 64, "--episodes", 2, "--seeds", 1]
-    small += ["--hyperparams", "n_envs=2", "n_steps=16", "--out", tmp_path]
-    assert ncs(*small).returncode == 0
-    kept = (tmp_path / "runs" / "unshielded-0.json").read_bytes()
-    assert_one_sentence(ncs(*small, "--seed", 1), "(seed 0, now 1)")
-    assert (tmp_path / "runs" / "unshielded-0.json").read_bytes() == kept
-    forced = ncs(*small, "--seed", 1, "--force")
-    assert forced.returncode == 0, forced.stderr
-    assert json.loads((tmp_path / "summary.json").read_text())["settings"]["seed"] == 1
-    assert (tmp_path / "runs" / "unshielded-0.json").read_bytes() != kept
-
-
 def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
     (tmp_path / "episode.gif").write_text("mine")
-    for command in (["train", "--algo", "A2C"], ["sweep", "--delays", 0, 1, 2, "--losses", 0.3], ["render"]):
-        run = ncs(*command, "--smoke", cwd=tmp_path)
+    tiny = ("--hyperparams", "n_envs=8", "n_steps=64", "policy_kwargs=dict(net_arch=[8, 8], log_std_init=-4.0)")
+    sweep = ("sweep", "--arms", "K x_hat", "--delays", 0, 1, 2, "--losses", 0.3)
+    for command in (("train", *tiny), sweep, ("render",)):
+        with without_pictures():
+            run = ncs(*command, "--smoke", cwd=tmp_path)
         assert run.returncode == 0, run.stderr
+        if command[0] == "train":  # so little was tried that nothing happened
+            said = " ".join(run.stdout.split())
+            assert "This training had no violation and no override, so it does not show what the shield is for" in said
+            assert "leave out --smoke" in said
+            assert run.stdout.splitlines()[-1].startswith("agent: ")
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {"train-smoke", "sweep-smoke"}
     settings = json.loads((tmp_path / "runs" / "train-smoke" / "settings.json").read_text())["settings"]
     assert (settings["steps"], settings["episodes"]) == (4096, 10)
@@ -248,7 +193,7 @@ def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
 
 
 def test_folder_of_several_agents_is_refused_with_their_names(smoke):
-    assert_one_sentence(ncs("evaluate", smoke[0]), "holds 8 agents", "models (penalized-0, penalized-1, ")
+    assert_one_sentence(ncs("evaluate", smoke[0]), "holds 4 agents", "models (shielded-0, shielded-1, ")
 
 
 def test_horizon_is_refused_if_the_agents_own_shield_plans_nothing(smoke):
@@ -312,10 +257,8 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
     assert (agent.shield_mode, agent.horizon) == ("lookahead", 3)
     for flags, mode, horizon in (
         ([], "lookahead", 3),
-        (["--shield", "lookahead", "--horizon", "2"], "lookahead", 2),
         (["--horizon", "2"], "lookahead", 2),
         (["--shield", "project"], "project", None),
-        (["--shield", "none"], "none", None),
     ):
         evaluated = ncs("evaluate", out, "--episodes", "3", "--out", tmp_path / "e.json", *flags)
         assert evaluated.returncode == 0, evaluated.stderr
@@ -329,6 +272,7 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
     grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "256"]
+    grid += ["--arms", "shielded", "lqr", "--seeds", "1"]
     run = ncs("sweep", *grid, "--hyperparams", "n_envs=4", "n_steps=64", "--out", out)
     assert run.returncode == 0, run.stderr
     summary = json.loads((out / "summary.json").read_text())
@@ -344,9 +288,14 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_worke
     fewer = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4")
     assert_one_sentence(fewer, "of other settings (losses [0.5], now [0.4])", "--force")
     assert digests(out) == before
-    more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5")
-    assert more.returncode == 0, more.stderr
-    assert "4 of 8 runs were finished before" in more.stderr
+    shutil.rmtree(out / "models" / "loss0.5-delay1-burst3.0-shielded-0")
+    (out / "runs" / "loss0.5-delay1-burst3.0-lqr-0.json").unlink()
+    (out / "runs" / "loss0.5-delay1-burst3.0-shielded-0.json").unlink()
+    with without_pictures():
+        again = ncs("sweep", "--config", out / "settings.json")
+    assert again.returncode == 0, again.stderr
+    assert "2 of 4 runs were finished before" in again.stderr
+    assert json.loads((out / "summary.json").read_text()) == summary
 
 
 def assert_verdict_first(printed, last):
@@ -434,102 +383,6 @@ def test_help_shows_every_setting_and_what_a_settings_file_gives(smoke):
         assert flag in run.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "Missing subcommand"),
-        (["fly"], "fly"),
-        (["verify"], "Required"),
-        (["compare", "--mode", "hope"], "hope"),
-        (["compare", "--steps", "many"], "many"),
-        (["compare", "--steps", "0"], "--steps must be at least 1"),
-        (["compare", "--jobs", "-1"], "--jobs must be at least 1"),
-        (["compare", "--seed", "-1"], "--seed must be at least 0"),
-        (["compare", "--violation-penalty", "nan"], "--violation-penalty must be"),
-        (["compare", "--hyperparams", "gamma"], "expected NAME=VALUE"),
-        (["compare", "--engine", "hope"], "hope"),
-        (["compare", "--ray-address", "auto"], "--ray-address is a setting of --engine ray"),
-        (["sweep", "--engine", "ray", "--ray-address", "head"], "--ray-address must be local, auto or HOST:PORT"),
-        (["sweep", "--engine", "ray", "--cpus-per-run", "0"], "--cpus-per-run must be at least"),
-        (["sweep", "--engine", "ray", "--gpus-per-run", "1.5"], "--gpus-per-run must be"),
-        (["evaluate", "nowhere", "--episodes", "0"], "--episodes must be at least 1"),
-        (
-            ["evaluate", "nowhere", "--shield", "lookahead", "--horizon", "51"],
-            "--horizon must be at least 1 and at most",
-        ),
-        (["evaluate", "nowhere", "--shield", "project", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
-        (["render", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
-        (["train", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
-    ],
-)
-def test_usage_errors_are_the_parsers(arguments, words):
-    run = ncs(*arguments)
-    assert run.returncode == 2
-    assert "Traceback" not in run.stderr
-    assert words in " ".join(run.stderr.replace("│", " ").split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["compare", "--env", "CartPole-v1"], ["unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"]),
-        (["compare", "--env", "ncs_gym/LinearNCS-v0"], ["unknown environment"]),
-        (["compare", "--env", "CSTR-v0"], ["unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"]),
-        (["compare", "--arms", "shielded", "hope"], ["unknown arm 'hope'", "shielded:MODE"]),
-        (["compare", "--arms", "shielded", "shielded"], ["--arms must be different"]),
-        (["compare", "--config", "nowhere.json"], ["cannot read settings nowhere.json"]),
-        (["compare", "--channel", "loss=1.5"], ["loss"]),
-        (["compare", "--hyperparams", "gamma=2"], ["gamma must be in [0, 1], got 2"]),
-        (
-            ["train", "--hyperparams", "gama=0.9"],
-            ["PPO: unknown hyperparameter 'gama'; its hyperparameters are"],
-        ),
-        (["train", "--conf-file", "nowhere.yml"], ["nowhere.yml"]),
-        (["train", "--arm", "hope"], ["unknown arm 'hope'"]),
-        (["compare", "--arms", "unshielded,shielded"], ["'unshielded,shielded' (several are separated by spaces)"]),
-        (["evaluate", "nowhere"], ["no agent in nowhere"]),
-        (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
-        (["sweep", "--downlink-losses", "0.1"], ["has an ideal downlink, which loses nothing"]),
-        (["sweep", "--losses", "0.9", "--burst-lengths", "2"], ["bursts of mean length 2"]),
-        (["sweep", "--channel", "loss=0.5"], ["--channel loss is a side of the grid"]),
-        (
-            ["sweep", "--env", "ncs_gym/BatchReactor-v0", "--quantization-steps", "0.1"],
-            ["rounds to 0.1, the contract allows 0.001"],
-        ),
-        (["compare", "--certificate", "nowhere.json"], ["cannot read certificate nowhere.json"]),
-        (["verify", "nowhere.json"], ["cannot read certificate nowhere.json"]),
-        (["synthesize", "--out", "no/such/folder/c.json"], ["No such file or directory"]),
-    ],
-)
-def test_other_errors_are_one_sentence(arguments, words, tmp_path):
-    assert_one_sentence(ncs(*arguments, cwd=tmp_path), *words)
-    assert list(tmp_path.iterdir()) == [] or not any(tmp_path.rglob("*.json"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["synthesize", "--out", "here"], ["Is a directory: here", "name the file"]),
-        (["synthesize", "--out", "file/c.json"], ["Not a directory: file;", "choose another path"]),
-        (["verify", "c.json", "--out", "here"], ["Is a directory: here", "name the file"]),
-        (["verify", "c.json", "--out", "nowhere/v.json"], ["No such file or directory: nowhere;", "check the path"]),
-        (["evaluate", "agent", "--out", "nowhere/e.json"], ["No such file or directory: nowhere;", "check the path"]),
-        (["audit", "--out", "nowhere/a.json"], ["No such file or directory: nowhere;", "check the path"]),
-        (["render", "--out", "nowhere/e.gif"], ["No such file or directory: nowhere;", "check the path"]),
-        (["reproduce", "--out", "file"], ["File exists: file;", "choose another path"]),
-        (["study", "--quote", "nowhere.md"], ["No such file or directory: nowhere.md;", "check the path"]),
-    ],
-)
-def test_file_that_cannot_be_written_is_refused_before_anything_is_computed(arguments, words, tmp_path):
-    (tmp_path / "file").write_text("mine")
-    (tmp_path / "here").mkdir()
-    run = ncs(*arguments, cwd=tmp_path)
-    assert_one_sentence(run, *words)
-    assert run.stdout == ""
-    assert (tmp_path / "file").read_text() == "mine"
-    assert {path.name for path in tmp_path.iterdir()} == {"file", "here"}
-
-
 @pytest.mark.parametrize(("number", "remedy"), [(errno.ENOSPC, "make room"), (errno.EROFS, "choose a path")])
 def test_errors_of_the_disk_say_what_to_do(number, remedy, certificate, monkeypatch, tmp_path):
     certificate.save(tmp_path / "c.json")
@@ -544,14 +397,9 @@ def test_errors_of_the_disk_say_what_to_do(number, remedy, certificate, monkeypa
 def test_infeasible_problem_is_one_sentence(tmp_path):
     truck_trailer(box=np.array([[0.5, 0.0]])).save(tmp_path / "plant.json")
     run = ncs("synthesize", "--plant", "plant.json", "--method", "paper", cwd=tmp_path)
-    assert_one_sentence(run, "the safe box leaves 1 of 2 directions unbounded")
+    assert run.returncode == 2
+    assert run.stderr.splitlines()[-1] == "ncs: the safe box leaves 1 of 2 directions unbounded: add rows to box"
     assert [path.name for path in tmp_path.iterdir()] == ["plant.json"]
-
-
-def test_unwritable_output_is_one_sentence_and_leaves_nothing(tmp_path):
-    (tmp_path / "file").write_text("mine")
-    assert_one_sentence(ncs("compare", "--smoke", "--out", tmp_path / "file"), "file")
-    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_damaged_and_foreign_certificates_are_one_sentence(certificate, tmp_path):

@@ -192,34 +192,6 @@ def test_model_of_another_environment_is_refused(model):
         policy_by_name(str(model[0]), "ncs_gym/CartPole-v0", gym.make("ncs_gym/CartPole-v0").unwrapped, 0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"env": "CartPole-v1"}, "unknown environment 'CartPole-v1'"),
-        ({"out": "a.avi"}, "--out must end in one of .gif, .mp4, .png"),
-        ({"steps": 0}, "--steps must be at least 1"),
-        ({"fps": 0}, "--fps must be at least 1 and at most 50"),
-        ({"seed": -1}, "--seed must be at least 0"),
-        ({"width": 10}, "--width must be at least 160"),
-        ({"side_by_side": True, "shield": "none"}, "--side-by-side compares with a shield"),
-        ({"out": "nowhere/a.gif"}, "No such file or directory"),
-        ({"policy": "nowhere"}, "no agent in nowhere"),
-    ],
-)
-def test_wrong_settings_raise_before_anything_is_played(changes, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    if "out" in changes:
-        changes = changes | {"out": tmp_path / changes["out"]}
-    with pytest.raises((ValueError, OSError), match=words):
-        render(settings(**changes))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_errors_of_the_command_are_one_sentence(tmp_path):
-    assert_one_sentence(ncs("render", "--out", "a.avi", cwd=tmp_path), "--out must end in one of .gif, .mp4, .png")
-    assert not (tmp_path / "a.avi").exists()
-
-
 def test_missing_pygame_is_one_sentence(tmp_path, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(

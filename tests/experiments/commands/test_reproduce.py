@@ -38,12 +38,3 @@ def test_command_leaves_figures_and_summary(tmp_path):
     assert (tmp_path / "out" / "figures" / "states.png").stat().st_size > 10_000
     assert (tmp_path / "out" / "figures" / "inputs.png").stat().st_size > 10_000
     assert "claimed epsilon" in run.stdout
-
-
-@pytest.mark.parametrize("arguments", [["--starts", "0"], ["--steps", "-1"], ["--seed", "-1"]])
-def test_bad_settings_are_one_sentence(arguments, tmp_path):
-    run = ncs("reproduce", *arguments, "--out", tmp_path / "out")
-    assert run.returncode == 2
-    assert f"{arguments[0]} must be" in run.stderr
-    assert "Traceback" not in run.stderr
-    assert not (tmp_path / "out").exists()

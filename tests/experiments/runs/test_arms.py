@@ -76,19 +76,6 @@ def test_arm_of_the_study_is_trained_with_what_was_tuned_for_it(env_id, arm):
         assert tuned.training_loop.lagrangian == LagrangianSettings(**own.get("lagrangian", {}))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("penalized:", "penalized:-1", "penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1"),
-        *("trusting:project", "psf:switch", "unshielded at test", "at test", "trusting+psf", "unshielded+shielded"),
-        *("proportional+", "proportional+monitored", "lqr+penalty", "lqr+residual", "+shielded", "K x_hat+K x_hat"),
-    ],
-)
-def test_unknown_arms_are_refused_with_those_that_are_known(name):
-    with pytest.raises(ValueError, match=r"unknown arm .*known are unshielded"):
-        Arm.of(name)
-
-
 def test_weight_of_a_penalty_may_be_part_of_the_name(run_of):
     weights = {name: run_of(name, violation_penalty=3.0) for name in ("penalized", "penalized:0.1", "penalized:1e-2")}
     assert [run.training_loop.violation_penalty for run in weights.values()] == [3.0, 0.1, 0.01]

@@ -140,6 +140,21 @@ def test_settings_of_something_else_are_not_replaced(content, tmp_path):
     claim_folder("compare", CompareSettings(out=tmp_path, force=True))
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *(["compare", "--smoke"], ["train", "--smoke"], ["sweep", "--smoke"], ["study", "--smoke"]),
+        *(["certify", "--steps", "1"], ["reproduce"], ["compare", "--smoke", "--force"]),
+    ],
+)
+def test_folder_that_another_command_has_is_refused(arguments, tmp_path):
+    with folder_of("compare", CompareSettings(out=tmp_path)):
+        before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+        run = ncs(*arguments, "--out", tmp_path)
+        assert_one_sentence(run, f"another command is writing to {tmp_path}", "give another --out")
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def hold(out, connection):
     """Has a folder until it is told to give it back."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it may be ignored
@@ -148,49 +163,23 @@ def hold(out, connection):
         connection.recv()
 
 
-@pytest.fixture
-def holder(tmp_path):
-    """A process that has the folder `tmp_path`, and what it listens to."""
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, *(pytest.param(each, marks=pytest.mark.slow) for each in (signal.SIGTERM, signal.SIGINT, None))],
+)
+def test_folder_is_free_again_when_its_command_is_killed_or_interrupted_or_ends(number, tmp_path):
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=hold, args=(tmp_path, there))
     process.start()
     there.close()
     assert here.recv() == "has it"
-    yield process, here
-    process.kill()
-    process.join()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *(["compare", "--smoke"], ["train", "--smoke"], ["sweep", "--smoke"], ["study", "--smoke"]),
-        *(["certify", "--steps", "1"], ["reproduce"], ["compare", "--smoke", "--force"]),
-    ],
-)
-def test_folder_that_another_command_has_is_refused(arguments, holder, tmp_path):
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    run = ncs(*arguments, "--out", tmp_path)
-    assert_one_sentence(run, f"another command is writing to {tmp_path}", "give another --out")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_folder_is_free_again_when_its_command_ends_and_nothing_is_left_of_the_lock(holder, tmp_path):
-    process, here = holder
-    settings = CompareSettings(out=tmp_path)
     with pytest.raises(FolderInUseError):
-        claim_folder("compare", settings)
-    here.send("end")
-    process.join()
-    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
-    claim_folder("compare", settings)
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_folder_is_free_again_when_its_command_is_killed_or_interrupted(number, holder, tmp_path):
-    process, _ = holder
-    os.kill(process.pid, number)
+        claim_folder("compare", CompareSettings(out=tmp_path))
+    if number is None:
+        here.send("end")
+    else:
+        os.kill(process.pid, number)
     process.join()
     claim_folder("compare", CompareSettings(out=tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]

@@ -30,8 +30,6 @@ def run_of(certificate, name, scenarios=ALL, episodes=8):
 def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():
     assert scenario_named("worst-case-disturbance") == "worst-case disturbance"
     assert other_scenarios(("as-trained", "worse-channel", "worse channel")) == ("worse channel",)
-    with pytest.raises(ValueError, match="unknown scenario 'worse'; known are as trained, worst-case disturbance"):
-        scenario_named("worse")
 
 
 def test_each_condition_changes_one_thing_in_both_kinds_of_environment():
@@ -64,8 +62,6 @@ def test_worse_channel_uses_what_the_contract_leaves_and_bursts_get_denser():
     assert (worse.loss.loss_good, worse.loss.loss_bad, worse.delay) == (0.5, 0.8, 1)
     assert worse_channel(Channel(), None) == Channel(loss=0.5, delay=1)
     assert worse_channel(Channel(), ChannelContract(max_age=3)) == Channel(delay=1)
-    with pytest.raises(ValueError, match="no channel within the contract is worse"):
-        worse_channel(Channel(), ChannelContract(max_age=0))
 
 
 @pytest.fixture(scope="module")

@@ -33,19 +33,3 @@ def test_value_that_no_file_can_keep_stays_a_text():
         "delay": "{1, 2}",
         "jitter": "b'1'",
     }
-
-
-@pytest.mark.parametrize(
-    ("texts", "words"),
-    [
-        (["loss"], "expected NAME=VALUE"),
-        (["=0.5"], "expected NAME=VALUE"),
-        (["my loss=0.5"], "expected NAME=VALUE"),
-        (["loss=0.1", "loss=0.2"], "loss is given twice"),
-    ],
-)
-def test_what_is_no_assignment_is_refused(texts, words, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit):
-        _parse(["compare", "--channel", *texts])
-    assert words in capsys.readouterr().err

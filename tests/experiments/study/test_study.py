@@ -84,22 +84,6 @@ def test_finished_runs_are_kept_and_give_the_same_summary(finished, capsys):
     assert (finished.out / "summary.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"budget": 0.0}, "--budget"),
-        ({"budget": 1.5}, "--budget"),
-        ({"seeds": 0}, "--seeds"),
-        ({"envs": ()}, "--envs"),
-        ({"envs": (CRUISE, CRUISE)}, "--envs"),
-        ({"channel_episodes": -1}, "--channel-episodes"),
-    ],
-)
-def test_impossible_settings_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        StudySettings(**change)
-
-
 def test_a_page_without_marks_is_refused_before_anything_runs(tmp_path):
     (tmp_path / "page.md").write_text("no mark")
     with pytest.raises(ValueError, match="no mark"):

@@ -200,12 +200,6 @@ def test_quoted_tables_replace_what_stands_between_the_marks():
     assert quoted(once, {"agents": "new"}) == once
 
 
-@pytest.mark.parametrize(("page", "message"), [("no mark", "no mark"), ("<!-- ncs study: x -->\n<!-- end -->", "'x'")])
-def test_pages_without_a_known_mark_are_refused(page, message):
-    with pytest.raises(ValueError, match=message):
-        quoted(page, {"agents": "new"})
-
-
 def test_small_margins_are_not_drawn_and_small_prices_are():
     # Small numbers beside the points are margins; "penalized:10" has a price.
     summary = study(**{"trusting:10": (10.0, 0.0, 0.5), "penalized:10": (11.0, 0.0, 0.5)})[0]

@@ -1,16 +1,20 @@
-"""Scalar environments that are fed with what a vector environment draws, and the comparison of both at every step."""
+"""Scalar shields, vector shields and loops fed with the same draws, bare environments too, compared at every step."""
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym.network.downlink import no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.processes.plant_step import PlantSimulation
+from shields import Certificate, SafeLoop, SafetyShield, VectorSafetyShield
 from tests import arrays
 
 
@@ -73,11 +77,17 @@ class ScriptedEnv(NCSEnv):
     """The scalar environment fed with what one environment of a vector drew."""
 
     def follow(self, many: NCSVectorEnv, index: int) -> None:
-        """Begins in the state of an episode of the vector that has just begun."""
+        """Says which environment of which vector is followed."""
         self.many, self.index = many, index
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple:
+        """Begins in the state of the episode that its environment of the vector has just begun."""
+        many, index = self.many, self.index
         self.np_random = np.random.default_rng(0)
         links = {"channel": many.episode_channels[index], "downlink": many.episode_downlinks[index]}
-        self.reset(options={"state": many._state[:, index], **links})
+        super().reset(options={"state": many._state[:, index], **links})
+        if np.isnan(many.starts[index]).any():
+            self.start = self.initial_set
         self._process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
         self.estimator.reset(many._estimator.mean[:, index])
         self._task_state = np.copy(many._task_state[..., index])[()]
@@ -88,15 +98,21 @@ class ScriptedEnv(NCSEnv):
         if self.downlink is not None:
             states = many._downlink_state._channel_state._loss_state
             self._downlink_state.in_flight._loss_state = LossState(*(kept[index] for kept in states))
-        self.np_random = ScriptedGenerator()
+        self.np_random, self._violations = ScriptedGenerator(), 0.0
+        info = self._info(no_inputs(self.plant.m), self.plant.constraint_values(self._state), arrived=False)
+        return self._observation(), info
 
-    def replay(self, action: np.ndarray) -> tuple:
+    def step(self, action: np.ndarray) -> tuple:
         """Steps with what the vector drew at its last step."""
         self.hear()
-        result = self.step(action)
+        result = super().step(action)
         sends = self._channel_state.sends_at(self.steps)
         assert not (sends and self.np_random.numbers)  # where nothing is sent, less is drawn
         return result
+
+    def go_on_from(self, state: np.ndarray) -> None:
+        """Takes over a state that is the same but for rounding, which unstable plants enlarge."""
+        self._state = state.copy()
 
     def hear(self) -> None:
         """Takes over what the vector drew at its last step."""
@@ -106,7 +122,7 @@ class ScriptedEnv(NCSEnv):
         self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
 
 
-def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -> list[Any]:
+def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     """Scalar environments that follow each environment of a vector, which is made to record."""
     single = many.single
     allowed = single.allow_assumption_violation
@@ -121,22 +137,11 @@ def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -
         rng.notes = True
 
     many._begin = begin_unnoticed
-    names = (
-        "plant",
-        "channel",
-        "task",
-        "disturbance",
-        "initial_set",
-        "terminate_on_violation",
-        "contract",
-        "horizon",
-        "noise",
-    )
-    settings = {name: getattr(single, name) for name in names}
-    settings |= {name: getattr(single, name) for name in ("allow_assumption_violation", "observe")}
+    names = "plant channel task disturbance initial_set terminate_on_violation contract horizon noise observe"
+    settings = {name: getattr(single, name) for name in (*names.split(), "allow_assumption_violation")}
     if single.downlink is not None:
         settings |= {"downlink": single.downlink, "downlink_contract": single.downlink_protocol.contract}
-    singles = [kind(**settings) for _ in range(many.num_envs)]
+    singles = [ScriptedEnv(**settings) for _ in range(many.num_envs)]
     for index, each in enumerate(singles):
         each.follow(many, index)
     return singles
@@ -151,46 +156,177 @@ def holding_gain(plant: LinearPlant) -> np.ndarray:
     return regulator_gain(inverse @ plant.A @ scale, inverse @ plant.B * plant.u_max, 1, 1) @ inverse
 
 
-def compare(many: NCSVectorEnv, steps: int, options: dict[str, Any] | None = None) -> int:
-    """Steps a vector and, with the same draws, scalar ones; compares everything; returns how many alarms there were."""
-    many.reset(seed=3, options=options)
-    singles, rng, gain = scalar_versions(many), np.random.default_rng(0), holding_gain(many.plant)
-    width, alarms, estimates = 0.1 if gain.any() else 1.2, 0, np.zeros((many.num_envs, many.plant.n))
+class LoopBeside:
+    """A loop without Gymnasium that is handed what the estimator of a scalar environment is given."""
+
+    def __init__(self, shield: SafetyShield) -> None:
+        self.shield, self.loops, self.packets = shield, {}, []
+
+    def start(self, info: dict[str, Any]) -> None:
+        """Begins an episode that the shield has begun."""
+        env, channel = self.shield.unwrapped, self.shield.unwrapped.episode_channel
+        if channel not in self.loops:
+            behind = {"downlink": env.downlink, "downlink_contract": env.downlink_contract, "on_unproved": "ignore"}
+            given = self.shield.certificate, env.plant, channel, self.shield.filter.mode
+            self.loops[channel] = SafeLoop(*given, **behind)
+        self.loop, estimator = self.loops[channel], env.estimator
+        vars(estimator).pop("advance", None)
+        advance = estimator.advance
+
+        def overheard(u: Any, packets: Any) -> None:
+            self.packets = list(packets)
+            advance(u, self.packets)
+
+        estimator.advance = overheard
+        self.loop.start(estimator.estimate.mean, initial_set=env.start)
+        self.sent = info["packets"]
+        self.assert_same(info)
+
+    def pickle(self) -> None:
+        """Goes on as a loop that was pickled and loaded."""
+        self.loop = self.loops[self.loop.channel] = pickle.loads(pickle.dumps(self.loop))
+
+    def decide(self, action: np.ndarray, *, ask: bool) -> None:
+        """Decides about the action that the shield is about to be given."""
+        self.decision = self.loop.decide(self.loop.filter.plant.u_max * np.asarray(action, np.float64), ask=ask)
+
+    def compare(self, info: dict[str, Any]) -> None:
+        """Compares the decision with the shield's, and then what both make of the step."""
+        arrays.assert_equal(self.decision.input, info.get("input_committed", info["input"]))
+        arrays.assert_equal(self.decision.margin, info["shield_margin"])
+        assert self.decision.intervened == info["shield_intervened"]
+        if self.loop.channel.on_request:
+            assert self.loop.request <= (info["packets"] > self.sent)  # what is not heard is sent
+        self.sent = info["packets"]
+        told = info["input"] if info.get("downlink_broken") else None
+        self.loop.receive([each._replace(episode=self.loop.episode) for each in self.packets[::-1]], applied=told)
+        self.assert_same(info)
+
+    def assert_same(self, info: dict[str, Any]) -> None:
+        """Compares what is known and what is proved."""
+        arrays.assert_close(self.loop.estimate, info["estimate"], rtol=1e-9, atol=1e-12)
+        arrays.assert_close(self.loop.error_shape, info["error_shape"], rtol=1e-9, atol=1e-15)
+        assert (self.loop.guaranteed, self.loop.reason) == (info["shield_guaranteed"], info["shield_reason"])
+        assert (self.loop.measurement_age, self.loop.steps) == (info["measurement_age"], self.shield.unwrapped.steps)
+        assert self.loop.plan_length == info.get("shield_plan_length", 0)
+
+
+@dataclass
+class Seen:
+    """What happened in a comparison."""
+
+    alarms: int = 0
+    interventions: int = 0
+    plans: int = 0
+    forced: int = 0
+    broken: int = 0
+    reasons: set[str] = field(default_factory=set)
+
+    def note(self, infos: dict[str, Any]) -> None:
+        """Counts what the infos of a vector say."""
+        self.alarms += int(infos["assumption_violated"].sum())
+        self.broken += int(infos["contract_broken"].sum())
+        self.interventions += int(np.sum(infos.get("shield_intervened", 0)))
+        self.plans += int(np.sum(infos.get("shield_plan_length", 0)))
+        self.forced += int(np.sum(infos.get("request_forced", 0)))
+        self.reasons |= set(infos.get("shield_reason", ()))
+
+
+def compare(
+    many: NCSVectorEnv,
+    steps: int,
+    options: dict[str, Any] | None = None,
+    certificate: Certificate | None = None,
+    mode: str = "project",
+    anew: tuple[int, ...] = (),
+) -> Seen:
+    """Steps a vector and, with the same draws, scalar environments; compares everything that both say.
+
+    With a certificate all are shielded, and a loop without Gymnasium runs beside each scalar shield.
+
+    Args:
+        many: The vector environment.
+        steps: How many steps.
+        options: Of the first reset.
+        certificate: That of the shields; None compares bare environments.
+        mode: Of the shields.
+        anew: Before which steps every third environment is reset alone.
+    """
+    shielded = certificate is not None
+    settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore"}
+    outer = VectorSafetyShield(many, certificate, **settings) if shielded else many
+    _, infos = outer.reset(seed=3, options=options)
+    singles = scalar_versions(many)
+    outers = [SafetyShield(each, certificate, **settings) if shielded else each for each in singles]
+    loops = [LoopBeside(each) for each in outers] if shielded else []
+    rng, gain, seen = np.random.default_rng(0), holding_gain(many.plant), Seen()
+    seen.note(infos)
+    # Without a shield that keeps it there, nothing may drive an unstable plant out of its box.
+    held = gain.any() and (not shielded or mode == "monitor")
+    over = np.zeros(many.num_envs, np.bool_)
+    push = many.plant.weight @ many.plant.A if not shielded else certificate.M @ many.plant.A
+    rtol, atol = (1e-5, 1e-7) if shielded else (1e-10, 1e-10)  # where actions are rounded to float32, or not
+
+    def begin(index: int, infos: dict[str, Any]) -> None:
+        _, info = outers[index].reset()
+        assert_same("reset", info, infos, index, rtol, atol)
+        if shielded:
+            loops[index].start(info)
+
+    for index in range(many.num_envs):
+        begin(index, infos)
     for number in range(steps):
-        actions = rng.uniform(-width, width, many.action_space.shape) + estimates @ gain.T
+        if number in anew:
+            chosen = np.arange(many.num_envs) % 3 == 0
+            chosen |= many.autoreset_mode is AutoresetMode.NEXT_STEP and over
+            _, infos = outer.reset(options=(options or {}) | {"reset_mask": chosen})
+            for index in np.flatnonzero(chosen).tolist():
+                begin(index, infos)
+            if shielded:
+                loops[-1].pickle()
+        actions = rng.uniform(-0.1 if held else -1.2, 0.1 if held else 1.2, many.action_space.shape)
+        actions += infos["estimate"] @ gain.T if held else 0.0
+        if shielded and not held and number % 2:
+            actions = np.sign(infos["estimate"] @ push.T @ many.plant.B + 1e-12)
         actions, episodes = actions.astype(np.float32), many.episodes.copy()
         many.np_random.drawn = []
+        asked = np.zeros(many.num_envs, np.bool_)
         if many.channel.on_request:
             asked = rng.random(many.num_envs) < 0.2
             many.request(asked)
-            for single, asks in zip(singles, asked, strict=True):
-                single.request(bool(asks))
-        observations, rewards, terminated, _, infos = many.step(actions)
+        observations, rewards, terminated, truncated, infos = outer.step(actions)
+        over = terminated | truncated
+        seen.note(infos)
         for index, single in enumerate(singles):
             begun, last = many.episodes[index] != episodes[index], (observations, infos)
             if begun and many.autoreset_mode is AutoresetMode.SAME_STEP:
                 last = infos["final_obs"], infos["final_info"]
             elif begun:
-                single.follow(many, index)
+                begin(index, infos)
                 continue
-            observation, reward, done, _, info = single.replay(actions[index])
-            arrays.assert_close(last[0][index], observation, rtol=1e-6, atol=1e-10)
-            arrays.assert_close(rewards[index], reward, rtol=1e-10, atol=1e-10)
+            if many.channel.on_request:
+                single.request(bool(asked[index]))
+            if shielded:
+                loops[index].decide(actions[index], ask=bool(asked[index]))
+            observation, reward, done, _, info = outers[index].step(actions[index])
+            arrays.assert_close(last[0][index], observation, rtol=max(rtol, 1e-6), atol=atol)
+            arrays.assert_close(rewards[index], reward, rtol=rtol, atol=atol)
             assert terminated[index] == done
-            assert_same(number, info, last[1], index)
+            assert_same(number, info, last[1], index, rtol, atol)
+            if shielded:
+                loops[index].compare(info)
             if begun:
-                single.follow(many, index)
-                continue
-            statistics = many._estimator.histories.table.statistics(many._estimator.statistics[index])
-            arrays.assert_close(statistics.covariance, single.estimator.estimate.covariance, rtol=1e-10)
-            if gain.any():  # an unstable plant makes 1e-17 of rounding 1e-10 in an episode
-                single._state = infos["state"][index].copy()
-        estimates = infos["estimate"]
-        alarms += int(infos["assumption_violated"].sum())
-    return alarms
+                begin(index, infos)
+            elif gain.any():  # an unstable plant makes 1e-17 of rounding 1e-10 in an episode
+                single.go_on_from(infos["state"][index])
+    return seen
 
 
-def assert_same(number: int, single: dict[str, Any], many: dict[str, Any], index: int) -> None:
+def assert_same(where: Any, single: dict[str, Any], many: dict[str, Any], index: int, rtol: float, atol: float) -> None:
+    assert set(single) == {key for key in many if not key.startswith(("_", "final_"))}
     for key, value in single.items():
-        arrays.assert_close(many[key][index], value, rtol=1e-10, atol=1e-10, where=(number, key))
+        if isinstance(value, str):
+            assert value == many[key][index], (where, key)
+            continue
+        arrays.assert_close(many[key][index], value, rtol=rtol, atol=atol, where=(where, key))
         assert np.asarray(value).dtype.kind == many[key].dtype.kind, key

@@ -1,7 +1,5 @@
 """Environments whose commands are late or lost: scalar ones, vectors, and that both are the same."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -77,15 +75,13 @@ def test_estimate_is_the_prediction_with_the_committed_inputs_and_its_error_stay
 
 def test_observation_holds_the_prediction_and_what_is_known_of_the_task_by_then():
     env = NCSEnv(downlink=Channel(delay=2), **(CRUISE | {"task": SpeedTracking(change_probability=0.0)}))
-    env.reset(seed=0)
-    errors, observed = [], []
+    before, _ = env.reset(seed=0)
     for action in (1.0, -0.5, 0.25, 0.75, 0.0, 0.0):
         observation, *_, info = env.step(np.array([action]))
-        speed, target = env._task_state
-        errors.append(target - speed)
-        observed.append(observation[2])
         np.testing.assert_allclose(observation[:2], info["estimate"], rtol=1e-6)
-    np.testing.assert_allclose(observed[:-2], errors[2:], rtol=1e-6)
+        gained = env.plant.dt * info["input_committed"][0]  # of the speed, two steps later
+        np.testing.assert_allclose(observation[2], before[2] - gained, rtol=1e-5)
+        before = observation
 
 
 def test_a_perfect_downlink_changes_nothing_but_the_draws():
@@ -98,26 +94,6 @@ def test_a_perfect_downlink_changes_nothing_but_the_draws():
         *_, info = env.step(action)
         np.testing.assert_array_equal(info["input"], info["input_committed"])
         np.testing.assert_allclose(info["estimate"] - info["estimation_error"], info["state"])
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"downlink": Channel(quantization_step=0.1)}, "a downlink carries inputs as they are, without quantization"),
-        ({"downlink": Channel(send_period=2)}, "a downlink sends a command at every step: leave out send_period"),
-        ({"downlink": 0.3}, "downlink must be of type Channel, got 0.3"),
-        ({"downlink_contract": ChannelContract(2)}, "downlink_contract is about a downlink"),
-        ({"downlink": Channel(delay=3), "downlink_contract": ChannelContract(2)}, "delays commands by up to 3 steps"),
-        ({"downlink": Channel(), "downlink_contract": 2}, "downlink_contract must be of type ChannelContract"),
-        (
-            {"downlink": Channel(delay=900), "contract": ChannelContract(200)},
-            "contracts of uplink and downlink add up to 1100 steps, more than 1000",
-        ),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(settings, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        NCSEnv(**CRUISE, **settings)
 
 
 def test_certificates_rest_on_both_contracts():
@@ -134,10 +110,3 @@ def test_a_contract_that_the_downlink_may_break_is_kept_until_it_does():
     env.reset(seed=0)
     broken = [env.step(np.ones(1))[4]["downlink_broken"] for _ in range(200)]
     assert 5 < sum(broken) < 60  # three losses in a row: an eighth of the steps
-
-
-def test_downlink_is_json():
-    env = gym.make("ncs_gym/TruckTrailerCruise-v0", downlink=DOWNLINKS["bursts"], downlink_contract=ChannelContract(5))
-    copied = gym.make(gym.envs.registration.EnvSpec.from_json(json.dumps(json.loads(env.spec.to_json()))))
-    assert copied.unwrapped.downlink == env.unwrapped.downlink
-    assert copied.unwrapped.downlink_protocol.input_delay == 5

@@ -12,7 +12,7 @@ from tests.ncs_gym.envs.same_draws import compare
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
-@pytest.mark.parametrize("env_id", [CRUISE, "ncs_gym/CartPole-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0"])
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0"])
 def test_age_and_radii_follow_the_tasks_entries(env_id):
     env = gym.make(env_id, observe=("age", "error"))
     plain, n = gym.make(env_id), env.unwrapped.plant.n
@@ -35,9 +35,6 @@ def test_only_what_is_asked_for_is_observed_in_its_order():
     age_first = gym.make(CRUISE, observe=("age", "error")).reset(seed=0)[0]
     np.testing.assert_array_equal(error_first[[0, 1, 2, 5, 3, 4]], age_first)
     assert gym.make(CRUISE, observe=["age"]).observation_space.shape == (4,)
-    for wrong in ("speed", ["age", "age"], [1], 3):
-        with pytest.raises(ValueError, match="observe must be a list of some of"):
-            gym.make(CRUISE, observe=wrong)
 
 
 def test_vector_observes_the_same():

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Estimator, LinearPlant, Packet
+from ncs_gym import Channel, ChannelContract, LinearPlant
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.set_membership import COARSEST_STEP, SHAPE_STEP, SetMembership
+from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.uncertainty.shape_matrices import is_inside
 
 # A motor whose speed is not measured, with sensors that are worth averaging over many samples.
@@ -27,43 +28,42 @@ CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
 
 
 def run(coarsens, steps):
-    """Follows the plant; returns the estimator, the largest level of the error in its shape, and the new histories."""
+    """Follows the plant; returns its histories, the largest level of the error in its shape, and how many were new."""
     rng, state = np.random.default_rng(0), np.zeros(3)
-    estimator = Estimator(PLANT, CHANNEL, SETS, histories_of(PLANT, CHANNEL, SETS, coarsens))
+    estimator = VectorEstimator(PLANT, histories_of(PLANT, CHANNEL, SETS, coarsens), 1)
     level, lost, unmet = 0.0, 0, 0
-    estimator.reset(state)
     for step in range(1, steps):
         state = PLANT.A @ state + PLANT.nominal_disturbance.sample_boundary(rng)
         lost = lost + 1 if rng.random() < 0.3 and lost < 2 else 0
         sample = PLANT.H @ state + PLANT.sensor_noise.bound.sample_boundary(rng)
-        before = len(estimator._histories)
-        estimator.advance(np.zeros(1), [] if lost else [Packet(step, sample)])
-        unmet += step > steps // 2 and len(estimator._histories) != before
-        error = estimator.mean - state
-        level = max(level, float(error @ np.linalg.solve(estimator.shape, error)))
-        assert is_inside(estimator.shape, SETS.shape_at(estimator.age))
-    return estimator, level, unmet
+        before = len(estimator.histories)
+        estimator.advance(np.zeros((1, 1)), sample[:, None], [(0, np.array([not lost]))])
+        unmet += step > steps // 2 and len(estimator.histories) != before
+        error, shape = estimator.mean[:, 0] - state, estimator.histories.table.shapes[estimator.statistics[0]]
+        level = max(level, float(error @ np.linalg.solve(shape, error)))
+        assert is_inside(shape, SETS.shape_at(estimator.age[0]))
+    assert not estimator.alarm.any()
+    return estimator.histories, level, unmet
 
 
 def test_histories_that_hardly_recur_soon_do_and_the_error_stays_in_its_set(monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_BYTES", 1 << 19)
-    fine, _, many = run(False, 2000)
-    coarse, level, few = run(True, 2000)
+    fine, _, many = run(False, 400)
+    coarse, level, few = run(True, 1600)
     assert level <= 1.0
-    assert not coarse.alarm
-    assert fine._histories.recursion.sets.shape_step == SHAPE_STEP
-    assert coarse._histories.recursion.sets.shape_step == COARSEST_STEP
-    assert few < 0.5 * many
+    assert fine.recursion.sets.shape_step == SHAPE_STEP
+    assert coarse.recursion.sets.shape_step == COARSEST_STEP
+    assert many > 0.9 * 200
+    assert few < 0.5 * 800
 
 
 def test_coarse_graph_stays_coarse_where_it_begins_anew_and_where_it_is_full_again(monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_BYTES", 1 << 17)
-    estimator, level, _ = run(True, 1500)
+    histories, level, _ = run(True, 800)
     assert level <= 1.0
-    assert estimator._histories.recursion.sets.shape_step == COARSEST_STEP
-    assert estimator._histories.recursion.coarser() is estimator._histories.recursion
-    estimator.restart(np.zeros(3), ())
-    assert estimator._histories.coarsens
+    assert histories.coarsens
+    assert histories.recursion.sets.shape_step == COARSEST_STEP
+    assert histories.recursion.coarser() is histories.recursion
 
 
 @pytest.mark.parametrize("step", [SHAPE_STEP, 2.0**-9, COARSEST_STEP])

@@ -69,7 +69,7 @@ def batch_estimate(plant, first, inputs, packets, noise_cov):
 
 
 @pytest.mark.parametrize("p", [None, 1])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(seed, p):
     plant = random_plant(seed, 3, 1, p)
     # Good sensors, so that every Kalman update also shrinks the hard ellipsoid and none is turned down.
@@ -116,24 +116,6 @@ def test_mean_predicts_with_the_applied_input():
     estimator.reset(np.array([0.3, -0.2]))
     estimator.advance(np.array([1.5]), [])
     np.testing.assert_allclose(estimator.estimate.mean, plant.A @ [0.3, -0.2] + plant.B @ [1.5])
-
-
-@pytest.mark.parametrize("stamp", [0, -3, 2, 99, 4 - 3])
-def test_packets_from_nowhere_are_discarded(stamp):
-    # At step 4 with a buffer of 2, stamps 2..4 could be used; 2 is sent twice here.
-    plant = truck_trailer()
-    estimator = Estimator(plant, Channel(delay=2))
-    for packets in ([], [Packet(2, np.full(2, 0.01))], []):
-        estimator.advance(np.zeros(1), packets)
-    ignoring = copy.deepcopy(estimator)
-    estimator.advance(np.zeros(1), [Packet(stamp, np.full(2, 0.02))])
-    ignoring.advance(np.zeros(1), [])
-    for value, wanted in zip(estimator.estimate, ignoring.estimate, strict=True):
-        np.testing.assert_array_equal(value, wanted)
-    assert not estimator.alarm
-    # One that could be used does make a difference.
-    ignoring.advance(np.zeros(1), [Packet(3, np.full(2, 0.02))])
-    assert ignoring.age == 2
 
 
 def test_late_packets_of_the_episode_before_are_discarded():
@@ -207,7 +189,7 @@ CHANNELS = [
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
 def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, seed):
     plant = random_plant(seed, 2 + seed % 3, 1, p=1 + seed % 2) if seed else truck_trailer(mass=4000.0)
 
@@ -217,7 +199,7 @@ def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, s
 
     Sigma = certified_error_set(plant).Sigma
     largest = 0.0
-    for estimator, x in drive(plant, channel, seed, 400, push):
+    for estimator, x in drive(plant, channel, seed, 100, push):
         shape = estimator.estimate.shape
         largest = max(largest, Ellipsoid(shape).gauge(estimator.estimate.mean - x))
         assert np.linalg.eigvalsh(Sigma - shape)[0] >= -1e-15
@@ -228,7 +210,7 @@ def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, s
 def test_partial_measurements_keep_being_used():
     plant = truck_trailer(H=np.array([[1.0, 0.0]]))
     channel = Channel(quantization_step=0.05)
-    ages = [estimator.age for estimator, _ in drive(plant, channel, 0, 500, lambda rng: np.eye(2))]
+    ages = [estimator.age for estimator, _ in drive(plant, channel, 0, 200, lambda rng: np.eye(2))]
     assert np.mean(np.array(ages) == 0) > 0.99
 
 
@@ -298,7 +280,7 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_a_packet_never_leaves_a_larger_ellipsoid_than_ignoring_it(seed):
     plant = random_plant(seed, 2, 1, p=1)
     rng = np.random.default_rng(seed)
@@ -446,7 +428,7 @@ def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bo
     plant = replace(truck_trailer(), measurement_noise_cov=np.eye(2))
     assumed, noise = sets_of(plant).noise, plant.sensor_noise.bound.shape_matrix
     passed = np.zeros(2, dtype=int)
-    for _ in range(200):
+    for _ in range(60):
         along = np.linalg.qr(rng.standard_normal((2, 2)))[0].T
         spread = condition * noise[0, 0] * np.outer(along[0], along[0])
         inverse = quick_test(spread, assumed)
@@ -454,4 +436,4 @@ def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bo
             residual = np.sqrt(noise[0, 0]) * (0.5 * np.sqrt(condition) * along[0] + times * along[1])
             passed[share] += residual @ inverse @ residual <= 1.0
     assert passed[1] == 0
-    assert passed[0] == 200 or condition > 1e4  # what is not vouched for goes to the exact test
+    assert passed[0] == 60 or condition > 1e4  # what is not vouched for goes to the exact test

@@ -28,7 +28,7 @@ def test_kalman_gain_of_the_count_is_filterpys():
     ],
 )
 def test_gain_taken_is_the_kalman_gain_on_the_trucks_and_almost_never_on_the_unstable_plants(name, kind, least):
-    counts = gains_taken(f"ncs_gym/{name}-v0", episodes=2)
+    counts = gains_taken(f"ncs_gym/{name}-v0", episodes=1)
     assert set(counts) <= set(KINDS)
-    assert sum(counts.values()) > 100
+    assert sum(counts.values()) > 50
     assert counts[kind] >= least * sum(counts.values())

@@ -56,8 +56,10 @@ def together(histories, seed):
     return np.array(seen)
 
 
-def check(fill, stride):
-    """Interrupts one that fills a graph, and compares who uses it afterwards with who has a graph of their own."""
+@pytest.mark.parametrize("stride", [12, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fill", [alone, together])
+def test_estimates_and_error_sets_are_the_same_after_an_interruption_of_another_estimator(fill, stride):
+    """One that fills a graph is interrupted; who uses it afterwards equals who has a graph of their own."""
     expected = {use: use(graph(), 1) for use in (alone, together)}
     tried = 0
     for place in places(partial(fill, graph(), 0), stride, *SHARED):
@@ -66,15 +68,4 @@ def check(fill, stride):
             tried += interrupt(place + later, partial(fill, histories, 0))
             for use, wanted in expected.items():
                 np.testing.assert_array_equal(use(histories, 1), wanted)
-    assert tried > 10
-
-
-@pytest.mark.parametrize("fill", [alone, together])
-def test_estimates_and_error_sets_are_the_same_after_an_interruption_of_another_estimator(fill):
-    check(fill, 3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fill", [alone, together])
-def test_estimates_and_error_sets_are_the_same_whichever_line_was_interrupted(fill):
-    check(fill, 1)
+    assert tried > 3

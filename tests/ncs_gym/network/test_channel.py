@@ -104,34 +104,3 @@ def test_random_draws_do_not_depend_on_the_measurement():
             ]
         )
     assert patterns[0] == patterns[1]
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "word"),
-    [
-        ({"loss": 1.1}, "loss"),
-        ({"loss": -0.1}, "loss"),
-        ({"loss": "often"}, "loss"),
-        ({"loss": True}, "loss"),
-        ({"quantization_step": "0.1"}, "quantization_step"),
-        ({"quantization_step": -0.05}, "quantization_step"),
-        ({"quantization_step": np.nan}, "quantization_step"),
-        ({"send_period": 0}, "send_period"),
-        ({"delay": -1}, "delay"),
-        ({"delay": 1.5}, "delay"),
-        ({"jitter": True}, "jitter"),
-    ],
-)
-def test_bad_channels_are_refused(kwargs, word):
-    with pytest.raises(ValueError, match=f"{word} must be"):
-        Channel(**kwargs)
-
-
-def test_a_range_of_delays_is_refused_with_what_stands_for_it():
-    with pytest.raises(ValueError, match=r"got \(1, 2\): jitter is .* delay=1, jitter=1 stands for 1 to 2 steps"):
-        Channel(delay=(1, 2))
-
-
-def test_bad_burst_probability_is_refused():
-    with pytest.raises(ValueError, match="p_good_to_bad must be"):
-        GilbertElliott(p_good_to_bad=2.0, p_bad_to_good=0.5)

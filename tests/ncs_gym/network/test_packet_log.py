@@ -8,7 +8,7 @@ import pytest
 
 from experiments.commands.channel import broken_contracts
 from ncs_gym import ChannelContract, PacketLog, TraceChannel, contract_of
-from ncs_gym.network.packet_loss_and_delay import ChannelState, side_by_side
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 
 PING = """PING host (192.0.2.1) 56(84) bytes of data.
 64 bytes from 192.0.2.1: icmp_seq=1 ttl=64 time=12.3 ms
@@ -44,9 +44,6 @@ def test_log_of_a_loop_is_read_in_steps_with_the_packets_that_are_missing(tmp_pa
     log = PacketLog.load(file, step=0.05)
     assert log.trace(0.05) == (1, -1, 2, 1, -1, 1)
     assert log.period == pytest.approx(0.05)
-    file.write_text("episode,sent,received\n77,1,\n")
-    with pytest.raises(ValueError, match=r"line 2 of .* is not an episode"):
-        PacketLog.load(file)
 
 
 def test_times_that_look_like_milliseconds_are_warned_of(tmp_path):
@@ -73,24 +70,6 @@ def test_stamps_of_ping_give_the_time_between_packets(tmp_path):
     assert log.trace(0.2) == (1, 1, -1, 1, 1)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "at least two packets"),
-        ("0.0,0.1\n", "at least two packets"),
-        ("0.0,0.1\n0.0,0.2\n", "one after the other"),
-        ("1.0,0.5\n2.0,2.1\n", "clocks"),
-        ("0.0,0.1\nlate,0.2\n", "line 2"),
-        ("0.0,0.1\n1.0,inf\n", "clocks|finite"),
-    ],
-)
-def test_unusable_logs_are_refused_with_the_reason(tmp_path, text, message):
-    file = tmp_path / "packets.csv"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        PacketLog.load(file)
-
-
 def ages_by_hand(trace, period, steps):
     """Looks at every packet at every step."""
     ages = []
@@ -101,7 +80,7 @@ def ages_by_hand(trace, period, steps):
     return ages
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_ages_are_those_of_the_newest_sample_and_within_the_contract_of_the_replay(seed):
     rng = np.random.default_rng(seed)
     trace = tuple(np.where(rng.random(60) < 0.3, -1, rng.integers(0, 4, 60)).tolist())
@@ -135,15 +114,6 @@ def test_replay_is_the_record_from_a_random_packet_on():
 def test_longest_run_of_losses_counts_across_the_end():
     assert TraceChannel(trace=(-1, 0, 0, -1, -1)).max_consecutive_losses == 3
     assert contract_of(TraceChannel(trace=(-1, -1))) is None
-
-
-def test_a_loss_beside_a_trace_is_refused():
-    with pytest.raises(ValueError, match="loss of a TraceChannel"):
-        TraceChannel(trace=(0, -1), loss=0.1)
-    with pytest.raises(ValueError, match="trace"):
-        TraceChannel()
-    with pytest.raises(ValueError, match="stands beside equal ones"):
-        side_by_side([TraceChannel(trace=(0, 1)), TraceChannel(trace=(0, 2))])
 
 
 def test_record_is_replayed_in_an_environment_single_and_vectorized_within_its_contract():

@@ -2,7 +2,6 @@
 
 from itertools import product
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -17,14 +16,6 @@ SETTINGS = [
     )
     if shortest <= longest and losses + longest + beyond + input_delay <= 7
 ]
-
-
-class LaterRequests(Requests):
-    """Forces requests one step later than it has to."""
-
-    def __init__(self, *settings, **more):
-        super().__init__(*settings, **more)
-        self._spare += 1
 
 
 def oldest_age(kind, losses, shortest, longest, beyond, input_delay):
@@ -73,13 +64,6 @@ def test_no_requests_losses_and_delays_make_a_sample_older_than_the_contract_all
         assert oldest == losses + longest + beyond, setting  # and no less: the rule forces no sooner than it has to
         count += states
     print(f"input delay {input_delay}: {count:,} states")
-
-
-@pytest.mark.parametrize("input_delay", [0, 1, 2])
-def test_requests_forced_one_step_later_break_every_contract(input_delay):
-    for setting in (each for each in SETTINGS if each[-1] == input_delay):
-        losses, _, longest, beyond, _ = setting
-        assert oldest_age(LaterRequests, *setting)[0] > losses + longest + beyond, setting
 
 
 def cart_pole_loop(kind, *count, **settings):
@@ -200,37 +184,3 @@ def test_trace_on_request_keeps_the_contract():
         *_, info = env.step(np.zeros((50, 1), np.float32))
         ages.append(info["measurement_age"].max())
     assert max(ages) == 8
-
-
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: Channel(on_request=True, send_period=2), "leave out send_period"),
-        (lambda: Channel(on_request=1), "on_request must be True or False"),
-        (
-            lambda: cart_pole_loop(NCSEnv, downlink=Channel(on_request=True)),
-            "for the channel of the samples",
-        ),
-        (
-            lambda: NCSEnv(cart_pole(), Channel(0.1, on_request=True), contract=ChannelContract(9)),
-            "give it max_consecutive_losses",
-        ),
-        (lambda: NCSEnv(cart_pole(), Channel()).request(), r"make it with Channel\(..., on_request=True\)"),
-        (lambda: cart_pole_loop(NCSEnv).request("yes"), "a request is True or False"),
-        (lambda: cart_pole_loop(NCSVectorEnv, 3).request([True]), r"bool of shape \(3,\)"),
-        (lambda: cart_pole_loop(NCSEnv).reset(options={"channel": Channel()}), "give one with on_request=True"),
-        (lambda: NCSEnv(truck_trailer()).reset(options={"channel": Channel(on_request=True)}), "on_request=False"),
-        (lambda: NCSVectorEnv(2, plant=truck_trailer(), channel=[Channel(), Channel(on_request=True)]), "on_request="),
-    ],
-)
-def test_what_makes_no_sense_is_refused(make, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        make()
-
-
-def test_spec_with_samples_on_request_is_json():
-    channel = {"loss": 0.2, "max_consecutive_losses": 1, "on_request": True}
-    env = gym.make("ncs_gym/CartPole-v0", channel=channel, contract={"max_age": 6})
-    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())).unwrapped
-    assert again.channel == env.unwrapped.channel
-    assert again.channel.on_request

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ncs_gym import FunctionProcess, LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym import LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.plants.between_samples import GridRows
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -165,54 +165,11 @@ def test_file_of_a_plant_keeps_the_setting(tmp_path):
     assert "at all times" not in str(batch_reactor())
 
 
-@pytest.mark.parametrize("wrong", [0, -3, 65, 2.5, True, "8", [8]])
-def test_numbers_that_are_no_grid_are_refused(wrong):
-    with pytest.raises(ValueError, match="between_samples must be"):
-        replace(truck_trailer(), between_samples=wrong)
-
-
 def test_once_per_step_is_at_the_sampling_instants_alone():
     plant = replace(truck_trailer(), between_samples=8)
     assert "by any time within a step" in " ".join(plant.assumptions)
     assert replace(plant, between_samples=1).between_samples is None
     assert replace(plant, between_samples=1).fingerprint == truck_trailer().fingerprint
-
-
-def test_a_model_in_continuous_time_is_given_once():
-    bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    model = [[-1.0]], [[1.0]], [[1.0]], [[0.0]]
-    with pytest.raises(ValueError, match="continuous_model is that of sys"):
-        LinearPlant.from_statespace(model, 0.1, box=1.0, u_max=1.0, continuous_model=[[-2.0, 1.0]], **bounds)
-
-
-def test_plants_whose_times_between_samples_nobody_knows_are_refused():
-    plant = truck_trailer()
-    with pytest.raises(ValueError, match="needs a plant that was sampled from a model in continuous time"):
-        replace(plant, continuous_model=None, between_samples=8)
-    with pytest.raises(ValueError, match="is another one"):
-        replace(plant, A=1.001 * plant.A, between_samples=8)
-    with pytest.raises(ValueError, match="bounds every state"):
-        truck_trailer(box=[2.0, np.inf], between_samples=8)
-    model = (plant.continuous_model[:, :2], plant.continuous_model[:, 2:], np.eye(2), np.zeros((2, 1)))
-    given_bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    with pytest.raises(ValueError, match="without input_delay"):
-        LinearPlant.from_statespace(
-            model, 0.5, box=[2.0, 2.0], u_max=4.0, input_delay=1, between_samples=8, **given_bounds
-        )
-    discrete = (plant.A, plant.B, np.eye(2), np.zeros((2, 1)), 0.5)
-    with pytest.raises(ValueError, match="needs a plant that was sampled from a model in continuous time"):
-        LinearPlant.from_statespace(discrete, box=[2.0, 2.0], u_max=4.0, between_samples=8, **given_bounds)
-    pendulum = gym.make("ncs_gym/CartPoleNonlinear-v0").unwrapped.plant
-    with pytest.raises(ValueError, match="without a remainder"):
-        replace(pendulum, continuous_model=cart_pole().continuous_model, between_samples=8)
-
-
-def test_other_processes_are_refused_where_times_between_samples_count():
-    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
-    process = FunctionProcess(lambda x, u: plant.A @ x + plant.B @ u)
-    with pytest.raises(ValueError, match="the plant's own equations"):
-        gym.make(CRUISE, plant=plant, process=process)
-    gym.make(CRUISE, process=process)
 
 
 def test_rows_of_a_grid_are_read_only():

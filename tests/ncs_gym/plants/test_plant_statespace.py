@@ -56,32 +56,6 @@ def test_discrete_model_is_taken_as_it_is(name):
         assert LinearPlant.from_statespace(DISCRETE[name], **REST).fingerprint == plant.fingerprint
 
 
-@pytest.mark.parametrize(
-    ("model", "changes", "words"),
-    [
-        ((A, B, C, D), {}, "the model has no sampling time: give dt"),
-        (DISCRETE["dt unknown"], {}, "the model has no sampling time: give dt"),
-        (DISCRETE["scipy"], {"dt": 0.2}, "dt must be that of the model in discrete time, 0.1, or be left out, got 0.2"),
-        ((A, B, C, np.ones((1, 1))), {"dt": 0.1}, "D of the model must be zero, .* subtract D u"),
-        ((A, B, C, D), {"dt": -0.1}, "dt must be a number > 0"),
-        ((A, B, C, D), {"dt": 0.1, "H": C}, "H come from the state-space model"),
-        ((A, B, C, D), {"dt": 0.1, "input_delay": -1}, "input_delay must be a whole number >= 1"),
-        ((A, B, C, D), {"dt": 0.1, "input_delay": 1.5}, "input_delay must be a whole number >= 1"),
-        ((A, B, C, D), {"dt": 0.1, "input_delay": 1, "initial_cov": np.eye(2)}, "must be given by initial_bound"),
-        ((A, B, np.eye(3), D), {"dt": 0.1}, r"C of the model must have shape \(any, 2\)"),
-        ((A[:1], B, C, D), {"dt": 0.1}, r"A of the model must have shape \(1, 1\), got \(1, 2\)"),
-        ((A, B, C, D, -0.1), {}, "dt must be a number > 0"),
-        ((A, B), {"dt": 0.1}, r"sys must be a state-space model of python-control \(control.ss"),
-        ("plant", {"dt": 0.1}, "sys must be a state-space model"),
-        (SimpleNamespace(num=[1.0]), {"dt": 0.1}, "sys must be a state-space model"),
-    ],
-)
-def test_wrong_models_are_refused_in_one_sentence(model, changes, words):
-    with pytest.raises(ValueError, match=words) as caught:
-        LinearPlant.from_statespace(model, **(REST | changes))
-    assert "\n" not in str(caught.value)
-
-
 def test_model_takes_limits_around_an_operating_point():
     settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")}
     point = {"operating_state": [1.0, 0.0], "operating_input": [2.0]}

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, FunctionProcess, GymProcess, LinearProcess, linear_model
+from ncs_gym import Ellipsoid, linear_model
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import surrounding_shape
 
@@ -129,68 +129,6 @@ def test_ellipsoid_around_points_holds_them_and_is_nearly_the_smallest():
     assert np.linalg.det(shape) < 1.05 * np.linalg.det(root @ root.T)
 
 
-def two_states(state, u):
-    angle, rate = state
-    return np.array([angle + 0.1 * rate, rate + 0.1 * u[0]])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"process": lambda x, u: swing(x, u) + 3.0 * np.abs(x)}, "shrink the box, the input limits or dt"),
-        ({"jacobian_bounds": (JACOBIAN[1], JACOBIAN[0])}, "must be the smallest values, then the largest"),
-        ({"jacobian_bounds": JACOBIAN[0]}, r"jacobian_bounds must be two arrays|jacobian_bounds must"),
-        ({"jacobian_bounds": 3}, r"jacobian_bounds must be two arrays of shape \(2, 3\)"),
-        (
-            {"jacobian_bounds": (JACOBIAN[1], JACOBIAN[1])},
-            "a fresh sample of the remainder is .* correct the jacobian_b",
-        ),
-        (
-            {"jacobian_bounds": JACOBIAN, "A": np.eye(2), "B": np.ones((2, 1))},
-            "give A and B together, or jacobian_bounds",
-        ),
-        ({"A": np.eye(2)}, "give A and B together, or jacobian_bounds"),
-        (
-            {"process": GymProcess(lambda: gym.make("Pendulum-v1"), lambda env: env.unwrapped.state)},
-            "give GymProcess wri",
-        ),
-        (
-            {"process": GymProcess(lambda: gym.make("CartPole-v1"), lambda env: np.zeros(2))},
-            "Box of actions, got Discre",
-        ),
-        ({"process": 3}, "must be a function"),
-        (
-            {"process": two_states, "box": [1.0, 1.0, 1.0]},
-            r"a state of 3 entries \(as box has\) with 1 input \(as u_max",
-        ),
-        ({"process": LinearProcess()}, "the linear process is its own model"),
-        ({"samples": 5}, "samples must be"),
-        ({"safety_factor": 0.9}, "safety_factor must be"),
-    ],
-)
-def test_wrong_argument_is_refused_in_one_sentence(changes, message):
-    with pytest.raises(ValueError, match=message):
-        model(**changes)
-
-
-def test_sample_that_a_bound_does_not_explain_is_refused():
-    """A kink that the first samples miss."""
-    calls = []
-
-    def step(state, u):
-        calls.append(0)
-        return swing(state, u) + (1e-3 if len(calls) > 2_000 else 0.0)
-
-    with pytest.raises(ValueError, match=r"a fresh sample of the remainder is .* use more samples, a larger"):
-        model(step)
-
-
-@pytest.mark.parametrize("name", ["gravity", "mass", "length"])
-def test_pendulum_without_a_length_is_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be"):
-        PendulumProcess(**{name: 0.0})
-
-
 @pytest.mark.parametrize("mass", [1.0, 0.7, 1.4634146])
 def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
     """A float32 torque times 3 / (m l^2) is a float32: gain, torque and product round at the edge of the box."""
@@ -205,31 +143,3 @@ def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
             largest = max(largest, plant.disturbance.gauge(left_out))
     inner.close()
     assert 0.999 < largest <= 1.0
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"box": [0.6, 3.0]}, r"proved for its own .*, which box would replace"),
-        ({"u_max": 4.0, "dt": 0.1}, "which dt, u_max would replace"),
-        ({"mass": 0.04}, "which Pendulum-v1 clips to 8"),
-    ],
-)
-def test_pendulum_that_the_proof_is_not_about_is_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        pendulum(**settings)
-
-
-@pytest.mark.parametrize("vectorized", [False, True])
-def test_proof_about_a_process_with_noise_is_refused(vectorized):
-    rng = np.random.default_rng(0)
-
-    def noisy(state, u):
-        return swing(state, u) + 1e-4 * rng.uniform(-1.0, 1.0, np.shape(state))
-
-    process = FunctionProcess(noisy, vectorized)
-    assert not model(process).remainder.proved
-    with pytest.raises(
-        ValueError, match=r"same state with the same input differ .* bounds on a Jacobian prove nothing"
-    ):
-        model(process, jacobian_bounds=JACOBIAN)

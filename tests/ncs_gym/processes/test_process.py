@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box
 
 from ncs_gym import (
     Channel,
@@ -222,79 +222,6 @@ def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many, lo
     assert not np.any(info["assumption_violated"])
 
 
-class Counted(Inner):
-    action_space = Discrete(2)
-
-
-class Wide(Inner):
-    action_space = Box(-1.0, 1.0, (3,))
-
-
-WRONG = [
-    (GymProcess(Counted, read_state=read), "needs an environment with a Box of actions, got Discrete: wrap it in"),
-    (GymProcess(Wide, read_state=read), r"the plant has 1 inputs, actions have shape \(3,\): give GymProcess write_ac"),
-    (GymProcess(lambda: 3, read_state=read), "make must return a gymnasium.Env, got 3"),
-]
-
-
-@pytest.mark.parametrize(("process", "message"), WRONG)
-def test_inner_environment_that_does_not_fit_is_refused(process, message):
-    with pytest.raises(ValueError, match=message):
-        NCSEnv(plant(), process=process)
-
-
-def test_input_beyond_the_actions_is_refused():
-    with pytest.raises(ValueError, match="goes beyond the actions"):
-        NCSEnv(plant(u_max=1.5), process=INNER)
-
-
-@pytest.mark.parametrize(
-    ("reader", "message"),
-    [
-        (lambda env: env.position, r"must return the state, .* it raised AttributeError"),
-        (lambda env: [1.0, 2.0, 3.0], "must return the 2 finite numbers of the state"),
-        (lambda env: [1.0, np.nan], "must return the 2 finite numbers of the state"),
-        (lambda env: env.state + 1.0, "where write_state wrote .* they must agree"),
-    ],
-)
-def test_state_that_cannot_be_read_is_refused(reader, message):
-    env = NCSEnv(plant(), process=GymProcess(Inner, read_state=reader, write_state=write))
-    with pytest.raises(ValueError, match=message):
-        env.reset(seed=0)
-
-
-def test_what_is_no_process_is_refused():
-    with pytest.raises(ValueError, match="process must be of type Process, got str"):
-        NCSEnv(plant(), process="pendulum")
-    with pytest.raises(ValueError, match="GymProcess: read_state must be a function, got 3"):
-        GymProcess(Inner, read_state=3)
-    with pytest.raises(ValueError, match="the process must be a function"):
-        FunctionProcess(3)
-    with pytest.raises(ValueError, match="disturbance of your own can act only on a process with write_state"):
-        NCSEnv(plant(), process=GymProcess(Inner, read_state=read), disturbance=lambda rng, plant, x: 0.0 * x)
-
-
-@pytest.mark.parametrize("value", [np.ones(3), [1.0, np.inf], "x"])
-def test_function_that_returns_no_state_is_refused(value):
-    env = NCSEnv(plant(), process=FunctionProcess(lambda x, u: value))
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"must return a finite next state of shape \(2,\)"):
-        env.step(np.zeros(1))
-
-
-def test_what_is_no_remainder_is_refused():
-    with pytest.raises(ValueError, match="remainder must be a Remainder"):
-        plant(remainder=0.1)
-    with pytest.raises(ValueError, match="dimension 2"):
-        plant(remainder=Remainder(Ellipsoid(np.eye(3)), True, "an example"))
-    with pytest.raises(ValueError, match="bound of a remainder must be an Ellipsoid"):
-        Remainder(0.1, True, "an example")
-    with pytest.raises(ValueError, match="proved must be"):
-        Remainder(Ellipsoid(np.eye(2)), "yes", "an example")
-    with pytest.raises(ValueError, match="basis of a remainder must be text"):
-        Remainder(Ellipsoid(np.eye(2)), True, 3)
-
-
 def test_file_of_a_plant_keeps_its_remainder(tmp_path):
     whole = plant(remainder=Remainder(Ellipsoid(0.01 * np.eye(2)), False, "an example"))
     whole.save(tmp_path / "plant.json")
@@ -305,13 +232,6 @@ def test_file_of_a_plant_keeps_its_remainder(tmp_path):
         "is assumed to lie in its bound while the state is in the box: an example" in s for s in twin.assumptions
     )
     assert whole.without_remainder.fingerprint == plant().fingerprint
-
-
-def test_environments_of_a_vector_may_not_be_the_same_one():
-    one = gym.make("Pendulum-v1")
-    process = GymProcess(lambda: one, lambda env: env.unwrapped.state)
-    with pytest.raises(ValueError, match="make must return a fresh environment at every call"):
-        NCSVectorEnv(2, plant=plant(), process=process)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

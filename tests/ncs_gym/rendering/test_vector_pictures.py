@@ -53,10 +53,3 @@ def test_recorders_of_gymnasium_and_stable_baselines3_take_it(tmp_path):
     recorder.close()
     assert list((tmp_path / "one").glob("*.mp4"))
     assert list((tmp_path / "two").glob("*.mp4"))
-
-
-def test_environments_that_do_not_exist_are_not_drawn():
-    with pytest.raises(ValueError, match="rendered_env must be a whole number <= 2"):
-        vector(rendered_env=3)
-    with pytest.raises(gym.error.ResetNeeded):
-        vector().render()

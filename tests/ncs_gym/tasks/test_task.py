@@ -50,27 +50,6 @@ def test_observation_bound_is_never_exceeded_at_full_throttle():
         assert abs(task.observe(task_state)[0]) <= task.observation_bound(plant, 200)[0]
 
 
-@pytest.mark.parametrize(
-    ("make", "word"),
-    [
-        (lambda: SpeedTracking(fastest=0.0), "fastest"),
-        (lambda: SpeedTracking(change_probability=1.5), "change_probability"),
-        (lambda: SpeedTracking(input_index=-1), "input_index"),
-        (lambda: SpeedTracking(fastest="25"), "fastest"),
-        (lambda: Regulation(state_cost=1.0), "state_cost"),
-        (lambda: Regulation(state_cost=-np.eye(2)), "state_cost"),
-    ],
-)
-def test_bad_tasks_are_refused(make, word):
-    with pytest.raises(ValueError, match=word):
-        make()
-
-
-def test_tasks_that_do_not_fit_the_plant_say_so(plant):
-    assert "input_index" in SpeedTracking(input_index=1).check(plant)
-    assert "state_cost" in Regulation(state_cost=np.eye(3)).check(plant)
-
-
 def setpoints(**changes):
     return SetpointTracking(**({"output": [1.0, 0.0], "reach": 0.8, "width": 2.0} | changes))
 

@@ -94,41 +94,5 @@ def test_what_rounding_may_have_put_beyond_the_bound_is_scaled_back_and_no_more_
             checked(plant, (1.0 + 1.1e-9) * edge, allow_assumption_violation=False)
 
 
-@pytest.mark.parametrize("d", [[np.nan, 0.0], [0.0], "gust", None])
-def test_what_is_no_disturbance_is_refused(d, plant):
-    with pytest.raises(ValueError, match="the disturbance must"):
-        checked(plant, d, allow_assumption_violation=True)
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        ("gusts", "disturbance must be one of"),
-        (3, "disturbance must be one of"),
-        (BoxDisturbance([0.1, 0.1]), "squared length"),
-        (BoxDisturbance([0.1]), "2 entries"),
-        (BoxDisturbance([0.1, 0.1, 0.1]), "2 entries"),
-        (AdversarialDisturbance(np.eye(3)), "M must have shape"),
-    ],
-)
-def test_bad_disturbances_are_refused(value, words, plant):
-    with pytest.raises(ValueError, match=words):
-        as_disturbance(value, plant, False)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: BoxDisturbance(0.02), "half_widths"),
-        (lambda: BoxDisturbance([-0.1, 0.0]), "half_widths"),
-        (lambda: AdversarialDisturbance(M=3.0), "M must have shape"),
-        (lambda: SinusoidDisturbance("20"), "period"),
-    ],
-)
-def test_bad_settings_are_refused_when_made(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
 def test_box_beyond_the_bound_is_possible_on_purpose(plant):
     assert as_disturbance(BoxDisturbance([0.1, 0.1]), plant, True).half_widths[0] == 0.1

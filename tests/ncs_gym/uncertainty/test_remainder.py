@@ -1,14 +1,11 @@
 """The remainder of a model belongs to the plant that it was found for."""
 
-import copy
-import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, Remainder, linear_model
-from ncs_gym.processes import gym_pendulum
 
 ROOM = {"disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
 
@@ -19,35 +16,6 @@ def swinging(x, u):
 
 
 PLANT = linear_model(swinging, box=[0.5, 1.0], u_max=1.0, dt=0.05, samples=400, **ROOM)
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"box": [1.0, 1.0]}, "box"),
-        ({"box": [0.4, 1.0]}, "box"),
-        ({"u_max": 2.0}, "u_max"),
-        ({"A": np.eye(2)}, "A"),
-        ({"B": [[0.0], [0.1]]}, "B"),
-        ({"dt": 0.1, "u_max": 3.0}, "u_max, dt"),
-    ],
-)
-@pytest.mark.parametrize("made", [lambda plant: plant, copy.deepcopy, lambda plant: pickle.loads(pickle.dumps(plant))])
-def test_remainder_is_not_taken_over_by_another_model_box_or_limit(change, named, made):
-    with pytest.raises(ValueError, match=f"belongs to a plant with another {named}: .*linear_model.* anew if it holds"):
-        replace(made(PLANT), **change)
-
-
-def test_remainder_of_a_plant_is_not_given_to_another():
-    with pytest.raises(ValueError, match="belongs to a plant with another A, B"):
-        LinearPlant(
-            A=np.eye(2), B=[[0.0], [1.0]], box=[0.5, 1.0], u_max=1.0, dt=0.05, remainder=PLANT.remainder, **ROOM
-        )
-
-
-def test_proved_remainder_of_the_pendulum_stays_with_its_box():
-    with pytest.raises(ValueError, match="another box"):
-        replace(gym_pendulum.pendulum(), box=[3.0, 3.0])
 
 
 def test_other_arguments_change_beside_the_remainder(tmp_path):

@@ -1,14 +1,16 @@
 """What is stored and proved where nothing else would show a mistake: restarts, starts in the box, other inputs."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv
-from shields import SafetyFilter, SafetyShield, VectorSafetyShield
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.backup_plans.plan_search import Plans
+from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
-from tests.shields.backup_plans.adversary import box_ellipsoid, case
+from tests.shields.attacks.cases import box_ellipsoid, plan_case
 
 COUNT = 6
 
@@ -16,27 +18,22 @@ COUNT = 6
 @pytest.fixture
 def many():
     """Six reactors behind lookahead, with starts anywhere in an ellipsoid of nearly the size of the box."""
-    plant, horizon, network, contract = case("batch reactor", "overtaking")
+    plant, horizon, network, contract = plan_case("batch reactor", "overtaking")
     start = {"initial_set": box_ellipsoid(plant, 0.95), "disturbance": "adversarial"}
     env = NCSVectorEnv(COUNT, plant=plant, channel=network, contract=contract, **start)
     return VectorSafetyShield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
-
-
-def plans(shield):
-    return np.nan_to_num(shield._stored, nan=9.0)
 
 
 def test_a_restart_before_the_first_step_drops_the_plan_of_the_start_and_no_other(many):
     rng, dropped, n = np.random.default_rng(0), 0, 4
     for seed in range(8):
         _, first = many.reset(seed=seed, options={"state": rng.uniform(-0.9, 0.9, (COUNT, n))})
-        stored, again = plans(many), rng.permutation(COUNT) < COUNT // 2
+        again = rng.permutation(COUNT) < COUNT // 2
         _, info = many.reset(options={"state": np.zeros((COUNT, n)), "reset_mask": again})
         assert (info["shield_plan_length"][again] == 0).all()
         assert info["shield_guaranteed"][again].all()
         for key in ("shield_plan_length", "shield_guaranteed"):
             np.testing.assert_array_equal(info[key][~again], first[key][~again])
-        np.testing.assert_array_equal(plans(many)[..., ~again], stored[..., ~again])
         dropped += np.count_nonzero(first["shield_plan_length"][again])
     assert dropped > 5
 
@@ -58,7 +55,7 @@ def test_a_step_behind_the_shield_drops_every_plan(many, goes_on):
 
 
 def test_a_start_in_the_box_is_decided_to_the_last_digit():
-    plant = case("batch reactor", "overtaking")[0]
+    plant = plan_case("batch reactor", "overtaking")[0]
     row = plant.box_rows[2] / np.linalg.norm(plant.box_rows[2])
     inward, outward = 1.0 - 1e-9, 1.0 + 1e-9
     for scale, inside in ((inward, True), (outward, False)):
@@ -70,7 +67,7 @@ def test_a_start_in_the_box_is_decided_to_the_last_digit():
 
 
 def test_an_estimate_proves_the_box_only_with_room_for_its_error():
-    plant, horizon, _, contract = case("batch reactor", "overtaking")
+    plant, horizon, _, contract = plan_case("batch reactor", "overtaking")
     shield = SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
     shape = 0.01 * np.eye(plant.n)
     errors = shield.errors_of(shape)
@@ -83,7 +80,7 @@ def test_an_estimate_proves_the_box_only_with_room_for_its_error():
 
 
 def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
-    plant, horizon, _, contract = case("cruise", "bursts")
+    plant, horizon, _, contract = plan_case("cruise", "bursts")
     shield = SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
 
     def nothing_found(estimates, *rest):
@@ -108,18 +105,78 @@ def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
     assert kept > 10
 
 
-def test_who_writes_into_a_decision_does_not_change_what_is_stored():
-    plant, horizon, network, contract = case("batch reactor", "overtaking")
-    env = NCSEnv(plant, network, contract=contract, initial_set=box_ellipsoid(plant, 0.95))
-    shield = SafetyShield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
-    written = 0
-    for seed in range(20):
-        shield.reset(seed=seed)
-        for _ in range(4):
-            decision = shield._monitored.decide(plant.u_max)
-            if len(decision.plan):
-                stored = shield._monitored._stored.copy()
-                decision.plan[:] = -plant.u_max
-                np.testing.assert_array_equal(shield._monitored._stored, stored)
-                written += not np.array_equal(stored, decision.plan)
-    assert written > 5
+@pytest.fixture
+def planned():
+    """A loop around a reactor outside S, with a stored plan of at least three inputs."""
+    plant, horizon, channel, contract = plan_case("batch reactor", "overtaking")
+    loop = SafeLoop(certificate_of(plant, contract), plant, channel, "lookahead", horizon, on_unproved="ignore")
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        loop.start(plant.half_widths * rng.uniform(-0.95, 0.95, plant.n))
+        if loop.guaranteed and loop.plan_length > 2:
+            return loop
+    raise AssertionError("no such start")
+
+
+def test_who_writes_into_a_decision_does_not_change_what_is_stored(planned):
+    first = planned.decide(None)  # a controller that failed: the stored plan goes on
+    kept = first.plan.copy()
+    first.plan[:] = -planned.filter.plant.u_max
+    for u in kept[:2]:
+        planned.receive()
+        assert planned.guaranteed
+        assert planned.plan_length == len(kept)
+        decision = planned.decide(None)
+        assert decision.reason == "stored"
+        np.testing.assert_array_equal(decision.input, u)
+        kept = kept[1:]
+
+
+def test_an_input_other_than_the_decided_one_drops_the_stored_plan(planned):
+    planned.decide(None)
+    assert planned.plan_length > 0
+    planned.receive(applied=np.full(2, 0.123))
+    assert planned.plan_length == 0
+    assert planned.reason == OTHER_INPUT
+
+
+def test_a_start_clears_what_was_stored(planned):
+    planned.start(np.zeros(4))
+    assert planned.guaranteed
+    assert planned.plan_length == 0
+
+
+def test_start_outside_the_safe_set_is_guaranteed_exactly_if_a_first_plan_is_certified():
+    plant, horizon, channel, contract = plan_case("batch reactor", "constant delay")
+    certificate, rng, seen = certificate_of(plant, contract), np.random.default_rng(0), set()
+    shield = SafetyShield(NCSEnv(plant, channel, contract=contract), certificate, "lookahead", horizon=horizon)
+    for seed in range(60):
+        start = rng.uniform(-1.0, 1.0, plant.n) * plant.half_widths * rng.choice([0.3, 0.9, 1.05])
+        _, info = shield.reset(seed=seed, options={"state": start})
+        outside = not certificate.safe_set.contains(start)
+        if (np.abs(plant.box_rows @ start) > 1.0).any():
+            assert not info["shield_guaranteed"]
+            assert info["shield_reason"] == NOT_KNOWN_INSIDE
+        elif outside:
+            assert info["shield_guaranteed"] == (info["shield_plan_length"] > 0)
+        else:
+            assert info["shield_guaranteed"]
+            assert info["shield_plan_length"] == 0
+        seen.add((outside, info["shield_guaranteed"]))
+    assert seen == {(False, True), (True, True), (True, False)}
+
+
+def test_final_info_says_what_the_last_decision_stored():
+    env = gym.make_vec("ncs_gym/BatchReactor-v0", num_envs=8, max_episode_steps=5, autoreset_mode="SameStep")
+    certificate = certificate_of(env.unwrapped.plant, env.unwrapped.certificate_contract, safe_set="ellipsoid")
+    shield, lengths = VectorSafetyShield(env, certificate, mode="lookahead"), []
+    shield.reset(seed=0)
+    for step in range(40):
+        *_, truncated, info = shield.step(np.ones((8, 2), np.float32))
+        assert info["shield_plan_length"].dtype == np.int64
+        if truncated.any():
+            assert step % 5 == 4
+            lengths += info["final_info"]["shield_plan_length"].tolist()
+            assert (info["shield_plan_length"] == 0).all()  # starts are in S
+            assert info["final_info"]["_shield_plan_length"].all()
+    assert max(lengths) > 0

@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -10,7 +9,7 @@ from ncs_gym import NCSEnv, NCSVectorEnv, Packet
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE, OLD_SAMPLE
 from tests.certificates import certificate_of
-from tests.shields.backup_plans.adversary import case
+from tests.shields.attacks.cases import plan_case
 
 NAMES = ("cruise", "cart-pole", "batch reactor")
 CHANNEL = "constant delay"
@@ -22,7 +21,7 @@ class World:
     """A plant beside its loop, begun outside S with a plan of at least so many inputs; nature pushes outwards."""
 
     def __init__(self, name, seed, least=1):
-        self.plant, horizon, channel, contract = case(name, CHANNEL if name != "cruise" else "overtaking")
+        self.plant, horizon, channel, contract = plan_case(name, CHANNEL if name != "cruise" else "overtaking")
         self.safe = certificate_of(self.plant, contract).safe_set
         self.loop = SafeLoop(certificate_of(self.plant, contract), self.plant, channel, "lookahead", horizon=horizon)
         self.contract, self.rng = contract, np.random.default_rng(seed)
@@ -84,7 +83,7 @@ def test_a_stored_tail_keeps_the_box_in_silence_and_proves_again_once_the_error_
 
 def world_age():
     """Largest age of a measurement under the contract of the cart-pole."""
-    return case("cart-pole", CHANNEL)[3].max_age
+    return plan_case("cart-pole", CHANNEL)[3].max_age
 
 
 def test_a_tail_that_ends_in_silence_ends_in_the_safe_set_and_the_fallback_proves_nothing_more():
@@ -104,17 +103,15 @@ def test_a_tail_that_ends_in_silence_ends_in_the_safe_set_and_the_fallback_prove
     assert False in proved
 
 
-class Doubt(gym.Wrapper):
+class DoubtfulEnv(NCSEnv):
     """Reports far too large an error where it is told to."""
 
     active = False
 
-    def step(self, action):
-        *rest, info = self.env.step(action)
-        if self.active:
-            known = self.unwrapped._known
-            self.unwrapped._known = known._replace(error_shape=FORGED * known.error_shape)
-        return *rest, info
+    @property
+    def known(self):
+        known = super().known
+        return known._replace(error_shape=FORGED * known.error_shape) if self.active else known
 
 
 class DoubtfulVectorEnv(NCSVectorEnv):
@@ -155,9 +152,9 @@ def drive(env, inner, actions, plan_length):
 
 @pytest.mark.parametrize("name", ["cart-pole", "batch reactor"])
 def test_both_wrappers_say_so_while_a_tail_is_stored_and_the_error_is_not_certified(name):
-    plant, horizon, channel, contract = case(name, CHANNEL)
+    plant, horizon, channel, contract = plan_case(name, CHANNEL)
     certificate, least = certificate_of(plant, contract), 3
-    doubt = Doubt(NCSEnv(plant, channel, contract=contract))
+    doubt = DoubtfulEnv(plant, channel, contract=contract)
     env = SafetyShield(doubt, certificate, "lookahead", horizon=horizon)
     start_with_a_tail(lambda x: env.reset(seed=1, options={"state": x})[1], plant, certificate.safe_set, least)
     lengths = list(drive(env, doubt, np.ones(plant.m, np.float32), 4))

@@ -19,7 +19,7 @@ from tests.certificates import certificate_of
 PLANT, KEY = cart_pole(), bytes(range(32))
 # At most two losses in a row and one or two steps late, either way: ages up to 4 + 4 steps.
 CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2)
-CERTIFICATE = certificate_of(PLANT, ChannelContract(8))
+CONTRACT = ChannelContract(8)
 
 
 class Air:
@@ -79,10 +79,9 @@ class Socket:
 class World:
     """A plant with sensor and actuator by one clock, a controller by another one, and the air between them."""
 
-    def __init__(
-        self, plant=PLANT, certificate=CERTIFICATE, seed=0, offset=1234.0, drift=0.0, uplink=CHANNEL, **settings
-    ):
-        self.plant, self.certificate, self.dt, self.uplink = plant, certificate, plant.dt, uplink
+    def __init__(self, plant=PLANT, certificate=None, seed=0, offset=1234.0, drift=0.0, uplink=CHANNEL, **settings):
+        self.plant, self.dt, self.uplink = plant, plant.dt, uplink
+        self.certificate = certificate_of(plant, CONTRACT) if certificate is None else certificate
         self.air, self.rng = Air(plant.dt, seed, **settings), np.random.default_rng([seed, 1])
         self.offset, self.drift = offset, drift
         self.state, self.history, self.proved, self.missing = np.zeros(plant.n), [], [], []
@@ -178,8 +177,7 @@ class World:
         return max(np.abs(self.plant.box_rows @ state).max() for state in self.history)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("offset", "drift"), [(0.0, 0.0), (1234.0, 3e-4), (-77.7, -3e-4)])
+@pytest.mark.parametrize(("seed", "offset", "drift"), [(0, 0.0, 0.0), (1, 1234.0, 3e-4), (2, -77.7, -3e-4)])
 def test_nothing_leaves_the_box_and_the_proof_holds_while_the_network_keeps_its_contract(seed, offset, drift):
     world = World(seed=seed, offset=offset, drift=drift)
     reasons = world.run(800)
@@ -226,9 +224,9 @@ def test_samples_on_request_are_never_older_than_the_contract_allows_whoever_ask
     )
     world.air.until_worst = True
     world.ask = asking(kind, world)
-    reasons = world.run(900)
+    reasons = world.run(400)
     assert set(reasons) == {""}
-    assert len(reasons) > 800
+    assert len(reasons) > 300
     assert world.worst <= 1.0
     assert max(world.ages) == 6
     assert world.actuator.actuator.echo.missing == 0
@@ -252,7 +250,7 @@ def test_message_recorded_from_a_waiting_sensor_does_not_silence_one_that_is_not
     """A sensor that may be silent for longer than others are is not taken over meanwhile."""
     plant = truck_trailer(mass=4000.0)
     uplink = replace(CHANNEL, on_request=True)
-    world = World(plant, certificate_of(plant, ChannelContract(30)), uplink=uplink, mischief=0.0)
+    world = World(plant, certificate_of(plant), uplink=uplink, mischief=0.0)
     world.run(PRELUDE + 60)
     waiting = [each for each in world.air.recorded if each[1] is world.at_sensor][:3]
     episode, push = world.controller.episode, lambda estimate: plant.u_max * (1.0 if estimate[0] < 0 else -1.0)
@@ -265,7 +263,7 @@ def test_message_recorded_from_a_waiting_sensor_does_not_silence_one_that_is_not
 
 def test_the_same_without_the_shield_leaves_the_box():
     world = World()
-    loop = SafeLoop(CERTIFICATE, PLANT, CHANNEL, "monitor", downlink=CHANNEL, echo_age=10, on_unproved="ignore")
+    loop = SafeLoop(world.certificate, PLANT, CHANNEL, "monitor", downlink=CHANNEL, echo_age=10, on_unproved="ignore")
     world.controller.loop = loop
     world.run(400)
     assert world.worst > 1.0
@@ -430,11 +428,3 @@ def test_network_that_breaks_its_contract_pauses_or_ends_the_proof_and_says_whic
     assert back[-1] == LATE_INPUT  # the actuator ran out of inputs, and its echo says so
     late = next(i for i, missing in enumerate(world.missing) if missing)
     assert max(np.abs(PLANT.box_rows @ state).max() for state in world.history[:late]) <= 1.0
-
-
-def test_controller_asks_for_a_downlink_and_echoes():
-    world = World()
-    for settings in ({"downlink": CHANNEL}, {"echo_age": 5}):
-        loop = SafeLoop(CERTIFICATE, PLANT, CHANNEL, **settings)
-        with pytest.raises(ValueError, match="downlink=Channel"):
-            ControllerNode(loop, Wire(PLANT, 4, KEY), world.at_controller, StepClock(0.02), np.zeros(4), known=True)

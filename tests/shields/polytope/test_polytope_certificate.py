@@ -11,14 +11,14 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import AdversarialDisturbance, LinearPlant, cart_pole
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import CART_POLE_CHANNEL
-from shields import Certificate, CertificateError, SafetyFilter, VectorSafetyShield, synthesize, verify
+from shields import Certificate, CertificateError, VectorSafetyShield, synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.json_documents import document_of
 from shields.polytope import Polytope
@@ -28,30 +28,24 @@ from shields.synthesis.certification import with_largest_polytope, with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 IDS = {"TruckTrailerCruise": 0.93, "CartPole": 0.43, "BatchReactor": 0.75, "Pendulum": 0.71}
 
 
-def both(certificate, plant):
-    """Verdict of either engine; they have to agree."""
-    verdicts = {verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint")}
-    assert len(verdicts) == 1
-    return verdicts.pop()
-
-
 @cache
 def found(name):
-    """Certificate with a polytope, the one that it was made of, and the plant of a registered environment."""
+    """Certificates of a registered environment, with a polytope and of the ellipsoid alone, and its plant."""
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    certificate = certificate_of(env.plant, env.certificate_contract)
-    return with_polytope(certificate, env.plant), certificate, env.plant
+    return *(certificate_of(env.plant, env.certificate_contract, kind) for kind in ("polytope", "ellipsoid")), env.plant
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", *(pytest.param(name, marks=pytest.mark.slow) for name in IDS)])
 def test_polytopes_fill_much_more_of_the_box_and_both_engines_prove_them(name):
-    wide, certificate, plant = found(name)
+    _, certificate, plant = found(name)
+    wide = with_polytope(certificate, plant)
     assert wide.provenance["polytope_share_of_box"] >= IDS[name] > certificate.provenance["share_of_box"]
-    assert both(wide, plant)
+    assert verified(wide, plant).valid
     assert wide.safe_set is wide.polytope
     assert replace(wide, polytope=None, provenance=certificate.provenance) == certificate
     # The ellipsoid lies inside: it is invariant under the same gain, and the polytope is the largest such set.
@@ -60,7 +54,8 @@ def test_polytopes_fill_much_more_of_the_box_and_both_engines_prove_them(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "before", "after"), [("TruckTrailerCruise", 0.95, 0.98), ("BatchReactor", 0.76, 0.81)]
+    ("name", "before", "after"),
+    [("TruckTrailerCruise", 0.95, 0.98), pytest.param("BatchReactor", 0.76, 0.81, marks=pytest.mark.slow)],
 )
 def test_gain_with_the_largest_polytope_is_kept_proved_and_says_what_it_gained(name, before, after):
     wide, certificate, plant = found(name)
@@ -68,7 +63,7 @@ def test_gain_with_the_largest_polytope_is_kept_proved_and_says_what_it_gained(n
     shares = [each.provenance["polytope_share_of_box"] for each in (wide, wider)]
     assert shares[0] == wider.provenance["share_with_gain_of_ellipsoid"] < before < after < shares[1]
     assert f"{100.0 * shares[1]:.4g} % of the safe box's volume ({100.0 * shares[0]:.3g} % with the gain" in str(wider)
-    assert both(wider, plant)
+    assert verified(wider, plant).valid
     assert (wider.K != wide.K).any()
     # The hardest disturbance and a policy that pushes outwards, from the edge of the polytope.
     hardest = AdversarialDisturbance(wider.M)
@@ -98,8 +93,6 @@ def test_gain_of_the_ellipsoid_stays_where_no_other_has_a_larger_polytope():
     tilted = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0], [0.9]], u_max=1.0, **QUIET)
     assert search.points_of_box(tilted, 4) is None
     assert_gain_stays(tilted)
-    with pytest.raises(ValueError, match="search_gain is for polytopes"):
-        synthesize(tilted, safe_set="ellipsoid", search_gain=True)
 
 
 QUIET = {"dt": 1.0, "disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
@@ -117,7 +110,7 @@ def test_polytope_of_a_candidate_is_kept_where_it_is_larger():
     again = synthesize(plant, candidates=[wider])
     shares = [each.provenance["polytope_share_of_box"] for each in (wide, wider, again)]
     assert shares[0] < shares[1] <= shares[2]
-    assert both(again, plant)
+    assert verified(again, plant).valid
 
 
 def test_search_for_a_gain_that_fails_keeps_the_polytope_of_the_first_gain(monkeypatch):
@@ -158,78 +151,12 @@ def test_file_holds_the_polytope_and_one_without_is_as_before(tmp_path):
 
 def test_default_has_a_polytope_around_the_same_ellipsoid_bit_for_bit():
     plant = random_plant(3, 2, 1)
-    plain = synthesize(plant, safe_set="ellipsoid")
-    wide = synthesize(plant)
-    assert wide == synthesize(plant, safe_set="polytope")
+    plain, wide = synthesize(plant, safe_set="ellipsoid"), synthesize(plant)
     assert plain.polytope is None
     assert "none was sought" in str(plain)
     assert wide.polytope is not None
     assert "none was sought" not in str(wide)
     np.testing.assert_array_equal(wide.L, plain.L)
-
-
-def changed(polytope, rows=None, multipliers=None):
-    return Polytope(
-        rows=polytope.rows if rows is None else rows,
-        multipliers=polytope.multipliers if multipliers is None else multipliers,
-    )
-
-
-def without_a_row(polytope, k):
-    rows = np.delete(polytope.rows, k, axis=0)
-    return changed(polytope, rows, np.delete(np.delete(polytope.multipliers, k, axis=0), k, axis=1))
-
-
-def scaled_multipliers(polytope, factor):
-    return changed(polytope, multipliers=factor * polytope.multipliers)
-
-
-def swapped(polytope):
-    order = np.arange(len(polytope.rows))
-    order[[-1, -2]] = order[[-2, -1]]
-    return changed(polytope, rows=polytope.rows[order])
-
-
-MUTANTS = {
-    "a row of the box left out": lambda p, k: without_a_row(p, 0),
-    "a row of the box moved out": lambda p, k: changed(p, rows=np.vstack([p.rows[:1] * (1 - 1e-9), p.rows[1:]])),
-    "a needed row left out": lambda p, k: without_a_row(p, k),
-    "a row moved out": lambda p, k: changed(
-        p, rows=np.vstack([p.rows[:k], 0.999 * p.rows[k : k + 1], p.rows[k + 1 :]])
-    ),
-    "multipliers too small": lambda p, k: scaled_multipliers(p, 1.0 - 1e-4),
-    "multipliers too large": lambda p, k: scaled_multipliers(p, 1.0 + 1e-4),
-    "multipliers of the opposite sign": lambda p, k: scaled_multipliers(p, -1.0),
-    "rows in another order": lambda p, k: swapped(p),
-    "no multipliers": lambda p, k: scaled_multipliers(p, 0.0),
-}
-
-
-@pytest.mark.parametrize("mutant", MUTANTS)
-@pytest.mark.parametrize("name", ["CartPole", "BatchReactor"])
-def test_changed_polytopes_are_refused_by_both_engines(name, mutant):
-    wide, _, plant = found(name)
-    broken = replace(wide, polytope=MUTANTS[mutant](wide.polytope, len(plant.box_rows)))
-    assert not both(broken, plant)
-    with pytest.raises(CertificateError, match="does not verify"):
-        SafetyFilter(broken, plant)
-
-
-@pytest.mark.parametrize("name", ["CartPole", "BatchReactor"])
-def test_polytope_of_other_numbers_is_refused(name):
-    wide, _, plant = found(name)
-    assert not both(replace(wide, K=1.01 * wide.K), plant)
-    larger = replace(wide, D=1.2 * wide.D)
-    broken = [c.name for c in verify(larger, plant).conditions if not c.holds]
-    assert any(name.startswith("(P)") for name in broken)
-    grown = replace(wide, proofs=tuple(replace(proof, Sigma=1.5 * proof.Sigma) for proof in wide.proofs))
-    broken = [c.name for c in verify(grown, plant).conditions if not c.holds]
-    assert any(name.startswith("(P)") for name in broken)
-    tighter = replace(wide, polytope=scaled_multipliers(wide.polytope, 1.0))
-    tighter.polytope.multipliers.setflags(write=True)
-    tighter.polytope.multipliers[len(wide.polytope.rows)] *= 0.5
-    broken = [c.name for c in verify(tighter, plant).conditions if not c.holds]
-    assert broken == ["(PU) input 1 stays within u_max (1 - 2^-24) on the polytope"]
 
 
 @pytest.mark.parametrize(
@@ -269,7 +196,7 @@ def test_file_with_too_many_rows_is_refused_before_they_take_memory(rows, multip
 
 def test_units_of_inputs_do_not_matter():
     plant = random_plant(3, 2, 1)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     tiny = replace(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
     K = certificate.K * 1e-39
     found_there = search.invariant_polytope(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
@@ -384,7 +311,7 @@ def test_chain_of_three_masses_with_two_forces_certifies_within_a_minute():
     assert time.process_time() - begin < 60.0
     assert (plant.n, plant.m) == (6, 2)
     assert wide.provenance["polytope_share_of_box"] > 0.12 > 2.5 * wide.provenance["share_of_box"]
-    assert both(wide, plant)
+    assert verified(wide, plant).valid
 
 
 @pytest.mark.slow
@@ -398,7 +325,7 @@ def test_chain_that_needs_too_many_rows_says_so_within_a_minute_and_keeps_the_el
 
 def test_errors_that_leave_a_face_alone_leave_no_polytope():
     plant = random_plant(3, 2, 1)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     wide = replace(certificate, proofs=(replace(certificate.proofs[0], Sigma=1e4 * certificate.Sigma),))
     with pytest.raises(Infeasible):
         search.invariant_polytope(search.feedback_of(wide), plant, lambda line: None)
@@ -406,7 +333,7 @@ def test_errors_that_leave_a_face_alone_leave_no_polytope():
 
 def test_interrupted_search_keeps_the_ellipsoid():
     plant = random_plant(3, 2, 1)
-    certificate = synthesize(plant, safe_set="ellipsoid")
+    certificate = certificate_of(plant)
 
     def interrupt(line):
         raise KeyboardInterrupt
@@ -428,25 +355,28 @@ def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
     assert "out of reach of float64" in narrow.provenance["no_polytope"]
 
 
-@pytest.mark.parametrize("wrong", ["Polytope", 0, 3, ["polytope"]])
-def test_unknown_kinds_of_sets_are_refused(wrong):
-    with pytest.raises(ValueError, match="safe_set must be"):
-        synthesize(random_plant(3, 2, 1), safe_set=wrong)
-    with pytest.raises(ValueError, match="safe_set='polytope' is for method 'certified'"):
-        synthesize(random_plant(3, 2, 1), "paper", safe_set="polytope")
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 2))
+@pytest.mark.parametrize(("seed", "n", "m"), [(0, 2, 1), (5, 2, 2)])
 def test_random_plants_have_polytopes_that_verify_and_hold_under_extreme_points(seed, n, m):
+    assert_polytope_holds(seed, n, m)
+
+
+@pytest.mark.slow
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 2))
+def test_many_random_plants_have_polytopes_that_verify_and_hold_under_extreme_points(seed, n, m):
+    assert_polytope_holds(seed, n, m)
+
+
+def assert_polytope_holds(seed, n, m):
     plant = random_plant(seed, n, m, gamma=1e-4)
     try:
         wide = synthesize(plant, safe_set="polytope")
     except Infeasible:
-        assume(False)
+        return
     assert (wide.polytope is None) == ("no_polytope" in wide.provenance)
-    assume(wide.polytope is not None)
-    assert both(wide, plant)
+    if wide.polytope is None:
+        return
+    assert verified(wide, plant).valid
     rng = np.random.default_rng(seed)
     x = wide.polytope.sample_boundary(rng, 300)
     error, push = wide.error_set.sample_boundary(rng, 300), plant.disturbance.sample_boundary(rng, 300)
@@ -459,7 +389,7 @@ def test_random_plants_have_polytopes_that_verify_and_hold_under_extreme_points(
         assert image + wide.error_set.support(row @ plant.B @ wide.K) + plant.disturbance.support(row) <= 1.0
 
 
-def testhalf_widths_and_roots_are_upper_bounds():
+def test_half_widths_and_roots_are_upper_bounds():
     rng = np.random.default_rng(0)
     for n in (1, 2, 4):
         rows = rng.standard_normal((n + 2, n)).round(3)
@@ -488,4 +418,4 @@ def test_plant_with_an_oblique_box_has_a_polytope():
     )
     wide = synthesize(plant, safe_set="polytope")
     assert wide.polytope is not None
-    assert both(wide, plant)
+    assert verified(wide, plant).valid

@@ -10,13 +10,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import AdversarialDisturbance, Ellipsoid, LinearPlant
+from ncs_gym import AdversarialDisturbance, ChannelContract, Ellipsoid, LinearPlant
 from ncs_gym.processes.plant_step import BlockSampler
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.projection import closest_between
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.starts import starts_inside
-from shields.synthesis.certification import with_polytope
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -26,13 +25,13 @@ ALL = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleTw
 @cache
 def wide_certificate(name):
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    return with_polytope(certificate_of(env.plant, env.certificate_contract), env.plant), env.plant
+    return certificate_of(env.plant, env.certificate_contract, "polytope"), env.plant
 
 
 @cache
 def random_filter(seed, n, m, mode="project", u_max=2.0):
     plant = replace(random_plant(seed, n, m, gamma=1e-4), u_max=u_max)
-    return SafetyFilter(synthesize(plant, safe_set="polytope"), plant, mode)
+    return SafetyFilter(certificate_of(plant, safe_set="polytope"), plant, mode)
 
 
 def situations(shield, count, seed=0):
@@ -118,7 +117,7 @@ def test_rows_given_twice_or_with_both_signs_change_no_projection():
     results = []
     for box in (plant.box_rows, np.concatenate([plant.box_rows, -plant.box_rows, plant.box_rows])):
         twice = replace(plant, box=box)
-        shield = SafetyFilter(synthesize(twice, safe_set="polytope"), twice)
+        shield = SafetyFilter(certificate_of(twice, safe_set="polytope"), twice)
         estimates, shape, proposals = situations(random_filter(2, 2, 2), 200)
         decisions = [shield.decide(x, shape, u) for x, u in zip(estimates, proposals, strict=True)]
         results.append((np.array([each.input for each in decisions]), [each.reason for each in decisions]))
@@ -297,8 +296,6 @@ def test_polytope_of_a_plant_with_one_state_is_an_interval():
         A=[[1.05]], B=[[0.5]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-4,
         measurement_noise_cov=[[1e-6]], initial_cov=[[1e-6]],
     )  # fmt: skip
-    from ncs_gym import ChannelContract
-
-    certificate = synthesize(plant, contract=ChannelContract(2), safe_set="polytope")
+    certificate = certificate_of(plant, ChannelContract(2), "polytope")
     np.testing.assert_array_equal(certificate.polytope.rows[0], plant.box_rows[0])
     assert SafetyFilter(certificate, plant).decide(np.zeros(1), certificate.Sigma, np.zeros(1)).reason == "safe"

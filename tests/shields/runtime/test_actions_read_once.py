@@ -12,7 +12,7 @@ from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv, truck_trailer
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.interruptions import at, places, tracing
-from tests.shields.attacks.extremes import CHANNELS
+from tests.shields.attacks.cases import CHANNELS
 
 PLANT = truck_trailer(mass=4000.0)
 COUNT = 3

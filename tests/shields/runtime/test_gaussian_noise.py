@@ -1,5 +1,7 @@
 """The shield under noise that may leave every bound: what it still does, and how often the safe set is left."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -42,7 +44,9 @@ def outside_bounds(info):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize(
+    "name", [each if each == "truck" else pytest.param(each, marks=pytest.mark.slow) for each in LOOPS]
+)
 def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
     plant, contract, channel = LOOPS[name]
     certificate, count, rng = certificate_of(plant, contract), 20, np.random.default_rng(0)
@@ -71,7 +75,7 @@ def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
 
 
 # Of a plant without memory, with inputs of no effect: a draw that leaves its ellipsoid by a few percent leaves S.
-DELTA, STEPS, COUNT = 2e-3, 100, 2000
+DELTA, STEPS, COUNT = 2e-3, 100, 1000
 
 
 def tight_plant(delta):
@@ -82,11 +86,13 @@ def tight_plant(delta):
     return LinearPlant(box=[1.02 * radius], **declared)
 
 
-def share_of_exits(plant, noise, mode="project"):
+@cache
+def share_of_exits(delta, noise):
     """The share of episodes whose state leaves S, under random proposals; episodes begin in S."""
+    plant = tight_plant(delta)
     certificate = certificate_of(plant)
     env = NCSVectorEnv(COUNT, plant=plant, channel=Channel(loss=0.3), noise=noise, max_episode_steps=None)
-    shield, rng = VectorSafetyShield(env, certificate, mode=mode), np.random.default_rng(0)
+    shield, rng = VectorSafetyShield(env, certificate), np.random.default_rng(0)
     _, info = shield.reset(seed=0)
     assert info["shield_guaranteed"].all()
     outside = np.zeros(COUNT, np.bool_)
@@ -97,13 +103,12 @@ def share_of_exits(plant, noise, mode="project"):
 
 
 def test_share_of_episodes_that_leave_the_safe_set_is_below_the_union_bound_and_close_to_it():
-    plant = tight_plant(DELTA)
-    bound = bound_violation_probability(plant, Channel(loss=0.3), STEPS)
+    bound = bound_violation_probability(tight_plant(DELTA), Channel(loss=0.3), STEPS)
     assert bound == pytest.approx(STEPS * DELTA)  # nothing but the process noise is Gaussian
-    assert 0.5 * bound < share_of_exits(plant, "gaussian") <= bound
-    assert share_of_exits(plant, "truncated") == 0.0
+    assert 0.5 * bound < share_of_exits(DELTA, "gaussian") <= bound
+    assert share_of_exits(DELTA, "truncated") == 0.0
 
 
 def test_a_smaller_delta_makes_leaving_rarer():
-    shares = [share_of_exits(tight_plant(delta), "gaussian") for delta in (DELTA, DELTA / 20.0)]
+    shares = [share_of_exits(delta, "gaussian") for delta in (DELTA, DELTA / 20.0)]
     assert 0.0 < shares[1] < 0.2 * shares[0]

@@ -85,13 +85,6 @@ def test_shield_that_is_told_so_says_nothing(shielded):
     assert said(lambda: (lose(shield), shield.step(still(shield)))) == []
 
 
-@pytest.mark.parametrize("make", [scalar, vector, loop])
-def test_what_to_do_about_a_lost_guarantee_is_one_of_three(make):
-    for wrong in ("log", None, ["warn"]):
-        with pytest.raises(ValueError, match=r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"):
-            make(on_unproved=wrong)
-
-
 def test_one_environment_of_many_is_enough_and_says_it_in_its_own_episode():
     shield = vector()
     states = np.zeros((3, PLANT.n))
@@ -158,5 +151,3 @@ def test_loop_of_an_agent_hands_the_choice_to_its_shield():
         config.single().reset(options={"state": OUTSIDE})
     with pytest.raises(GuaranteeLostError):
         config.vector(2).reset(options={"state": OUTSIDE})
-    with pytest.raises(ValueError, match="on_unproved must be one of"):
-        ShieldSettings(certificate_of(PLANT), on_unproved="maybe")

@@ -16,7 +16,7 @@ PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
 }
 
 
-@pytest.fixture(scope="module", params=PLANTS)
+@pytest.fixture(scope="module", params=["truck", "2, 1", pytest.param("3, 2", marks=pytest.mark.slow), "4, 3"])
 def case(request):
     plant = PLANTS[request.param]
     return plant, certificate_of(plant)

@@ -119,27 +119,20 @@ def test_what_the_loop_says_is_conditional_where_nothing_is_echoed():
     assert (condition in str(told), condition in str(untold)) == (False, True)
 
 
-@pytest.mark.parametrize("echo", [None, 5, ("1", 0, b"", 0), (1, 0, "", 0), (1, 0)])
-def test_what_is_no_echo_is_refused(echo):
-    loop = loop_with()
-    loop.start(np.zeros(4))
-    with pytest.raises(ValueError, match=r"an echo is what Actuator.echo says"):
-        loop.receive(echoes=[echo])
-
-
 @pytest.mark.parametrize("input_delay", [0, 2, 5])
 def test_wild_stamps_and_inputs_do_not_stop_an_actuator(input_delay):
     actuator = Actuator(input_delay, 1, 10.0)
-    inputs = np.ones((input_delay + 1, 1))
+    inputs, size = np.ones((input_delay + 1, 1)), 0
     for step in range(100):
         wild = [Command(stamp, -inputs) for stamp in (10**9, 2**62, step + input_delay + 2, -(10**9))]
         wild += [Command(step, size * inputs) for size in (1e6, -10.001)]
         actuator.receive([*wild, Command(step, inputs), *wild])
         u = actuator.apply(step)
         assert u.tolist() == [1.0 if step >= input_delay else 0.0]
+        size = len(pickle.dumps(actuator)) if step == 10 else size
     assert actuator.echo.missing == 0
     assert actuator.refused == 100 * 10
-    assert len(actuator._committed) <= 2 * input_delay + 3
+    assert len(pickle.dumps(actuator)) < 2 * size
 
 
 def test_command_that_comes_early_is_kept_for_its_step():
@@ -147,12 +140,6 @@ def test_command_that_comes_early_is_kept_for_its_step():
     actuator.receive([Command(0, np.array([[0.0], [1.0]])), Command(1, np.array([[1.0], [2.0]]))])
     assert [actuator.apply(step).tolist() for step in range(4)] == [[0.0], [1.0], [2.0], [0.0]]
     assert (actuator.missing, actuator.echo.missing) == (True, 1)
-
-
-@pytest.mark.parametrize("u_max", [-1.0, [1.0, 2.0], "10", np.nan])
-def test_limits_of_an_actuator_are_sizes(u_max):
-    with pytest.raises(ValueError, match="u_max must be a size"):
-        Actuator(1, 1, u_max)
 
 
 def far_out(plant, seed):
@@ -189,10 +176,6 @@ def test_wrong_first_estimate_that_is_claimed_to_be_known_is_no_longer_the_only_
     assert loop.guaranteed  # a claim, which may be wrong
     loop.start(np.zeros(4), known=False)
     assert not loop.guaranteed
-    with pytest.raises(ValueError, match="initial_set says what is known"):
-        loop.start(np.zeros(4), np.zeros(4), known=False)
-    with pytest.raises(ValueError, match="known must be"):
-        loop.start(np.zeros(4), known="yes")
 
 
 @pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False), truck_trailer()])

@@ -63,11 +63,12 @@ def random_case(rng, m):
     return wanted, offset, effect, radius, limit
 
 
+@pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("m", [1, 2, 3, 5])
-def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
+def test_projection_agrees_with_a_conic_solver(m, count):
     rng = np.random.default_rng(m)
     compared = bound = failed = 0
-    for _ in range(1000):
+    for _ in range(count):
         wanted, offset, effect, radius, limit = random_case(rng, m)
         found = closest_admissible(wanted, offset, effect, radius, limit)
         try:
@@ -91,9 +92,9 @@ def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
             a, b, c = (effect.T @ effect).item(), (effect.T @ offset).item(), float(offset @ offset)
             line = closest_on_line(wanted.item(), a, b, c, radius, limit.item())
             assert line == pytest.approx(found.item(), rel=1e-9, abs=1e-9)  # as the scalar shield does it
-    assert compared > 300
-    assert failed < 10
-    assert m == 1 or bound > 20  # cases in which an input limit binds too
+    assert compared > 0.3 * count
+    assert failed < 0.01 * count
+    assert m == 1 or bound > 0.02 * count  # cases in which an input limit binds too
 
 
 @pytest.mark.parametrize(
@@ -125,17 +126,18 @@ def hard_case(rng):
     return wanted, offset, effect, np.linalg.norm(offset + effect @ inside) * 1.01, np.ones(3)
 
 
-def test_projection_agrees_with_a_conic_solver_where_limits_bind():
+@pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
+def test_projection_agrees_with_a_conic_solver_where_limits_bind(count):
     rng = np.random.default_rng(0)
     branched = 0
-    for _ in range(1000):
+    for _ in range(count):
         case = hard_case(rng)
         found, expected = closest_admissible(*case), conic_solution(*case)
         assert found is not None
         distance, best = np.linalg.norm(found - case[0]), np.linalg.norm(expected - case[0])
         assert distance <= best * (1 + 1e-4) + 1e-6
         branched += bool((np.abs(found) == 1.0).any())
-    assert branched > 200
+    assert branched > 0.2 * count
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])

@@ -97,11 +97,6 @@ def test_disturbance_set_without_the_remainder_does_not_verify(engine):
     assert "D: the plant's holds the disturbance and the process noise" in broken
 
 
-def test_published_method_knows_no_remainder():
-    with pytest.raises(ValueError, match="remainder_bound"):
-        synthesize(LOCAL, method="paper")
-
-
 def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
     settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)

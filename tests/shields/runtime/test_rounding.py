@@ -43,15 +43,16 @@ def worst_disturbance(certificate, plant, x, u):
     return (1 - 1e-12) * d
 
 
+@pytest.mark.parametrize("count", [60, pytest.param(600, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10, 1e13])
-def test_passed_means_inside_however_far_out_the_estimate_is(size):
+def test_passed_means_inside_however_far_out_the_estimate_is(size, count):
     # Estimates along a direction that A annihilates: products of huge numbers cancel.
     plant = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
     certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
     *_, axes = np.linalg.svd(SINGULAR)
     passed, worst = 0, -1.0
-    for _ in range(300):
+    for _ in range(count):
         inwards, u = rng.choice([-1.0, 1.0]) * axes[0], rng.uniform(-1, 1, 1)
         low, high = 0.0, 8.0
         base = axes[1] * size * rng.uniform(0.5, 1.0)
@@ -64,7 +65,7 @@ def test_passed_means_inside_however_far_out_the_estimate_is(size):
             passed += 1
             worst = max(worst, exact_level(certificate, plant, x, u, worst_disturbance(certificate, plant, x, u)))
     assert worst <= 0.0
-    assert passed > 50
+    assert passed > count // 6
     assert worst > -1e-4 or size > 1e7  # at the edge, as far as float64 can tell
 
 
@@ -85,7 +86,7 @@ def slanted(ratio):
     )
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e3])
+@pytest.mark.parametrize("ratio", [1.0, pytest.param(1e2, marks=pytest.mark.slow), 1e3])
 def test_passed_means_inside_for_thin_safe_sets(ratio):
     plant = slanted(ratio)
     certificate = certificate_of(plant)
@@ -149,12 +150,13 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
         assert p * p + (q - Fraction(tilt) * p) ** 2 <= 1
 
 
+@pytest.mark.parametrize("count", [16, pytest.param(160, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("tilt", [2.0**8, 2.0**10, 2.0**12])
-def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_margin(tilt):
+def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_margin(tilt, count):
     factor = np.array([[1.0, 0.0], [tilt, 1.0]])
     L, rng, nothing, closest = factor @ factor.T, np.random.default_rng(0), np.zeros((0, 2, 2)), 0.0
     test = OneStepTest(L, slanted(10.0))
-    for _ in range(80):
+    for _ in range(count):
         root = factor @ rng.standard_normal((2, 2))
         shape = 0.5 * (root @ root.T + (root @ root.T).T)
         low, high = 0.0, 1e3
@@ -166,16 +168,7 @@ def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_marg
         assert is_positive_semidefinite(subtract(rational(L), rational(low * shape)))
         grown = scale(1 + Fraction(1, 10**4), rational(low * shape))
         closest += not is_positive_semidefinite(subtract(rational(L), grown))
-    assert closest > 40
-
-
-def test_safe_set_too_thin_for_float64_is_refused():
-    with pytest.raises(CertificateError, match="too thin"):
-        certified_root(np.array([[1.0, 1.0], [1.0, 1.0]]))
-    G = np.random.default_rng(0).standard_normal((6, 6)) * 10.0 ** np.linspace(-9, 0, 6)
-    L = G @ G.T
-    with pytest.raises(CertificateError, match="too thin"):
-        certified_root(0.5 * (L + L.T))
+    assert closest > count // 2
 
 
 def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded):

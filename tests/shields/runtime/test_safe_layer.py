@@ -4,20 +4,22 @@ import numpy as np
 import pytest
 import torch
 
-from ncs_gym import ChannelContract, batch_reactor, truck_trailer
-from shields import SafetyFilter, synthesize
+from ncs_gym import truck_trailer
+from shields import SafetyFilter
 from shields.torch import SafeLayer
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 
-@pytest.fixture(scope="module", params=["one input", "two inputs", "three inputs", "polytope"])
+@pytest.fixture(
+    scope="module", params=["one input", "two inputs", "polytope", pytest.param("three inputs", marks=pytest.mark.slow)]
+)
 def setting(request):
     """A plant, its certificate, estimates, inputs and error shapes where many proposals are projected."""
     plant = {"one input": truck_trailer(mass=4000.0)}.get(request.param)
     if plant is None:
         plant = random_plant(0, 4, 3 if request.param == "three inputs" else 2)
-    certificate = synthesize(plant, safe_set="polytope") if request.param == "polytope" else certificate_of(plant)
+    certificate = certificate_of(plant, safe_set="polytope" if request.param == "polytope" else "ellipsoid")
     rng = np.random.default_rng(0)
     estimates = 0.95 * certificate.ellipsoid.sample(rng, 60)
     if request.param == "polytope":
@@ -37,9 +39,6 @@ def test_batches_of_decisions_are_those_of_single_ones(setting):
         assert (many.intervened[e], many.passed[e], many.reason[e]) == (one.intervened, one.passed, one.reason)
     of_one_shape = shield.decide_many(estimates, shapes[3], inputs)
     np.testing.assert_array_equal(of_one_shape.input[3], many.input[3])
-    for wrong in [(estimates[0], shapes, inputs), (estimates, shapes[:5], inputs), (estimates, shapes, inputs[:, :0])]:
-        with pytest.raises(ValueError, match="must be numbers of shape"):
-            shield.decide_many(*wrong)
 
 
 def test_layer_applies_what_the_shield_applies(setting):
@@ -97,35 +96,3 @@ def test_empty_batches_give_empty_ones(setting):
     safe = layer(actions, torch.tensor(empty))
     safe.sum().backward()
     assert safe.shape == (0, plant.m)
-
-
-TWO = torch.zeros((2, 1))
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ((torch.tensor([[np.nan], [0.0]]), torch.zeros(2, 2)), "actions must be finite numbers"),
-        ((torch.tensor([[np.inf], [0.0]]), torch.zeros(2, 2)), "actions must be finite numbers"),
-        ((TWO, torch.tensor([[np.nan, 0.0], [0.0, 0.0]])), "estimates must be finite numbers"),
-        ((TWO, torch.zeros(2, 2), torch.full((2, 2), np.nan)), "error_shapes must be finite numbers"),
-        ((np.zeros((2, 1)), torch.zeros(2, 2)), "actions must be a tensor of floats.* got ndarray"),
-        ((torch.zeros((2, 1), dtype=torch.int64), torch.zeros(2, 2)), "tensor of floats.* got one of torch.int64"),
-        ((torch.tensor(0.0), torch.zeros(2, 2)), r"actions must have shape \(0, 1\)"),
-        ((torch.zeros(1), torch.zeros(2)), r"actions must have shape \(1, 1\) beside 1 actions, got \(1,\)"),
-        ((TWO, torch.zeros(3, 2)), r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)"),
-        ((TWO, torch.zeros(2, 2), torch.zeros(3, 2, 2)), r"error_shapes must have shape \(2, 2\) or \(2, 2, 2\)"),
-        ((TWO, "estimates"), "estimates must be numbers, got str"),
-        ((TWO, None), "estimates must"),
-    ],
-)
-def test_what_is_no_batch_of_numbers_is_refused(given, words):
-    plant = truck_trailer(mass=4000.0)
-    with pytest.raises(ValueError, match=words):
-        SafeLayer(certificate_of(plant), plant)(*given)
-
-
-def test_error_shapes_that_are_none_are_refused():
-    plant = batch_reactor()
-    with pytest.raises(ValueError, match="positive semidefinite"):
-        SafeLayer(certificate_of(plant, ChannelContract(3, 1e-3)), plant, -np.eye(4))

@@ -1,10 +1,9 @@
-"""The loop without Gymnasium: the same decisions and proofs as the wrapper's, and the same attacks."""
+"""The loop without Gymnasium: the same decisions and proofs as the wrapper's."""
 
 import re
 import sys
 from contextlib import nullcontext
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -12,25 +11,18 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     Ellipsoid,
-    Estimator,
-    NCSEnv,
     Packet,
-    UnstablePlantError,
     UnusedPacketsWarning,
     batch_reactor,
     cart_pole,
-    certified_error_set,
     truck_trailer,
 )
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
+from shields import SafeLoop
+from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
-from shields.runtime.safety_filter import MODES
-from tests import arrays
 from tests.certificates import certificate_of
-from tests.ncs_gym.estimation.adversary import Traffic
-from tests.shields.attacks.extremes import RANDOM
+from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 LATE = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=2)
 # Plant, contract, channel.
@@ -55,197 +47,23 @@ def started(name="truck", mode="project", channel=None):
     return loop
 
 
-class Tap:
-    """Overhears what the estimator of an environment is given."""
-
-    def __init__(self, env):
-        self.estimator, self.packets = env.unwrapped.estimator, []
-        self.advance, self.estimator.advance = self.estimator.advance, self._overheard
-
-    def _overheard(self, u, packets):
-        self.packets = list(packets)
-        self.advance(u, self.packets)
-
-
-class Meddler(gym.Wrapper):
-    """Applies something else now and then."""
-
-    def step(self, action):
-        return self.env.step(-action if self.env.unwrapped.steps % 40 == 39 else action)
-
-
-def gust(rng, plant, nominal_next):
-    return (3.0 if rng.random() < 0.03 else 0.9) * plant.nominal_disturbance.sample_boundary(rng)
-
-
-def policy(name, env, rng):
-    plant, M = env.filter.plant, env.certificate.M
-    if name == "random":
-        return lambda info: rng.uniform(-1.5, 1.5, plant.m)
-    return lambda info: np.sign(plant.B.T @ M @ plant.A @ info["estimate"] + 1e-12)
-
-
-def assert_same(loop, info):
-    arrays.assert_equal(loop.estimate, info["estimate"])
-    arrays.assert_equal(loop.error_shape, info["error_shape"])
-    assert (loop.guaranteed, loop.reason) == (info["shield_guaranteed"], info["shield_reason"])
-    assert loop.measurement_age == info["measurement_age"]
-
-
-def follow(env, loop, act, steps, seed, tell=False):
-    """Steps the loop beside the wrapper with the same packets; returns reasons, and whether it intervened."""
-    tap = Tap(env)
-    _, info = env.reset(seed=seed)
-    loop.start(info["estimate"], initial_set=env.unwrapped.start)
-    assert_same(loop, info)
-    reasons, intervened = set(), []
-    for step in range(steps):
-        action, limits = act(info), loop.filter.plant.u_max
-        decision = loop.decide(limits * np.asarray(action, np.float64))
-        *_, info = env.step(action)
-        if not tell:
-            arrays.assert_equal(decision.input, info["input"])
-        assert decision.intervened == info["shield_intervened"]
-        arrays.assert_equal(decision.margin, info["shield_margin"])
-        packets = [
-            packet._replace(episode=loop.episode) for packet in tap.packets[::-1]
-        ]  # not the environment's number
-        loop.receive(packets, applied=info["input"] if tell else None)
-        assert_same(loop, info)
-        assert loop.steps == step + 1 == env.unwrapped.steps
-        reasons.add(loop.reason)
-        intervened.append(decision.intervened)
-    return reasons, intervened
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", LOOPS)
-def test_loop_decides_and_proves_what_the_wrapper_does_with_the_same_packets(name, mode):
-    plant, contract, channel = LOOPS[name]
-    certificate, rng, seen, intervened = certificate_of(plant, contract), np.random.default_rng(0), set(), []
-    for seed, act in enumerate(("random", "outwards")):
-        env = SafetyShield(NCSEnv(plant, channel, disturbance="adversarial", contract=contract), certificate, mode=mode)
-        reasons, overridden = follow(env, loop_of(name, mode), policy(act, env, rng), 80, seed)
-        seen |= reasons
-        intervened += overridden
-    assert (sum(intervened) > 0) is (mode != "lookahead" or name != "n=3 m=2 p=1")  # there a plan saves every proposal
-    assert "" in seen
-    if mode != "monitor" and name != "truck with a contract":  # that channel may break its contract
-        assert seen == {""}
-
-
-@pytest.mark.parametrize("name", ["truck", "cart-pole", "batch reactor"])
-def test_loop_doubts_what_the_wrapper_doubts(name):
-    plant, contract, _ = LOOPS[name]
-    certificate, rng = certificate_of(plant, contract), np.random.default_rng(1)
-    settings = {"disturbance": gust, "allow_assumption_violation": True, "contract": contract}
-    seen = set()
-    for seed, channel in enumerate((Channel(), Channel(loss=0.97))):
-        env = SafetyShield(NCSEnv(plant, channel, **settings), certificate)
-        reasons, _ = follow(env, loop_of(name, channel=channel), policy("random", env, rng), 120, seed)
-        seen |= reasons
-    assert ALARM in seen
-    assert (OLD_SAMPLE in seen) == (name in UNSTABLE)
-    inside_out = Ellipsoid(1.3 * certificate.L)
-    env = SafetyShield(NCSEnv(plant, Channel(), initial_set=inside_out, contract=contract), certificate)
-    start = {follow(env, loop_of(name, channel=Channel()), policy("random", env, rng), 1, s)[0].pop() for s in range(9)}
-    assert "" in start
-
-
-def test_input_that_the_actuator_reports_ends_the_guarantee_as_in_the_wrapper():
-    plant, _, channel = LOOPS["truck"]
-    env = SafetyShield(Meddler(NCSEnv(plant, channel)), certificate_of(plant))
-    act = policy("random", env, np.random.default_rng(0))
-    reasons, _ = follow(env, loop_of("truck"), act, 100, 0, tell=True)
-    assert reasons == {"", OTHER_INPUT}
-
-
-class Plant:
-    """A plant written by hand, with everything its bounds allow: states, worst disturbances, worst noise, packets."""
-
-    def __init__(self, name, channel, max_age, seed):
-        self.plant, contract, _ = LOOPS[name]
-        self.certificate, self.channel = certificate_of(self.plant, contract), channel
-        self.rng = np.random.default_rng(seed)
-        self.x = (1.0 - 1e-9) * self.certificate.safe_set.sample_boundary(self.rng)
-        self.first_estimate = self.x + (1.0 - 1e-9) * self.plant.initial_noise.bound.sample_boundary(self.rng)
-        self.traffic = Traffic(channel, max_age, 1)
-        self.samples, self.step = [], 0
-
-    def move(self, u, e):
-        """Moves under the worst disturbance for S, or for the error e."""
-        plant = self.plant
-        nominal = plant.A @ self.x + plant.B @ u
-        worst = self.certificate.M @ nominal if self.step // 30 % 2 else -plant.A @ e
-        self.x = nominal + plant.nominal_disturbance.extreme_point(worst + 1e-12 * self.rng.standard_normal(plant.n))
-        self.step += 1
-
-    def packets(self, e):
-        """What arrives: late, out of order, twice, and some that no one may use."""
-        plant, rng, q = self.plant, self.rng, self.channel.quantization_step
-        v = plant.sensor_noise.bound.extreme_point(plant.H @ e + 1e-12 * rng.standard_normal(plant.p))
-        y = plant.H @ self.x + v
-        self.samples = [np.round(y / q) * q if q else y, *self.samples[: self.traffic.oldest]]
-        ages = [age for age, _ in self.traffic.arrivals(rng, self.step)]
-        some = [Packet(self.step - age, self.samples[age]) for age in ages]
-        some += [Packet(stamp, self.samples[0] + 9.0) for stamp in (self.step + 1, 0, -3, self.step - 99)]
-        some += some[: rng.integers(0, 3)]
-        rng.shuffle(some)
-        return some
-
-
-def attacked(name, mode, steps, seed=0):
-    """Largest gauges of state and error, and how often inputs were overridden."""
-    plant, contract, _ = LOOPS[name]
-    max_age = None if contract is None else contract.max_age
-    channel = Channel(jitter=max_age or 3, quantization_step=0.0 if contract else 0.01)
-    world, loop = Plant(name, channel, max_age, seed), loop_of(name, mode, channel)
-    loop.start(world.first_estimate, initial_set=world.certificate.safe_set)
-    push, level, error, overridden = plant.B.T @ world.certificate.M @ plant.A, 0.0, 0.0, 0
-    for step in range(steps):
-        away = np.sign(push @ loop.estimate) if step // 50 % 3 else world.rng.uniform(-1.0, 1.0, plant.m)
-        decision = loop.decide(plant.u_max * away)
-        world.move(decision.input, loop.estimate - world.x)
-        loop.receive(world.packets(plant.A @ (loop.estimate - world.x)))
-        assert loop.guaranteed, loop.reason
-        e = loop.estimate - world.x
-        level = max(level, world.certificate.safe_set.gauge(world.x))
-        error = max(error, float(np.sqrt(e @ np.linalg.solve(loop.error_shape, e))))
-        overridden += decision.intervened
-    return level, error, overridden
-
-
-@pytest.mark.parametrize("steps", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
-@pytest.mark.parametrize("name", ["truck", "n=3 m=2 p=1", "cart-pole", "batch reactor"])
-def test_no_disturbance_noise_or_packet_order_drives_the_plant_out_of_the_safe_set(name, mode, steps):
-    level, error, overridden = attacked(name, mode, steps)
-    assert level <= 1.0
-    assert error <= 1.0
-    assert 0 < overridden <= steps
-    if mode == "project":
-        assert level > 0.9  # the attack comes close
-
-
-def test_the_same_attack_leaves_the_safe_set_without_the_filter():
-    with pytest.raises(AssertionError):
-        attacked("truck", "monitor", 500)
+def pushed(plant, x, u, direction):
+    """The next state under the disturbance that pushes it farthest in a direction."""
+    return plant.A @ x + plant.B @ u + plant.nominal_disturbance.extreme_point(direction)
 
 
 @pytest.mark.parametrize("told", [False, True])
 def test_another_input_than_decided_is_told_or_found_out(told):
-    world, loop = Plant("truck", Channel(), None, 0), started(channel=Channel())
-    world.x = np.zeros(2)
-    reasons = []
+    loop, x, reasons = started(channel=Channel()), np.zeros(2), []
     for _ in range(30):
         decision = loop.decide(0.5 * loop.filter.plant.u_max)
         applied = -decision.input
-        world.move(applied, np.ones(2))
-        packet = Packet(loop.steps + 1, world.x)
+        x = pushed(loop.filter.plant, x, applied, -np.ones(2))
+        packet = Packet(loop.steps + 1, x)
         loop.receive([packet], applied=applied if told else None)
         reasons.append(loop.reason)
         if told:  # the estimate follows what was applied: its bound stays true
-            e = loop.estimate - world.x
+            e = loop.estimate - x
             assert e @ np.linalg.solve(loop.error_shape, e) <= 1.0
     assert set(reasons[-20:]) == {OTHER_INPUT if told else ALARM}
     assert (reasons[0] == OTHER_INPUT) is told
@@ -253,13 +71,12 @@ def test_another_input_than_decided_is_told_or_found_out(told):
 
 def test_another_input_than_decided_is_not_seen_without_packets():
     # The documented limitation: nothing that the loop is given says so.
-    world, loop = Plant("truck", Channel(), None, 0), started(channel=Channel())
-    world.x, level = np.zeros(2), 0.0
+    loop, x, level = started(channel=Channel()), np.zeros(2), 0.0
     for _ in range(60):
         loop.decide(0.3 * loop.filter.plant.u_max)
-        world.move(loop.filter.plant.u_max, np.ones(2))
+        x = pushed(loop.filter.plant, x, loop.filter.plant.u_max, np.ones(2))
         loop.receive()
-        level = max(level, world.certificate.safe_set.gauge(world.x))
+        level = max(level, loop.filter.certificate.safe_set.gauge(x))
     assert level > 1.0
     assert loop.guaranteed
 
@@ -321,18 +138,8 @@ def test_what_the_caller_keeps_is_its_own():
     assert loop.guaranteed
 
 
-@pytest.mark.parametrize("packets", [None, Packet(1, np.zeros(2)), 0.5, np.array(1.0)])
-def test_what_is_no_list_of_packets_is_refused_before_anything_moves(packets):
-    loop = started(channel=Channel())
-    loop.decide(0.0)
-    with pytest.raises(ValueError, match="packets must be a list of Packet"):
-        loop.receive(packets)
-    assert loop.steps == 0
-    assert loop.receive([]).shape == (2,)
-
-
 def test_measurement_of_one_output_may_be_a_number():
-    plant = truck_trailer(H=[[1.0, 0.0]])
+    plant = TRUCKS["4000 kg, position only"]
     loops = [SafeLoop(certificate_of(plant), plant, Channel()) for _ in range(2)]
     for loop, measurement in zip(loops, (0.03, [0.03]), strict=True):
         loop.start([0.0, 0.0])
@@ -342,28 +149,11 @@ def test_measurement_of_one_output_may_be_a_number():
     assert loops[0].measurement_age == 0
 
 
-@pytest.mark.parametrize(
-    "packet",
-    [
-        *(Packet(1, np.zeros(3)), Packet(1.5, np.zeros(2)), (1,), None, Packet(1, "near"), Packet("1", np.zeros(2))),
-        *(Packet(1, np.zeros(2), 0.5), Packet(1, np.zeros(2), None), (1, np.zeros(2), 0, 0)),
-    ],
-)
-def test_what_is_no_packet_is_refused_before_anything_moves(packet):
-    loop = started(channel=Channel())
-    loop.decide(0.0)
-    with pytest.raises(ValueError, match=r"a packet is Packet\(stamp, measurement\)"):
-        loop.receive([Packet(1, np.zeros(2)), packet])
-    assert loop.steps == 0
-    assert loop.receive([Packet(1, np.zeros(2))]).shape == (2,)
-    assert loop.measurement_age == 0
-
-
 def test_measurement_that_is_not_finite_is_an_alarm():
     loop = started(channel=Channel())
     loop.step(0.0)
     loop.step(0.0, [Packet(1, [np.nan, 0.0])])
-    assert loop.reason == ALARM
+    assert loop.reason == NOT_FINITE
     loop.start([0.0, 0.0])
     assert loop.guaranteed
 
@@ -401,23 +191,6 @@ def test_packets_of_an_earlier_episode_are_of_no_use_if_steps_are_counted_on():
     assert loop.measurement_age == 1
 
 
-def test_calls_out_of_order_are_refused_in_one_sentence():
-    loop = loop_of("truck")
-    assert (loop.guaranteed, loop.reason) == (False, NOT_STARTED)
-    for call in (loop.receive, lambda: loop.decide(0.0), lambda: loop.step(0.0)):
-        with pytest.raises(RuntimeError, match="call start"):
-            call()
-    loop.start([0.0, 0.0])
-    loop.receive()
-    with pytest.raises(RuntimeError, match="receive was called twice"):
-        loop.receive()
-    loop.decide(0.0)
-    with pytest.raises(RuntimeError, match="decide was called twice"):
-        loop.decide(0.0)
-    loop.receive()
-    assert loop.guaranteed
-
-
 def test_step_is_receive_and_then_decide():
     one, two = started(channel=Channel()), started(channel=Channel())
     for step in range(20):
@@ -440,60 +213,6 @@ def test_start_is_in_the_safe_set_only_if_estimate_or_set_say_so():
     assert loop.reason == NOT_KNOWN_INSIDE
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([0.0],), r"x_hat0 = \(.*, .*\) must have shape"),
-        (([np.nan, 0.0],), r"x_hat0 = \(.*\) must be finite"),
-        (([0.0, 0.0], [1.0]), "initial_set must have shape"),
-        (([0.0, 0.0], Ellipsoid(np.eye(3))), "initial_set must have dimension 2"),
-    ],
-)
-def test_wrong_start_is_refused_and_the_episode_goes_on(arguments, message):
-    loop = started()
-    loop.step(0.0)
-    with pytest.raises(ValueError, match=message):
-        loop.start(*arguments)
-    loop.step(0.0)
-    assert (loop.steps, loop.guaranteed) == (1, True)
-
-
-def test_wrong_settings_are_refused():
-    plant, contract, channel = LOOPS["cart-pole"]
-    certificate = certificate_of(plant, contract)
-    with pytest.raises(ValueError, match="channel must be a Channel"):
-        SafeLoop(certificate, plant, contract)
-    with pytest.raises(ValueError, match="rounds more coarsely"):
-        SafeLoop(certificate, plant, Channel(quantization_step=0.1))
-    with pytest.raises(CertificateError, match="another plant"):
-        SafeLoop(certificate, truck_trailer(), channel)
-    with pytest.raises(ValueError, match="mode must be"):
-        SafeLoop(certificate, plant, channel, mode="hope")
-    assert SafeLoop(certificate, plant, channel).contract == contract
-
-
-def test_shield_around_the_wrong_kind_of_environment_names_the_right_one(certificate):
-    cruise = "ncs_gym/TruckTrailerCruise-v0"
-    vectors, sync = gym.make_vec(cruise, num_envs=2), gym.make_vec(cruise, num_envs=2, vectorization_mode="sync")
-    wrong = [
-        (SafetyShield, vectors, "use VectorSafetyShield"),
-        (SafetyShield, sync, r"wrappers=\[SafetyShield\]"),
-        (VectorSafetyShield, sync, r"wrappers=\[SafetyShield\]"),
-        (VectorSafetyShield, gym.make(cruise), "use SafetyShield for"),
-        (SafetyShield, gym.make("Pendulum-v1"), "got PendulumEnv, which has no linear model"),
-    ]
-    for shield, env, message in wrong:
-        with pytest.raises(ValueError, match=message):
-            shield(env, certificate)
-
-
-def test_unstable_plant_without_its_error_set_is_refused_with_the_remedy():
-    plant, contract, channel = LOOPS["cart-pole"]
-    with pytest.raises(UnstablePlantError, match=r"error_set=certified_error_set\(plant, contract\)"):
-        Estimator(plant, channel)
-    Estimator(plant, channel, error_set=certified_error_set(plant, contract))
-
-
 @pytest.mark.parametrize("name", ["truck", "cart-pole"])
 def test_memory_does_not_grow(name):
     # What is kept of arrival histories depends only on which were met: the same steps once more meet no new one.
@@ -504,7 +223,7 @@ def test_memory_does_not_grow(name):
         rng = np.random.default_rng(0)
         state, x = ChannelState(channel, rng), np.zeros(plant.n)
         loop.start(x)
-        for step in range(1, 6_001):
+        for step in range(1, 1_501):
             x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
             loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
         assert loop.guaranteed

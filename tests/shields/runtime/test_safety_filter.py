@@ -1,5 +1,5 @@
 import pickle
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -7,14 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import Ellipsoid, truck_trailer
+from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from shields import CertificateError, SafetyFilter
+from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.shields.attacks.cases import RANDOM
 
 TWO_STATES = random_plant(3, 2, 1)
+# Actions are so coarse that float32 steps are visible in the test.
+STRONG = replace(TWO_STATES, u_max=1e4)
 
 
 def many(shield, estimates, shapes, inputs):
@@ -40,7 +43,7 @@ def farthest(shape, directions):
     return images / np.sqrt(np.einsum("ki,ki->k", directions, images))[:, None]
 
 
-@pytest.fixture(scope="module", params=[(2, 1), (3, 2), (4, 3)], ids=str)
+@pytest.fixture(scope="module", params=[(2, 1), (4, 3), pytest.param((3, 2), marks=pytest.mark.slow)], ids=str)
 def case(request):
     n, m = request.param
     plant = random_plant(3, n, m)
@@ -188,12 +191,12 @@ def test_indefinite_error_shapes_of_three_states_are_unusable():
     assert shield.margin(u[[0, 0, 0]], skew, u) == pytest.approx(shield.margin(u[[0, 0, 0]], skew.T, u), abs=1e-15)
 
 
+@pytest.mark.parametrize("plant", [STRONG, random_plant(3, 3, 2)], ids=["2, 1", "3, 2"])
 @pytest.mark.parametrize("size", [1e150, 1e308])
-def test_huge_estimates_never_give_a_nan_input(size):
-    plant = replace(random_plant(3, 3, 2), u_max=1e4)
+def test_huge_estimates_never_give_a_nan_input(size, plant):
     shield = SafetyFilter(certificate_of(plant), plant)
-    for signs in product((-1.0, 1.0), repeat=3):
-        decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(3), np.zeros(2))
+    for signs in product((-1.0, 1.0), repeat=plant.n):
+        decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(plant.n), np.zeros(plant.m))
         assert np.isfinite(decision.input).all()
         assert not decision.passed
 
@@ -218,7 +221,7 @@ def test_decide_never_raises(states):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("states", [2, 3])
+@pytest.mark.parametrize("states", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_what_underflows_raises_nothing(states, mode):
     plant = replace(random_plant(3, states, states - 1), u_max=10.0)
     shield = SafetyFilter(certificate_of(plant), plant, mode)
@@ -247,9 +250,6 @@ def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loade
     assert shield.margin([0.0, 0.0], certificate.Sigma.tolist(), [0.0]) > 0.0
     assert not shield.knows_inside(np.array([np.nan, 0.0]), certificate.Sigma)
     assert not shield.knows_inside(np.zeros(2), -certificate.Sigma)
-    for estimate in (np.zeros(3), np.array([np.nan, 0.0]), "here"):
-        with pytest.raises(ValueError, match=r"shape \(2,\)"):
-            shield.fallback_input(estimate)
 
 
 def test_known_inside_ends_at_the_edge(certificate, loaded):
@@ -319,7 +319,7 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
 
 
 def test_boundary_trusts_weak_inputs_of_larger_plants_too():
-    plant = replace(random_plant(3, 3, 2), u_max=0.3)
+    plant = RANDOM["n=3 m=2 p=1"]
     certificate = certificate_of(plant)
     boundary, rng = SafetyFilter(certificate, plant, "boundary"), np.random.default_rng(0)
     reasons = set()
@@ -334,14 +334,6 @@ def test_boundary_trusts_the_agent_where_no_input_can_harm(certificate, loaded):
     shape, u = 0.1 * certificate.Sigma, np.array([4.0])
     assert boundary.decide(np.zeros(2), shape, u).reason == "safe"
     assert boundary.decide(np.array([1.8, 0.5]), shape, 0.0 * u).reason == "fallback"
-
-
-def test_boundary_refuses_too_many_inputs():
-    plant = random_plant(0, 2, 13)
-    certificate = certificate_of(plant)
-    SafetyFilter(certificate, plant, "switch")
-    with pytest.raises(ValueError, match="at most 12 inputs"):
-        SafetyFilter(certificate, plant, "boundary")
 
 
 @given(st.integers(0, 100_000))
@@ -372,27 +364,6 @@ def test_margin_is_that_of_the_contract(certificate, loaded):
     assert shield.margin(estimate, certificate.Sigma, u) == decision.margin
 
 
-def test_filter_refuses_what_does_not_verify(certificate, loaded, plant):
-    with pytest.raises(CertificateError, match=r"\(S\)"):
-        SafetyFilter(replace(certificate, L=1.1 * certificate.L), loaded)
-    with pytest.raises(CertificateError, match="another plant"):
-        SafetyFilter(certificate, plant)
-    with pytest.raises(ValueError, match="SafetyFilter takes a Certificate"):
-        SafetyFilter(loaded, certificate)
-    for certified, known in ((certificate, "plant"), ("certificate", loaded)):
-        with pytest.raises(ValueError, match="SafetyFilter takes a Certificate"):
-            SafetyFilter(certified, known)
-    with pytest.raises(ValueError, match="mode must be one of"):
-        SafetyFilter(certificate, loaded, "hope")
-
-
-def test_filter_cannot_be_changed_once_it_is_verified(certificate, loaded):
-    shield = SafetyFilter(certificate, loaded)
-    for name, value in (("mode", "monitor"), ("plant", truck_trailer()), ("certificate", certificate), ("test", None)):
-        with pytest.raises(FrozenInstanceError):
-            setattr(shield, name, value)
-
-
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
     shield = SafetyFilter(certificate, loaded, "switch")
     shape = 0.1 * certificate.Sigma
@@ -407,8 +378,7 @@ def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
 
 
 def test_projection_leaves_room_for_float32():
-    # Coarse actions: a limit so large that float32 steps are visible in the test.
-    plant = replace(random_plant(3, 2, 1), u_max=1e4)
+    plant = STRONG
     certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
     reasons = []
@@ -437,10 +407,18 @@ def random_cases(rng, shield, count):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 1), (2, 2), (3, 2), (4, 1), (4, 3), (5, 2), (6, 3)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        (1, 1),
+        (2, 1),
+        (4, 3),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in [(2, 2), (3, 2), (4, 1), (6, 3)]),
+    ],
+)
 def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
     plant = replace(random_plant(n, n, m), u_max=0.3 / m)
-    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 300
+    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 150
     estimates, shapes, inputs = random_cases(rng, shield, count)
     found = many(shield, estimates, shapes, inputs)
     ones = [shield.decide(*case) for case in zip(estimates, shapes, inputs, strict=True)]
@@ -466,7 +444,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("states", [2, 3])
+@pytest.mark.parametrize("states", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mode):
     # As if float64 had five digits.
     plant = replace(random_plant(states, states, 1), u_max=0.3)
@@ -489,12 +467,14 @@ def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
     plant = TWO_STATES
     shield, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
     monkeypatch.setattr("shields.runtime.safety_filter.MOST_REMEMBERED", 5)
-    for _ in range(2):
-        for size in np.linspace(0.1, 1.0, 12):
-            errors = shield.errors_of(size * Sigma)
-            assert shield.errors_of((size * Sigma).copy()) is errors
-            np.testing.assert_allclose(errors.half_widths, np.sqrt(size * np.diag(Sigma)))
-            assert len(shield._remembered) <= 5
+    first = shield.errors_of(0.05 * Sigma)
+    for size in np.linspace(0.1, 1.0, 4):
+        errors = shield.errors_of(size * Sigma)
+        assert shield.errors_of((size * Sigma).copy()) is errors
+        np.testing.assert_allclose(errors.half_widths, np.sqrt(size * np.diag(Sigma)))
+    assert shield.errors_of(0.05 * Sigma) is first
+    shield.errors_of(2.0 * Sigma)  # one too many
+    assert shield.errors_of(0.05 * Sigma) is not first
 
 
 def test_a_filter_decides_the_same_after_pickling(certificate, loaded):

@@ -7,10 +7,10 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from agents import LoopConfig, SafetyCallback
+from agents import SafetyCallback
 from agents.loop import CostPenalty
-from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
+from ncs_gym import Channel, LinearPlant, NCSEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
+from shields import SafeLoop, SafetyFilter, SafetyShield, synthesize
 from tests.certificates import certificate_of
 
 PLANT = truck_trailer(mass=4000.0)
@@ -46,11 +46,6 @@ def test_batches_and_tensors_handed_to_a_filter_are_told_of(certificate, estimat
     with pytest.warns(UserWarning, match=words):
         decision = shield.decide(estimate, certificate.Sigma, proposed)
     assert decision.reason == "invalid"
-
-
-def test_unknown_ids_are_refused_where_a_loop_is_described():
-    with pytest.raises(ValueError, match="'ncs_gym/Nothing-v0' is no registered environment"):
-        LoopConfig(env="ncs_gym/Nothing-v0")
 
 
 def test_infos_without_cost_are_named():
@@ -98,12 +93,6 @@ def test_packets_without_the_number_of_a_later_episode_are_named_once(certificat
     assert loop.discarded.other_episode == 3
 
 
-@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
-def test_settings_of_the_channel_say_where_they_belong(make):
-    with pytest.raises(ValueError, match=r"delay is a setting of the channel: give channel=Channel\(delay=...\)"):
-        make("ncs_gym/TruckTrailerCruise-v0", delay="a", loss=0.1)
-
-
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_bounds_of_zero_are_certified_without_a_word():
     none = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
@@ -128,21 +117,3 @@ def test_monitor_has_the_share_of_guaranteed_states(certificate):
     while not (result := shield.step([0.1]))[3]:
         pass
     assert result[4]["episode"]["episode_guaranteed"] == 8 / 20
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_vector_has_the_same_share(certificate, mode):
-    env = NCSVectorEnv(3, plant=PLANT, max_episode_steps=19, autoreset_mode=mode)
-    shield = VectorSafetyShield(env, certificate, on_unproved="ignore")
-    shield.reset(seed=0)
-    for step in range(45):
-        if step == 7:
-            env._estimator.alarm[1] = True
-        *_, truncated, info = shield.step(np.full((3, 1), 0.1))
-        share = info["final_info"]["episode_guaranteed"] if "final_info" in info else info["episode_guaranteed"]
-        if truncated.any():
-            np.testing.assert_allclose(share, [1.0, 8 / 20 if step < 20 else 1.0, 1.0])
-        elif step == 10:
-            np.testing.assert_allclose(share, [1.0, 8 / 12, 1.0])
-    info = shield.reset(options={"reset_mask": np.array([True, False, False])})[1]
-    assert info["episode_guaranteed"].tolist() == [1.0, 1.0, 1.0]

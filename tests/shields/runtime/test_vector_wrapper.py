@@ -3,25 +3,20 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
+from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
+from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor
+from shields import Decision, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
-    EXPLANATIONS,
     NOT_KNOWN_INSIDE,
     OLD_SAMPLE,
     OTHER_STEPS,
-    GuaranteeMonitor,
-    LoopObservation,
 )
-from shields.runtime.safety_filter import MODES
-from shields.runtime.starts import first_store, starts_known
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests import arrays
 from tests.certificates import certificate_of
-from tests.shields.attacks.extremes import CHANNELS, TRUCKS, harmful
+from tests.shields.attacks.cases import CHANNELS, TRUCKS, harmful
 
 KEYS = {
     "shield_intervened",
@@ -32,119 +27,6 @@ KEYS = {
     "shield_reason",
     "episode_interventions",
 }
-
-
-class Watched:
-    """What a scalar shield would know of one environment, from its infos alone."""
-
-    def __init__(self, shield: SafetyFilter):
-        self.shield, self.monitor, self.row = shield, GuaranteeMonitor(shield), {}
-        self.stored = np.empty((0, shield.plant.m))
-
-    def _seen(self, row):
-        self.row = row
-        return LoopObservation(
-            row["estimate"],
-            self.shield.errors_of(row["error_shape"]),
-            bool(row["assumption_violated"]),
-            int(row["measurement_age"]),
-        )
-
-    def decide(self, u):
-        return self.shield.decide(self.row["estimate"], self.row["error_shape"], u, self.stored)
-
-    def margin(self, u):
-        return self.shield.margin(self.row["estimate"], self.row["error_shape"], u)
-
-    def start(self, known, row):
-        report = self._seen(row)
-        self.stored, is_safe = first_store(self.shield, report.estimate, report.errors, known)
-        self.state = self.monitor.start(is_safe, True, report)
-
-    def step(self, decision, row):
-        same_input = np.array_equal(decision.input, row["input"])
-        self.stored = decision.plan if same_input else decision.plan[:0]
-        self.state = self.monitor.advance(self.state, decision, True, same_input, self._seen(row))
-
-    @property
-    def reason(self):
-        return EXPLANATIONS[self.monitor.reasons(self.state, self.row["measurement_age"])]
-
-
-def drive(env, steps, policy):
-    """Steps a shielded vector environment; checks every key against scalar filters and monitors."""
-    shield, inner = env, env.unwrapped
-    safety_filter = SafetyFilter(shield.certificate, inner.plant, shield.filter.mode)
-    watched = [Watched(safety_filter) for _ in range(env.num_envs)]
-    _, info = env.reset(seed=0)
-    (inside,) = starts_known(safety_filter, inner.single.initial_set, 0)
-    counts = np.zeros(env.num_envs, int)
-    for e, one in enumerate(watched):
-        one.start(inside, {key: value[e] for key, value in info.items()})
-    totals, plans = {"interventions": 0, "guaranteed": 0, "reasons": set()}, []
-    for _ in range(steps):
-        actions = policy(info)
-        episodes = inner.episodes.copy()
-        decisions = [one.decide(u) for one, u in zip(watched, inner.inputs_of(actions).T, strict=True)]
-        *_, info = env.step(actions)
-        for e, (one, decision) in enumerate(zip(watched, decisions, strict=True)):
-            row = {key: value[e] for key, value in info.items()}
-            if inner.episodes[e] != episodes[e]:
-                one.start(inside, row)
-                counts[e] = 0
-                assert not row["shield_intervened"]
-                assert not row["input_proposed"].any()
-                assert row["shield_correction"] == 0.0
-                assert row["shield_margin"] == pytest.approx(one.margin(np.zeros(inner.plant.m)), abs=1e-12)
-            else:
-                arrays.assert_close(row["input"], decision.input, rtol=3e-7, atol=1e-9)
-                one.step(decision._replace(input=row["input"]), row)
-                plans.append(len(one.stored))
-                counts[e] += decision.intervened
-                assert row["shield_intervened"] == decision.intervened
-                arrays.assert_close(row["shield_margin"], decision.margin, rtol=1e-6, atol=1e-6)
-                correction = np.linalg.norm(row["input"] - row["input_proposed"])
-                arrays.assert_close(row["shield_correction"], correction, rtol=1e-6, atol=1e-12)
-            assert row.get("shield_plan_length", 0) == len(one.stored)
-            assert row["shield_reason"] == one.reason
-            assert row["shield_guaranteed"] == (not one.reason)
-            assert row["episode_interventions"] == counts[e]
-        totals["interventions"] += int(info["shield_intervened"].sum())
-        totals["guaranteed"] += int(info["shield_guaranteed"].sum())
-        totals["reasons"] |= set(info["shield_reason"].tolist())
-    totals["planned"] = np.count_nonzero(plans)
-    return totals
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", ["TruckTrailerCruise", "BatchReactor"])
-def test_infos_equal_those_of_scalar_shields(name, mode):
-    env = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=6, max_episode_steps=60), mode=mode)
-    rng = np.random.default_rng(1)
-
-    def policy(info):
-        return np.sign(rng.uniform(-1, 1, (6, env.unwrapped.plant.m)) + 0.8).astype(np.float32)
-
-    totals = drive(env, 150, policy)
-    assert totals["interventions"] > 0
-    assert totals["guaranteed"] > 0
-    assert (totals["planned"] > 0) == (mode == "lookahead")
-
-
-def test_reasons_of_broken_proofs_equal_those_of_scalar_shields():
-    env = NCSVectorEnv(
-        8,
-        plant=batch_reactor(),
-        channel=Channel(loss=0.6, quantization_step=1e-3),
-        contract=ChannelContract(2, 1e-3),
-        max_episode_steps=40,
-        disturbance=lambda rng, plant, nominal: 4.0 * plant.disturbance.sample_boundary(rng),
-        allow_assumption_violation=True,
-    )
-    shielded = VectorSafetyShield(env, mode="monitor")
-    rng = np.random.default_rng(0)
-    totals = drive(shielded, 100, lambda info: rng.uniform(-1, 1, (8, 2)))
-    assert len(totals["reasons"]) >= 4
 
 
 @pytest.mark.parametrize("next_tick", [True, False])
@@ -194,23 +76,24 @@ def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
     np.testing.assert_array_equal(actions, [[0.25], [1.0]])
 
 
-@pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
+@pytest.mark.parametrize(
+    ("mode", "channel"), [("switch", "bursts"), ("boundary", "overtaking"), *(("project", each) for each in CHANNELS)]
+)
 def test_no_policy_leaves_the_safe_set(mode, channel):
     plant = TRUCKS["4000 kg"]
-    env = NCSVectorEnv(500, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=100)
+    env = NCSVectorEnv(200, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=100)
     shield = VectorSafetyShield(env, certificate_of(plant), mode)
     _, info = shield.reset(seed=0)
     rng, levels, overridden = np.random.default_rng(0), [], 0
     for step in range(200):
         outwards = np.sign(info["estimate"] @ (shield.certificate.M @ plant.B))
-        actions = outwards if step % 2 else rng.uniform(-1, 1, (500, 1))
+        actions = outwards if step % 2 else rng.uniform(-1, 1, (200, 1))
         _, _, _, _, info = shield.step(actions)
         levels.append(np.einsum("ei,ij,ej->e", info["state"], shield.certificate.M, info["state"]).max())
         assert info["shield_guaranteed"].all()
         overridden += int(info["shield_intervened"].sum())
     assert 0.5 < max(levels) <= 1.0
-    assert 0 < overridden < 200 * 500
+    assert 0 < overridden < 200 * 200
 
 
 def test_same_step_autoreset_reports_the_last_step_in_final_info():
@@ -383,34 +266,6 @@ def test_works_under_gymnasiums_vector_wrappers():
         episodes += int(info.get("_episode", np.zeros(3)).sum())
         assert info["shield_guaranteed"].all()
     assert episodes == 6
-
-
-def test_wrong_uses_are_refused():
-    class Scaled(VectorActionWrapper):
-        def actions(self, actions):
-            return 0.5 * actions
-
-    class Plain(VectorObservationWrapper):
-        def observations(self, observations):
-            return observations
-
-    env = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2)
-    with pytest.raises(ValueError, match="inside Scaled"):
-        VectorSafetyShield(Scaled(env))
-    with pytest.raises(ValueError, match="inside VectorSafetyShield"):
-        VectorSafetyShield(VectorSafetyShield(env))
-    with pytest.raises(ValueError, match="wrappers="):
-        VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2, vectorization_mode="sync"))
-    with pytest.raises(ValueError, match="mode must be"):
-        VectorSafetyShield(env, mode="off")
-    with pytest.raises(ValueError, match="penalty"):
-        VectorSafetyShield(env, penalty=-1.0)
-    with pytest.raises(ValueError, match="certificate must be"):
-        VectorSafetyShield(env, certificate=7)
-    with pytest.raises(CertificateError):
-        VectorSafetyShield(env, certificate_of(truck_trailer()))
-    with pytest.raises(gym.error.ResetNeeded):
-        VectorSafetyShield(Plain(env)).step(np.zeros((2, 1)))
 
 
 def test_scalar_shields_in_gymnasiums_sync_environment_still_work():

@@ -8,7 +8,7 @@ from gymnasium.wrappers import StickyAction
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearProcess, NCSEnv, NCSVectorEnv, truck_trailer
 from ncs_gym.network import downlink_protocol
-from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields import SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import OTHER_STEPS
 from tests.certificates import certificate_of
 
@@ -96,23 +96,3 @@ def test_wrapper_that_changes_a_setting_in_its_reset_is_found_at_the_next_one():
     shield = VectorSafetyShield(Widens(NCSVectorEnv(2, plant=PLANT)), certificate_of(PLANT))
     with pytest.raises(ValueError, match="the initial_set is not the one"):
         shield.reset(seed=0)
-
-
-@pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved", "channel"])
-@pytest.mark.parametrize("shielded", [scalar, vector])
-def test_settings_of_a_shield_cannot_be_changed(shielded, name):
-    shield = shielded()
-    with pytest.raises(AttributeError, match=f"{name} is a setting of {type(shield).__name__}"):
-        setattr(shield, name, getattr(shield, name))
-
-
-@pytest.mark.parametrize("name", ["filter", "contract", "input_delay"])
-def test_settings_of_a_loop_cannot_be_changed(name):
-    loop = SafeLoop(certificate_of(PLANT), PLANT, Channel())
-    with pytest.raises(AttributeError, match=f"{name} is a setting of SafeLoop"):
-        setattr(loop, name, None)
-
-
-def test_environment_of_somebody_else_is_refused_with_the_page_that_helps():
-    with pytest.raises(ValueError, match=r"needs an NCSEnv inside, got PendulumEnv, .*: docs/own_plant\.md says how"):
-        SafetyShield(gym.make("Pendulum-v1"))

@@ -1,8 +1,8 @@
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_lyapunov
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.plants.lqr import regulator_gain
@@ -10,45 +10,33 @@ from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible, synthesize
 from shields.errors import SynthesisInterrupted
 from shields.synthesis.design_problem import design_problem
-from shields.synthesis.max_margin_gain import _GainSearch, _initial_points, max_margin_gain
+from shields.synthesis.max_margin_gain import max_margin_gain
+from tests.certificates import feasible_bounds_not_sought
 from tests.plants import random_plant
 from tests.verdicts import verified
 
 CONTRACT = ChannelContract(2, 1e-4)
-PLANTS = {"cart-pole": cart_pole(), "reactor": batch_reactor()}
 
 
-@pytest.mark.parametrize("input_limits", [True, False])
-@pytest.mark.parametrize("name", PLANTS)
-def test_derivatives_are_those_of_finite_differences(name, input_limits):
-    problem, _ = design_problem(PLANTS[name], CONTRACT)
-    search = _GainSearch(problem, problem.covering_error_shape, input_limits)
-    for point in _initial_points(problem)[:4]:
-        slopes = search._uses(point)[1]
-        steps = 1e-4 * np.eye(len(point))
-        differences = [(search._uses(point + step)[0] - search._uses(point - step)[0]) / 2e-4 for step in steps]
-        np.testing.assert_allclose(slopes, np.transpose(differences), rtol=1e-3, atol=1e-4 * np.abs(slopes).max())
-
-
-def feasible_bounds_not_sought():
-    """Where nothing is asked of the message: that search takes longer than the synthesis."""
-    unchanged = mock.Mock(side_effect=lambda infeasible, *others, **more: infeasible)
-    return mock.patch("shields.synthesis.certification.with_feasible_bounds", unchanged)
+def slow(*values):
+    """More of the same, for the slow tests."""
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def radii_scaled(plant, factor):
     """The plant with the radii of all its uncertainty scaled."""
+    plant = replace(plant, gamma=factor**2 * plant.gamma)
     covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
     return replace(plant, **{name: factor**2 * getattr(plant, name) for name in covariances})
 
 
-@pytest.mark.parametrize("name", ["reactor", pytest.param("cart-pole", marks=pytest.mark.slow)])
-def test_its_margin_is_what_exact_verification_accepts(name):
-    plant, contract = PLANTS[name], ChannelContract(2)
+@pytest.mark.parametrize("make", [lambda: random_plant(3, 2, 1), *map(slow, (batch_reactor, cart_pole))])
+def test_its_margin_is_what_exact_verification_accepts(make):
+    plant, contract = make(), ChannelContract(2)
     problem, _ = design_problem(plant, contract)
     margin = max_margin_gain(problem, problem.covering_error_shape).margin
     tolerated = radii_scaled(plant, 0.99 * margin)
-    assert verified(synthesize(tolerated, contract=contract), tolerated).valid
+    assert verified(synthesize(tolerated, contract=contract, safe_set="ellipsoid"), tolerated).valid
     with feasible_bounds_not_sought(), pytest.raises(Infeasible, match="radii shrink to") as caught:
         synthesize(radii_scaled(plant, 2.0 * margin), contract=contract, safe_set="ellipsoid")
     assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
@@ -66,11 +54,30 @@ def test_its_set_is_the_smallest_that_is_invariant_with_its_gain():
     assert 1.0 / gain.margin == pytest.approx(max(inputs.max(), box.max()), rel=1e-9)
 
 
-def test_its_margin_is_larger_than_that_of_every_initial_regulator():
-    problem, _ = design_problem(batch_reactor(), CONTRACT)
-    search = _GainSearch(problem, problem.covering_error_shape, True)
-    largest_initial_margin = np.exp(-0.5 * min(search.largest_use(point) for point in _initial_points(problem)))
-    assert max_margin_gain(problem, problem.covering_error_shape).margin > 1.2 * largest_initial_margin
+@pytest.mark.parametrize("make", [batch_reactor, cart_pole])
+def test_no_gain_and_no_multipliers_near_it_have_a_larger_margin(make):
+    problem, _ = design_problem(make(), CONTRACT)
+    gain, Sigma, rng = (
+        max_margin_gain(problem, problem.covering_error_shape),
+        problem.covering_error_shape,
+        np.random.default_rng(0),
+    )
+    assert margin_of(problem, Sigma, gain.K, gain.multipliers) == pytest.approx(gain.margin, rel=1e-6)
+    for size in np.repeat([1e-2, 1e-3, 1e-4], 100):
+        K = gain.K * (1.0 + size * rng.standard_normal(gain.K.shape))
+        shares = np.array(gain.multipliers) * (1.0 + size * rng.standard_normal(3))
+        assert margin_of(problem, Sigma, K, shares / max(shares.sum(), 1.0)) < gain.margin * (1.0 + 1e-4)
+
+
+def margin_of(problem, Sigma, K, multipliers):
+    """By which factor all radii may grow, by the sum of a series for the smallest invariant ellipsoid."""
+    lx, le, ld = multipliers
+    closed_loop, BK = (problem.A + problem.B @ K) / np.sqrt(lx), problem.B @ K
+    if np.abs(np.linalg.eigvals(closed_loop)).max() >= 1.0:
+        return 0.0
+    L = solve_discrete_lyapunov(closed_loop, BK @ Sigma @ BK.T / le + problem.D_u / ld)
+    inputs = np.sqrt(np.einsum("ij,jk,ik->i", K, L, K)) + np.sqrt(np.einsum("ij,jk,ik->i", K, Sigma, K))
+    return 1.0 / max(inputs.max(), np.sqrt(np.einsum("ij,jk,ik->i", problem.C, L, problem.C)).max())
 
 
 def test_the_margin_is_larger_without_input_limits():

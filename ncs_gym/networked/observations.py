@@ -1,0 +1,270 @@
+"""What travels of an observation, and what an agent sees of it: parts, their spaces, and the entries that are added."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel
+from ncs_gym.validation import shown
+
+# Ages beyond this are observed as this [steps].
+OLDEST_OBSERVED = LONGEST_DELAY
+# What `observe` may name.
+ENTRIES = "age", "arrived", "pending_actions"
+# Arrays below this size are copied without a second thought [bytes].
+SMALL = 4096
+
+
+class Part(NamedTuple):
+    """A part of an observation that has a channel of its own.
+
+    Attributes:
+        key: Its key in a `Dict`, its index in a `Tuple`; None for the whole observation.
+        space: Its space.
+    """
+
+    key: Any
+    space: spaces.Space
+
+    def of(self, observation: Any) -> Any:
+        """Returns this part of an observation."""
+        return observation if self.key is None else observation[self.key]
+
+
+def parts_of(space: spaces.Space, channel: Any) -> tuple[list[Part], list[Any]]:
+    """Returns the parts of observations that travel alone, and the channel or channels to draw from of each.
+
+    Args:
+        space: The space of the observations.
+        channel: What `Networked` was given: one for all, or one for each key of a `Dict` or entry of a `Tuple`; keys
+            that are left out arrive at once.
+
+    Raises:
+        ValueError: If there are channels of keys that the space does not have.
+    """
+    if isinstance(channel, Mapping) and not channel.keys() <= TraceChannel.__dataclass_fields__.keys() | {"type"}:
+        keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
+        if unknown := [key for key in channel if key not in keys]:
+            known = f"its keys are {', '.join(map(str, keys))}" if keys else f"the space is {shown(space)}"
+            raise ValueError(f"channel has the key {shown(unknown[0])}, which observations do not have: {known}")
+        return [Part(key, space[key]) for key in keys], [channel.get(key) for key in keys]  # type: ignore[index]
+    if isinstance(space, spaces.Tuple) and isinstance(channel, tuple | list):
+        if len(channel) != len(space.spaces):
+            raise ValueError(f"observations have {len(space.spaces)} entries, channel has {len(channel)}")
+        return [Part(index, each) for index, each in enumerate(space.spaces)], list(channel)
+    return [Part(None, space)], [channel]
+
+
+def joined(parts: Sequence[Part], seen: Sequence[Any]) -> Any:
+    """Returns the observation whose parts are given."""
+    if parts[0].key is None:
+        return seen[0]
+    if isinstance(parts[0].key, int):
+        return tuple(seen)
+    return {part.key: each for part, each in zip(parts, seen, strict=True)}
+
+
+def quantized(channel: Any, space: spaces.Space, sample: Any) -> Any:
+    """Returns a sample with its entries of floats rounded as a channel does, within their limits; others as they are.
+
+    Args:
+        channel: What has `quantize`; of N environments stacked, whose samples have N as the first axis.
+        space: Space of one sample.
+        sample: The sample.
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: quantized(channel, each, sample[key]) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(quantized(channel, each, part) for each, part in zip(space.spaces, sample, strict=True))
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
+        rounded = channel.quantize(np.asarray(sample).T).T  # the last axis is that of environments
+        return np.clip(rounded, space.low, space.high).astype(space.dtype)
+    return sample
+
+
+def has_floats(space: spaces.Space) -> bool:
+    """Returns whether anything in a space can be quantized."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        inner = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+        return any(map(has_floats, inner))
+    return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
+
+
+def zero_of(space: spaces.Space) -> Any:
+    """Returns the zero of a space.
+
+    Raises:
+        ValueError: If the space has none.
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: zero_of(each) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(map(zero_of, space.spaces))
+    zero = np.zeros(space.shape or (), space.dtype) if space.shape is not None else None
+    zero = np.int64(0) if isinstance(space, spaces.Discrete) else zero
+    if zero is None or not space.contains(zero):
+        raise ValueError(f"{shown(space)} has no zero")
+    return zero
+
+
+class Snapshots:
+    """Keeps samples as they were when they were taken, with few copies of large ones.
+
+    Small arrays are copied. Large ones are not, unless the environment turns out to write into the same memory again:
+    memory of the first two samples is held back, so that a later one that lies there was written over an older one.
+    Samples until then are still as they were, since an environment goes through its buffers in turn.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[Any] = []
+        self._reused = False
+
+    def begin(self) -> None:
+        """Forgets the samples of the episode before."""
+        self._held = []
+
+    def taken(self, sample: Any) -> Any:
+        """Returns a sample that stays as it is."""
+        if isinstance(sample, dict):
+            return {key: self.taken(each) for key, each in sample.items()}
+        if isinstance(sample, tuple):
+            return tuple(map(self.taken, sample))
+        if not isinstance(sample, np.ndarray):
+            return sample
+        if sample.nbytes <= SMALL or self._reused:
+            return sample.copy()
+        if len(self._held) < 2:
+            self._held.append(sample)
+            return sample.copy()
+        self._reused = any(np.may_share_memory(sample, each) for each in self._held)
+        return sample.copy() if self._reused else sample
+
+
+def handed_out(sample: Any, *, anew: bool) -> Any:
+    """Returns a sample for the agent, whose arrays are its own.
+
+    Large ones are not copied where they are seen for the first time: an agent that writes into them changes what it
+    sees again while nothing arrives.
+    """
+    if isinstance(sample, dict):
+        return {key: handed_out(each, anew=anew) for key, each in sample.items()}
+    if isinstance(sample, tuple):
+        return tuple(handed_out(each, anew=anew) for each in sample)
+    if isinstance(sample, np.ndarray) and (sample.nbytes <= SMALL or not anew):
+        return sample.copy()
+    return sample
+
+
+class Entries:
+    """The entries that `observe` adds to observations, of one environment or of N.
+
+    Args:
+        names: Which ones, of "age", "arrived" and "pending_actions".
+        observations: Space of the observations of one environment.
+        actions: Space of its actions.
+        parts: Number of parts of an observation that have a channel of their own.
+        pending: How many of the last actions are pending, at least 1.
+
+    Attributes:
+        space: Space of the observations with these entries.
+
+    Raises:
+        ValueError: If a name is unknown, or a space is not of a kind that can be observed.
+    """
+
+    def __init__(
+        self, names: Sequence[str], observations: spaces.Space, actions: spaces.Space, parts: int, pending: int
+    ) -> None:
+        if isinstance(names, str) or any(name not in ENTRIES for name in names) or len(set(names)) < len(names):
+            raise ValueError(f"observe must be different ones of {', '.join(ENTRIES)}, got {shown(names)}")
+        self.names, self._inner, self._actions = tuple(names), observations, actions
+        made = {
+            "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),
+            "arrived": lambda: spaces.MultiBinary(parts),
+            "pending_actions": lambda: pending_space(actions, pending),
+        }
+        added = {name: made[name]() for name in self.names}
+        self._is_flat = (
+            isinstance(observations, spaces.Box)
+            and len(observations.shape) == 1
+            and np.issubdtype(observations.dtype, np.floating)
+        )
+        self.space = self._widened(added)
+
+    def _widened(self, added: dict[str, spaces.Space]) -> spaces.Space:
+        inner = self._inner
+        if not added:
+            return inner
+        if self._is_flat:
+            flat: list[Any] = [inner, *map(spaces.flatten_space, added.values())]
+            low, high = (np.concatenate([getattr(each, end) for each in flat]) for end in ("low", "high"))
+            return spaces.Box(low.astype(inner.dtype), high.astype(inner.dtype), dtype=inner.dtype)  # type: ignore[arg-type]
+        if isinstance(inner, spaces.Tuple):
+            return spaces.Tuple((*inner.spaces, *added.values()))
+        if isinstance(inner, spaces.Dict):
+            if taken := [name for name in added if name in inner.spaces]:
+                raise ValueError(f"observations have an entry {taken[0]!r} of their own: leave it out of observe")
+            return spaces.Dict({**inner.spaces, **added})
+        return spaces.Dict({"observation": inner, **added})
+
+    def added_to(self, observation: Any, age: Any, arrived: Any, pending: Any) -> Any:
+        """Returns an observation with the entries.
+
+        Args:
+            observation: What is seen of the environment, of N environments a batch.
+            age: Of the newest sample of each part, shape (parts,) or (N, parts) [steps].
+            arrived: Whether one arrived, likewise.
+            pending: The pending actions, oldest first, shape (pending, ...) or (N, pending, ...).
+        """
+        if not self.names:
+            return observation
+        values = {
+            "age": lambda: np.minimum(age, OLDEST_OBSERVED).astype(np.float32),
+            "arrived": lambda: np.asarray(arrived, np.int8),
+            "pending_actions": lambda: pending,
+        }
+        added = {name: values[name]() for name in self.names}
+        if self._is_flat:
+            lead = np.shape(observation)[:-1]
+            flat = [self._flattened(name, each).reshape(*lead, -1) for name, each in added.items()]
+            return np.concatenate([observation, *flat], axis=-1, dtype=self.space.dtype, casting="unsafe")  # type: ignore[call-overload]
+        if isinstance(self._inner, spaces.Tuple):
+            return (*observation, *added.values())
+        own = observation if isinstance(self._inner, spaces.Dict) else {"observation": observation}
+        return {**own, **added}
+
+    def _flattened(self, name: str, value: Any) -> np.ndarray:
+        """Returns what `gymnasium.spaces.flatten` makes of a value, of N values at once."""
+        if name != "pending_actions" or not isinstance(self._actions, spaces.Discrete | spaces.MultiDiscrete):
+            return np.asarray(value)
+        counts = self._actions.n if isinstance(self._actions, spaces.Discrete) else self._actions.nvec
+        counts, start = np.atleast_1d(counts), np.atleast_1d(self._actions.start)
+        number = np.asarray(value).reshape(*np.shape(value)[: np.ndim(value) - self._actions_ndim], -1) - start
+        one_hot = [np.arange(n) == number[..., index, None] for index, n in enumerate(counts.tolist())]
+        return np.concatenate(one_hot, axis=-1)
+
+    @property
+    def _actions_ndim(self) -> int:
+        return len(self._actions.shape or ())
+
+
+def pending_space(actions: spaces.Space, pending: int) -> spaces.Space:
+    """Returns the space of so many actions.
+
+    Raises:
+        ValueError: If the actions are of a kind that is not told as an array.
+    """
+    if isinstance(actions, spaces.Box):
+        low, high = (np.broadcast_to(end, (pending, *actions.shape)) for end in (actions.low, actions.high))
+        return spaces.Box(low, high, dtype=actions.dtype)  # type: ignore[arg-type]
+    if isinstance(actions, spaces.Discrete):
+        return spaces.MultiDiscrete(np.full(pending, actions.n), start=np.full(pending, actions.start))
+    if isinstance(actions, spaces.MultiDiscrete):
+        return spaces.MultiDiscrete(np.tile(actions.nvec, (pending, 1)), start=np.tile(actions.start, (pending, 1)))
+    if isinstance(actions, spaces.MultiBinary):
+        return spaces.MultiBinary((pending, *actions.shape))
+    raise ValueError(f"pending_actions are for actions that are one array, got {shown(actions)}")

@@ -1,0 +1,164 @@
+"""What `Networked` and `VectorNetworked` are made with, checked once for both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from ncs_gym.envs.episode_channels import EpisodeChannels
+from ncs_gym.envs.json_settings import from_json, to_json
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import contract_of
+from ncs_gym.network.downlink import downlink_protocol
+from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
+from ncs_gym.validation import as_count, as_flag, shown
+
+LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
+# What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
+Predictor = Callable[[Any, Any, Any], Any]
+
+
+class NetworkSettings:
+    """The settings of a network around an environment, read against its spaces.
+
+    Args:
+        observations: Space of the observations of one environment.
+        actions: Space of its actions.
+        settings: The keywords of `Networked` by name.
+
+    Attributes:
+        parts: The parts of observations that have a channel of their own.
+        channels: Their channels.
+        downlink: The network of the actions; None for an ideal one.
+        fill: "last", "zero" or a predictor.
+        late: "apply", "drop" or "queue".
+        idle: "hold" or "neutral".
+        neutral: The action before the first command arrives; None where all arrive at once.
+        pending: How many of the last actions are kept.
+        entries: What is added to observations.
+        delay_reward: Whether rewards travel with samples.
+        recorded: The settings as JSON values, as far as they can be.
+
+    Raises:
+        ValueError: If a setting is wrong, or does not fit the spaces.
+    """
+
+    def __init__(self, observations: spaces.Space, actions: spaces.Space, settings: Mapping[str, Any]) -> None:
+        self.parts, given = parts_of(observations, settings["channel"])
+        self.channels = [as_channel(each, "channel") or Channel() for each in given]
+        for part, channel in zip(self.parts, self.channels, strict=True):
+            if channel.quantization_step and not has_floats(part.space):
+                raise ValueError(f"{shown(part.space)} has no floats to quantize: leave out quantization_step")
+        if len({channel.on_request for channel in self.channels}) > 1:
+            raise ValueError("samples are taken on request on all channels or on none")
+        self.downlink = as_channel(settings["downlink"], "downlink")
+        downlink_protocol(self.downlink, None)  # raises where a setting makes no sense there
+        self.fill: Any = settings["fill"]
+        if not (callable(self.fill) or (isinstance(self.fill, str) and self.fill in ("last", "zero"))):
+            raise ValueError(
+                f"fill must be 'last', 'zero' or a function (last, age, actions) -> observation, got {shown(self.fill)}"
+            )
+        if callable(self.fill) and len(self.parts) > 1:
+            raise ValueError("a function for fill is for one channel: it returns a whole observation")
+        if self.fill == "zero":
+            for part in self.parts:
+                zero_of(part.space)
+        self.late = _one_of(settings["late"], LATE, "late")
+        self.idle = _one_of(settings["idle"], IDLE, "idle")
+        self.neutral = _neutral(settings["neutral"], actions, needed=self.downlink is not None)
+        given_pending = settings["pending"]
+        self.pending = self._memory() if given_pending is None else as_count(given_pending, "pending", low=1, high=1000)
+        self.entries = Entries(settings["observe"], observations, actions, len(self.parts), self.pending)
+        self.delay_reward = as_flag(settings["delay_reward"], "delay_reward")
+        self.recorded = dict(settings) | {
+            "channel": to_json(settings["channel"]),
+            "downlink": to_json(settings["downlink"]),
+            "neutral": to_json(settings["neutral"]),
+            "observe": list(self.entries.names),
+        }
+
+    def uplinks(self, count: int) -> list[EpisodeChannels]:
+        """Returns the channels of each part in the present episodes of so many environments."""
+        return [EpisodeChannels([each] * count, partial(_require_like, each)) for each in self.channels]
+
+    def downlinks(self, count: int) -> EpisodeChannels:
+        """Returns the channels of the commands in the present episodes."""
+        return EpisodeChannels([self.downlink] * count, partial(_require_downlink, self.downlink))
+
+    def sources(self, options: dict[str, Any], uplinks: Sequence[EpisodeChannels]) -> list[list[Any]]:
+        """Returns what `EpisodeChannels.read` makes of the option "channel" for each part, and takes it out.
+
+        Raises:
+            ValueError: If it is no channel, or of keys that observations do not have.
+        """
+        option = options.pop("channel", None)
+        if isinstance(option, Mapping):
+            keys = [part.key for part in self.parts]
+            if unknown := [key for key in option if key not in keys]:
+                raise ValueError(f"the option channel has the key {shown(unknown[0])}, the channels' are {keys}")
+            return [links.read(option.get(key), "channel") for key, links in zip(keys, uplinks, strict=True)]
+        return [links.read(option, "channel") for links in uplinks]
+
+    def _memory(self) -> int:
+        """Returns how many actions the newest sample may lack: what the contracts allow, or without any the delays."""
+        uplink = [contract_of(each) for each in self.channels]
+        ages = [
+            each.longest_delay + each.send_period - 1 if contract is None else contract.max_age
+            for each, contract in zip(self.channels, uplink, strict=True)
+        ]
+        if self.downlink is not None:
+            protocol: Any = downlink_protocol(self.downlink, None)
+            return max(max(ages) + protocol.input_delay, 1)
+        return max(*ages, 1)
+
+
+def as_channel(value: Any, name: str) -> Channel | None:
+    """Returns a channel, also one whose fields a dictionary holds; None for None.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    channel = from_json(value, (Channel,), name)
+    if channel is None or isinstance(channel, Channel):
+        return channel
+    raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}")
+
+
+def _one_of(value: Any, known: tuple[str, ...], name: str) -> str:
+    if not (isinstance(value, str) and value in known):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, known))}, got {shown(value)}")
+    return value
+
+
+def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
+    """Returns the action that is applied while no command has arrived, the zero of the space by default."""
+    if given is None and not needed:
+        return None
+    if given is None:
+        try:
+            if not isinstance(actions, spaces.Discrete):  # whose zero is an action like any other
+                return zero_of(actions)
+        except ValueError:
+            pass
+        raise ValueError(
+            f"before the first command arrives some action has to act, and {shown(actions)} has no zero: give neutral="
+        )
+    action = np.asarray(given, actions.dtype) if isinstance(actions, spaces.Box) else given
+    if not actions.contains(action):
+        raise ValueError(f"neutral must be an action, got {shown(given)}")
+    return action
+
+
+def _require_like(declared: Channel, channel: Channel) -> None:
+    if channel.on_request != declared.on_request:
+        raise ValueError(f"the environment was made for channels with on_request={declared.on_request}")
+
+
+def _require_downlink(declared: Channel | None, channel: Channel) -> None:
+    if declared is None:
+        raise ValueError("the environment has an ideal downlink: make it with downlink=Channel(...)")
+    downlink_protocol(channel, None)

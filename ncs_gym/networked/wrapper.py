@@ -1,0 +1,336 @@
+"""The network around any Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs, seeding
+
+from ncs_gym.envs.env import NCSEnv
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.network.requests import Requests, require_on_request
+from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
+from ncs_gym.networked.settings import NetworkSettings, Predictor
+
+# Keeps what the network draws apart from what an environment of the same seed draws.
+NETWORK_STREAM = 0x6E6574
+
+
+class Networked(gym.Wrapper, RecordConstructorArgs):
+    """Puts a network between an environment and its agent: observations and actions are late, lost, rare or rounded.
+
+    It needs no model and proves nothing; where there is a linear model, `NCSEnv` has an estimator and a shield for it.
+    Rewards, ends of episodes and infos are those of the true environment, at once.
+
+    ## Observations
+    At step 0 the agent sees the environment's first observation. At each step k >= 1 that is a multiple of
+    `send_period` the observation is sampled, its floats are quantized, and it is lost or arrives later. What arrives is
+    seen unless something newer was seen before; otherwise `fill` says what is seen.
+
+    ## Actions
+    Without `downlink` an action acts in its own step. Behind one every action is sent; until the first has arrived
+    `neutral` acts.
+
+    ## Info (added to the environment's, at reset too)
+    | key | type | unit | meaning |
+    |---|---|---|---|
+    | `measurement_age` | int | steps | age of the newest sample that arrived; with several channels a dictionary |
+    | `packet_arrived` | bool | - | whether one arrived that is newer than all before; with several channels likewise |
+    | `action_age` | int | steps | how long ago the action that acted in this step was decided; 0 at reset |
+    | `action_applied` | of the actions | - | that action; at reset the neutral one, or zeros |
+    | `packets` | int | packets | samples sent in this episode |
+
+    Args:
+        env: Any environment but an `NCSEnv`, which has its own network.
+        channel: The network of the observations, a `Channel` or its fields; for a `Dict` of observations also a
+            dictionary of these, for a `Tuple` a tuple, so that each entry has a network of its own. Keys left out
+            arrive at once. Ideal by default.
+        downlink: The network of the actions (loss, delay, jitter and `max_consecutive_losses`); ideal by default.
+        observe: Entries that are added to observations: "age" of the newest sample [steps, at most 1,000], "arrived",
+            and "pending_actions", the last ones decided. A flat observation of floats becomes longer, a `Dict` gets
+            keys and a `Tuple` entries of these names; another one becomes a `Dict` with the key "observation".
+        fill: What is seen where nothing new arrived: "last", the newest sample that did; "zero"; or a function
+            (last, age, actions) -> observation, which is given that sample, its age and the last `pending` actions
+            decided, oldest first, of which those of the last `age` steps came after the sample.
+        late: "apply" lets the newest command that has arrived act. "drop" does not wait for commands that take longer
+            than `downlink.delay`. "queue" lets all commands act in the order of their arrival, one in each step.
+        idle: What acts where no command arrived: "hold", the one before, or "neutral".
+        neutral: The action before the first command arrives; the zero of the actions by default, and needed behind a
+            downlink where they have none.
+        pending: How many of the last actions are kept; by default as many as the contracts of both channels allow the
+            newest sample to lack, or the delays where there is no contract.
+        delay_reward: Whether rewards travel with samples: the agent gets what was earned until the newest one was
+            taken, and at the end of an episode the rest.
+
+    Attributes:
+        episode_channel: The channel of this episode; with several a dictionary of them. `reset` takes another one as
+            its option "channel" (and "downlink"), or what draws one (`RandomChannel`).
+
+    Raises:
+        ValueError: If a setting is wrong, or does not fit the environment's spaces.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        channel: Channel | Mapping[str, Any] | tuple[Any, ...] | None = None,
+        downlink: Channel | Mapping[str, Any] | None = None,
+        observe: Sequence[str] = (),
+        fill: str | Predictor = "last",
+        late: str = "apply",
+        idle: str = "hold",
+        neutral: Any = None,
+        pending: int | None = None,
+        delay_reward: bool = False,
+    ) -> None:
+        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "late": late, "idle": idle}
+        given |= {"neutral": neutral, "pending": pending, "delay_reward": delay_reward}
+        if isinstance(env.unwrapped, NCSEnv):
+            raise ValueError("an NCSEnv has its own network: give gym.make(id, channel=..., downlink=...)")
+        self._settings = settings = NetworkSettings(env.observation_space, env.action_space, given)
+        RecordConstructorArgs.__init__(self, **settings.recorded)
+        gym.Wrapper.__init__(self, env)
+        self.observation_space = settings.entries.space
+        self._uplinks, self._downlinks = settings.uplinks(1), settings.downlinks(1)
+        on_request = settings.channels[0].on_request
+        self._requests = Requests(settings.channels[0], None) if on_request else None
+        self._snapshots, self._rng = Snapshots(), None
+        self._arrivals = [_Arrivals() for _ in settings.parts]
+        self._keys = [part.key for part in settings.parts] if settings.parts[0].key is not None else None
+        self._sees_newest = self._keys is None and settings.fill == "last" and not settings.entries.names
+        self._keeps_actions = bool(settings.entries.names) or callable(settings.fill)
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """What the network draws from; the environment's own draws do not change it."""
+        if self._rng is None:
+            self._rng = seeding.np_random()[0]
+        return self._rng
+
+    @property
+    def channel(self) -> Any:
+        """The channel of the observations; with several a dictionary of them."""
+        return self._by_part(self._settings.channels)
+
+    @property
+    def downlink(self) -> Channel | None:
+        """The channel of the actions; None for an ideal one."""
+        return self._settings.downlink
+
+    @property
+    def episode_channel(self) -> Any:
+        """The channel of this episode; with several a dictionary of them."""
+        return self._by_part([links.now[0] for links in self._uplinks])
+
+    @property
+    def episode_downlink(self) -> Channel | None:
+        """The downlink of this episode; None for an ideal one."""
+        return self._downlinks.now[0]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+            seed: Seeds the network and the environment, whose draws are independent.
+            options: {"channel": c}, {"downlink": c} give this episode another channel, or a function (rng) -> Channel
+                that draws one; with several channels a dictionary of these. The rest is the environment's.
+        """
+        own = dict(options or {})
+        sources = self._settings.sources(own, self._uplinks)
+        downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
+        observation, info = self.env.reset(seed=seed, options=own or None)
+        if seed is not None:
+            self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NETWORK_STREAM,)))
+        rng = self.np_random
+        for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
+            links.give(given)
+            links.begin(rng)
+        self._snapshots.begin()
+        self._step = self._packets = 0
+        sample = self._snapshots.taken(observation)
+        for part, arrivals, links in zip(self._settings.parts, self._arrivals, self._uplinks, strict=True):
+            arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
+        settings, given = self._settings, self.episode_downlink
+        self._actuator = None if given is None else _Actuator(settings, ChannelState(given, rng))
+        if self._requests is not None:
+            self._requests.begin()
+        idle = settings.neutral if settings.neutral is not None else nothing(self.action_space)
+        self._decided: deque[Any] = deque([idle] * settings.pending, settings.pending)
+        self._earned = self._told = 0.0
+        return self._seen(), self._with_network(info, idle, 0)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Sends the action, steps the environment with the one that acts now, and sees what arrives."""
+        rng, settings, step = self.np_random, self._settings, self._step
+        applied, decided_at = action, step
+        if self._actuator is not None:
+            applied, decided_at = self._actuator.exchange(rng, step, _kept(action))
+        if self._keeps_actions:
+            self._decided.append(_kept(action))
+        if self._requests is not None:
+            self._requests.decide(self._oldest)
+        observation, reward, terminated, truncated, info = self.env.step(applied)
+        self._step = step = step + 1
+        self._earned += reward if settings.delay_reward else 0.0
+        sample = None
+        for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
+            link, packet = arrivals.link, None
+            if link.sends_at(step) if self._requests is None else self._requests.requested:
+                if sample is None:
+                    sample = self._snapshots.taken(observation)
+                own = part.of(sample)
+                if link.channel.quantization_step:
+                    own = quantized(link.channel, part.space, own)
+                packet = step, own, self._earned
+                self._packets += 1
+            arrivals.take(link.carry(rng, step, packet))
+        if settings.delay_reward:
+            earned = self._earned if terminated or truncated else max(each.earned for each in self._arrivals)
+            reward, self._told = earned - self._told, earned
+        return self._seen(), reward, terminated, truncated, self._with_network(info, applied, step - 1 - decided_at)
+
+    def request(self, asked: bool = True) -> None:
+        """Asks for samples in the next step, where the channel takes them on request (`RequestActions`).
+
+        Raises:
+            ValueError: If the channel sends samples by itself, or what is given is no bool.
+        """
+        require_on_request(self._requests).ask(asked)
+
+    @property
+    def outstanding(self) -> int:
+        """Number of samples requested that are newer than the newest that arrived and may still arrive."""
+        return int(require_on_request(self._requests).outstanding(self._oldest))
+
+    @property
+    def request_state(self) -> tuple[int, int]:
+        """The age of the newest sample, of several the oldest, and `outstanding` [steps, samples]."""
+        return self._oldest, self.outstanding
+
+    @property
+    def request_limits(self) -> np.ndarray:
+        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
+        delays = [channel.longest_delay for channel in self._settings.channels]
+        return np.array([OLDEST_OBSERVED, max(*delays, 1)], dtype=np.float64)
+
+    @property
+    def _oldest(self) -> int:
+        return self._step - min(arrivals.stamp for arrivals in self._arrivals)
+
+    def _seen(self) -> Any:
+        """Returns what the agent sees now."""
+        settings, step = self._settings, self._step
+        if self._sees_newest:
+            return self._arrivals[0].seen(step)
+        seen = [arrivals.seen(step) for arrivals in self._arrivals]
+        if settings.fill == "zero":
+            pairs = zip(seen, settings.parts, self._arrivals, strict=True)
+            seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
+        elif callable(settings.fill) and not self._arrivals[0].is_new(step):
+            seen = [settings.fill(seen[0], step - self._arrivals[0].stamp, np.array(self._decided))]
+        observation = joined(settings.parts, seen)
+        if not settings.entries.names:
+            return observation
+        ages = np.array([step - arrivals.stamp for arrivals in self._arrivals])
+        arrived = np.array([arrivals.arrived for arrivals in self._arrivals])
+        return settings.entries.added_to(observation, ages, arrived, np.array(self._decided))
+
+    def _with_network(self, info: dict[str, Any], applied: Any, action_age: int) -> dict[str, Any]:
+        """Returns the environment's infos with those of the network."""
+        step, arrivals = self._step, self._arrivals
+        if self._keys is None:
+            age, arrived = step - arrivals[0].stamp, arrivals[0].arrived
+        else:
+            age = self._by_part([step - each.stamp for each in arrivals])
+            arrived = self._by_part([each.arrived for each in arrivals])
+        return {
+            **info,
+            "measurement_age": age,
+            "packet_arrived": arrived,
+            "action_age": action_age,
+            "action_applied": applied.copy() if isinstance(applied, np.ndarray) else applied,
+            "packets": self._packets,
+        }
+
+    def _by_part(self, values: list[Any]) -> Any:
+        return values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
+
+
+class _Arrivals:
+    """What has arrived of a part of the observations.
+
+    Attributes:
+        link: Its channel.
+        stamp: Step at which the newest sample was taken.
+        sample: That sample.
+        arrived: Whether it arrived at this step.
+        earned: Sum of the rewards until it was taken.
+    """
+
+    link: ChannelState
+
+    def begin(self, link: ChannelState, sample: Any) -> None:
+        """Starts an episode, whose first sample is there."""
+        self.link, self.sample = link, sample
+        self.stamp, self.arrived, self.earned = 0, False, 0.0
+
+    def seen(self, step: int) -> Any:
+        """Returns the newest sample for the agent, at a step."""
+        return handed_out(self.sample, anew=self.is_new(step))
+
+    def is_new(self, step: int) -> bool:
+        """Returns whether the newest sample arrived at this step, as the first of an episode does."""
+        return self.arrived or self.stamp == step
+
+    def take(self, packets: list[Any]) -> None:
+        """Takes the packets that arrive at this step."""
+        self.arrived = False
+        for stamp, sample, earned in packets:
+            if stamp > self.stamp:
+                self.stamp, self.sample, self.earned, self.arrived = stamp, sample, earned, True
+
+
+class _Actuator:
+    """The commands on their way and the one that acts."""
+
+    def __init__(self, settings: NetworkSettings, link: ChannelState) -> None:
+        self._link, self._late, self._idle, self._neutral = link, settings.late, settings.idle, settings.neutral
+        self._action, self._stamp = settings.neutral, -1
+        self._queue: deque[tuple[int, Any]] = deque()
+
+    def exchange(self, rng: np.random.Generator, step: int, action: Any) -> tuple[Any, int]:
+        """Sends an action; returns the one that acts at this step, and the step at which it was decided."""
+        arrived = self._link.carry(rng, step, (step, action))
+        if self._late == "drop":
+            arrived = [each for each in arrived if step - each[0] == self._link.channel.delay]
+        if self._late == "queue":
+            self._queue += arrived
+            arrived = [self._queue.popleft()] if self._queue else []
+        newest = max(arrived, key=lambda each: each[0], default=None)
+        if newest is not None and (newest[0] > self._stamp or self._late == "queue"):
+            self._stamp, self._action = newest
+        elif self._idle == "neutral":
+            return self._neutral, self._stamp
+        return self._action, self._stamp
+
+
+def _kept(action: Any) -> Any:
+    """Returns an action that stays as it is when its array is written over."""
+    return action.copy() if isinstance(action, np.ndarray) else action
+
+
+def nothing(actions: gym.Space) -> Any:
+    """Returns zeros of the kind of an action, for what was decided before the first step."""
+    if isinstance(actions, gym.spaces.Discrete):
+        return actions.start
+    if actions.shape is None:
+        return None
+    zeros = np.zeros(actions.shape, actions.dtype)
+    if isinstance(actions, gym.spaces.MultiDiscrete):
+        return zeros + actions.start
+    return np.clip(zeros, actions.low, actions.high) if isinstance(actions, gym.spaces.Box) else zeros

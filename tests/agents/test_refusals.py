@@ -1,0 +1,95 @@
+"""What agents, loops and trainings refuse, and the words that users need: a new refusal is a row."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+
+import numpy as np
+import pytest
+
+from agents import evaluate
+from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
+from agents.training import require_trainable, train, untrained
+from ncs_gym import truck_trailer
+from tests.certificates import certificate_of
+
+CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
+REPLAY = dict(n_envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
+CERTIFICATE = certificate_of(truck_trailer(mass=4000.0))
+NAN, INF = float("nan"), float("inf")
+OBSERVED = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \(N, 3\), got "
+
+# What an algorithm of stable-baselines3 is asked to take, and what is said of it.
+HYPERPARAMS = [
+    ("PPO", {"gama": 0.9}, "PPO: unknown hyperparameter 'gama'; .* are n_envs, .*n_steps.* gamma"),
+    ("SAC", {"gae_lambda": 0.9}, "SAC: unknown hyperparameter 'gae_lambda'; .* noise_std.* buffer_size"),
+    *(("PPO", {name: value}, f"unknown hyperparameter '{name}'") for name, value in
+      {"noise_std": 0.1, "device": "cuda"}.items()),
+    *(("PPO", {"vf_coef": value}, f"vf_coef cannot be {value!r}") for value in ("high", True)),
+    *(("PPO", {"n_epochs": value}, f"n_epochs must be a whole number >= 1, got {value}") for value in (1.5, 0)),
+    ("PPO", {"clip_range": [0.2]}, "clip_range cannot be"),
+    ("PPO", {"learning_rate": -1.0}, "PPO: Invalid learning rate: -1.0; its hyperparameters are"),
+    ("PPO", {"learning_rate": "lin_fast"}, "PPO: could not convert"),
+    ("PPO", {"policy": "Cnn"}, "PPO: Policy Cnn unknown; its hyperparameters are"),
+    ("PPO", {"policy_kwargs": {"net_arc": [8]}}, "PPO: .*'net_arc'; its hyperparameters are"),
+    ("PPO", {"batch_size": 1}, "PPO: .*batch_size.*; its hyperparameters are"),
+    *(("PPO", {"normalize": value}, "PPO: normalize must be true or") for value in (False, {"norm_obs": False})),
+    ("PPO", {"normalize": {"gain": 2.0}}, "PPO: normalize: unknown hyperparameter 'gain'"),
+    ("PPO", {"normalize": {"norm_reward": "no"}}, "PPO: normalize: norm_reward cannot be 'no'"),
+    ("A2C", {"n_steps": 0}, "n_steps must be a whole number >= 1"),
+    *(("PPO", {"n_envs": value}, "n_envs must be a whole number >= 1") for value in (0, True)),
+    ("PPO", {"gamma": 1.5}, r"gamma must be in \[0, 1\], got 1.5"),
+    ("TD3", {"gamma": "high"}, r"gamma must be in \[0, 1\], got 'high'"),
+    ("TD3", {"noise_std": -0.1}, "TD3: noise_std must be >= 0"),
+    ("TD3", {"noise_type": "pink"}, "TD3: noise_type cannot be 'pink'"),
+    ("SAC", {"buffer_size": -1}, "buffer_size must be a whole number >= 1, got -1"),
+    ("SAC", {"stored_action": "both"}, "stored_action must be"),
+    ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values"),
+    ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values"),
+    ("DQN", {}, "unknown algorithm 'DQN'"),
+    ("SAC", {"n_epochs": 2}, "unknown hyperparameter 'n_epochs'"),
+]  # fmt: skip
+
+CALLS = [
+    (partial(train, CRUISE, 64, 0, "SAC", REPLAY), "64 steps train nothing: learning starts after 64"),
+    (partial(train, CRUISE, -5, 0), "steps must be at least 1, got -5"),
+    (partial(train, CRUISE, 64, 0, "DQN"), "unknown algorithm 'DQN'"),
+    (partial(require_trainable, CRUISE, 2_000, "SAC", {}), "2000 steps train nothing"),
+    (partial(evaluate, CRUISE, None, 0, 0), "episodes must be at least 1, got 0"),
+    (partial(LoopConfig, env=CRUISE.env, shield=CERTIFICATE),
+     r"^shield must be ShieldSettings\(certificate\), got Certificate$"),
+    (partial(LoopConfig, env=CRUISE.env, shield=ShieldSettings(CERTIFICATE), filter=print),
+     "give either a shield or a filter"),
+    (LoopConfig(env=CRUISE.env, shield=ShieldSettings(CERTIFICATE, "project", horizon=4)).single, "horizon"),
+    (partial(ShieldSettings, CERTIFICATE, mode="x"), r"^mode must be one of \["),
+    *((partial(LagrangianSettings, **{name: value}), f"{name} must be >= 0")
+      for name in ("cost_limit", "learning_rate", "multiplier") for value in (-0.1, NAN, INF)),
+]  # fmt: skip
+SHAPES = [(4, 5), (5,), (2, 4, 3), (3, 1), ()]
+
+
+@pytest.mark.parametrize(("algorithm", "change", "words"), HYPERPARAMS)
+def test_what_an_algorithm_does_not_take_is_refused_in_one_sentence(algorithm, change, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        require_trainable(CRUISE, 100_000, algorithm, change)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("call", "words"), CALLS)
+def test_calls_are_refused_in_one_sentence(call, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("observations", "words"),
+    [
+        *((np.zeros(shape), f"{OBSERVED}{re.escape(str(shape))}$") for shape in SHAPES),
+        *(([value, 0.0, 0.0], "observations must be finite numbers") for value in (NAN, INF)),
+    ],
+)
+def test_observations_that_no_agent_knows_are_refused(observations, words):
+    with pytest.raises(ValueError, match=words):
+        untrained(CRUISE, 0).act(observations)

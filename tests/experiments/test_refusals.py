@@ -1,0 +1,232 @@
+"""What settings and commands refuse, and the words that users need: a new refusal is a row."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.attack.monte_carlo_batch import cases_of
+from experiments.baselines.requests import best_period
+from experiments.plots.figure_style import ArmStyle
+from experiments.runs.arms import Arm
+from experiments.runs.loops import changed_channel, scenario_named, worse_channel
+from experiments.settings import (
+    BackendSettings,
+    ChannelSettings,
+    CompareSettings,
+    RenderSettings,
+    StudySettings,
+    SweepSettings,
+)
+from experiments.settings.certificates import AttackSettings
+from experiments.study.study import quoted
+from ncs_gym import Channel, ChannelContract
+from tests.command import assert_one_sentence, ncs
+
+NAN, INF = float("nan"), float("inf")
+RAY, ATTACK = partial(BackendSettings, engine="ray"), partial(AttackSettings, random_plants=1)
+CRUISE, CSTR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CSTR-v0"
+HORIZON = "--horizon must be at least 1 and at most 50, got"
+PAGES = {"agents": "new"}
+
+SETTINGS = [
+    *((kind, {"steps": 0}, "--steps must be at least 1") for kind in (CompareSettings, SweepSettings)),
+    *((kind, {"jobs": 0}, "--jobs must be at least 1") for kind in (BackendSettings, CompareSettings, ATTACK)),
+    *((RAY, {"ray_address": text}, "--ray-address must be local, auto or HOST:PORT, got") for text in ("head", "")),
+    (RAY, {"ray_address": "ray://head:10001"}, "--ray-address must be"),
+    *((RAY, {"ray_wait": value}, "--ray-wait must be at least 0") for value in (-1.0, INF)),
+    *((RAY, {"cpus_per_run": value}, "--cpus-per-run must be at least") for value in (0.0, NAN)),
+    *((RAY, {"gpus_per_run": value}, "--gpus-per-run must be in [0, 1] or a whole") for value in (-1.0, 1.5, INF)),
+    *((BackendSettings, {name: value}, f"--{name.replace('_', '-')} is a setting of --engine ray")
+      for name, value in {"ray_address": "auto", "cpus_per_run": 2.0, "gpus_per_run": 1.0, "ray_wait": 1.0}.items()),
+    *((CompareSettings, {name: value}, f"--{name.replace('_', '-')} must be")
+      for name, value in {"seeds": 0, "steps": -1, "episodes": 0, "seed": -1, "intervention_penalty": -0.1,
+                          "violation_penalty": np.inf}.items()),
+    (CompareSettings, {"horizon": 0, "mode": "lookahead"}, f"{HORIZON} 0"),
+    (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
+    (CompareSettings, {"horizon": 6}, "--horizon 6 is for mode lookahead, which is not asked for"),
+    *((StudySettings, {name: value}, f"--{name.replace('_', '-')}")
+      for name, value in [("budget", 0.0), ("budget", 1.5), ("seeds", 0), ("envs", ()), ("envs", (CRUISE, CRUISE)),
+                          ("channel_episodes", -1)]),
+    *((ATTACK, {name: value}, f"--{name.replace('_', '-')} must be at least")
+      for name, value in [("steps", 0.5), ("steps", NAN), ("envs", 3), ("seed", -1), ("random_plants", -1)]),
+    *((ATTACK, {"delta": value}, "--delta must be at least 1e-12 and at most 0.5") for value in (0.0, 0.6)),
+    *((ATTACK, {"horizon": value, "mode": "lookahead"}, f"{HORIZON} {value}") for value in (0, 51)),
+    *((ATTACK, {"horizon": 6} | mode, "--horizon 6 is for mode lookahead") for mode in ({}, {"mode": "project"})),
+    (ATTACK, {"unshielded": True, "mode": "switch"}, "give either --mode switch or --unshielded"),
+    (ATTACK, {"env": "ncs_gym/CartPole-v0", "plant": "p.json"}, "give either --env or --plant"),
+    (ATTACK, {"max_age": 3}, "--max-age and --quantization-step belong to --plant"),
+    (ATTACK, {"env": "ncs_gym/CartPole-v0", "quantization_step": 0.1}, "--max-age and --quantization-step belong to"),
+    *((ChannelSettings, {"file": Path("packets.csv"), "sampling_period": period},
+       "--sampling-period must be a number > 0") for period in (0.0, -0.02, NAN, INF)),
+    *((RenderSettings, {name: value}, words)
+      for name, value, words in [("steps", 0, "--steps must be at least 1"), ("seed", -1, "--seed must be at least 0"),
+                                 ("fps", 0, "--fps must be at least 1 and at most 50"),
+                                 ("width", 10, "--width must be at least 160")]),
+]  # fmt: skip
+
+ARMS = ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor", "penalized:", "penalized:-1"]
+ARMS += ["penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1", "trusting:project", "psf:switch"]
+ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "proportional+", "lqr+penalty"]
+ARMS += ["proportional+monitored", "lqr+residual", "+shielded", "K x_hat+K x_hat"]
+BURSTS = [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, NAN), (0.3, INF)]
+
+CALLS = [
+    *(((Arm.of, name), "unknown arm .*known are unshielded") for name in ARMS),
+    ((ArmStyle.of, "hoped"), "unknown arm"),
+    ((scenario_named, "worse"), "unknown scenario 'worse'; known are as trained, worst-case disturbance"),
+    ((worse_channel, Channel(), ChannelContract(max_age=0)), "no channel within the contract is worse"),
+    ((best_period, Channel(0.5), ChannelContract(3)), "any number of packets"),
+    ((cases_of, ATTACK(channel="nowhere")), "channel must be one of"),
+    ((changed_channel, Channel(), {"lag": 3}), "--channel lag: a channel has no such setting; known .*burst_length"),
+    *(((changed_channel, Channel(), {"loss": loss, "burst_length": length}), "bursts of mean length")
+      for loss, length in BURSTS),
+    *(((quoted, page, PAGES), words) for page, words in [("no mark", "no mark"),
+                                                        ("<!-- ncs study: x -->\n<!-- end -->", "'x'")]),
+]  # fmt: skip
+
+# Most of these the library shows in a box that reads the command line.
+USAGE = [
+    ("", "Missing subcommand"),
+    ("fly", "fly"),
+    ("verify", "Required"),
+    ("compare --mode hope", "hope"),
+    ("compare --steps many", "many"),
+    ("compare --steps 0", "--steps must be at least 1"),
+    ("compare --jobs -1", "--jobs must be at least 1"),
+    ("compare --seed -1", "--seed must be at least 0"),
+    ("compare --violation-penalty nan", "--violation-penalty must be"),
+    ("compare --hyperparams gamma", "expected NAME=VALUE"),
+    ("compare --channel =0.5", "expected NAME=VALUE"),
+    ("compare --channel loss=0.1 loss=0.2", "loss is given twice"),
+    ("compare --engine hope", "hope"),
+    ("compare --ray-address auto", "--ray-address is a setting of --engine ray"),
+    ("sweep --engine ray --ray-address head", "--ray-address must be local, auto or HOST:PORT"),
+    ("evaluate nowhere --episodes 0", "--episodes must be at least 1"),
+    ("evaluate nowhere --shield lookahead --horizon 51", "--horizon must be at least 1 and at most"),
+    ("evaluate nowhere --shield project --horizon 6", "--horizon 6 is for mode lookahead"),
+    ("render --horizon 6", "--horizon 6 is for mode lookahead"),
+    ("train --horizon 6", "--horizon 6 is for mode lookahead"),
+    ("loop --speed 0", "--speed must be positive"),
+    ("loop --mischief 2", "--mischief must be at least 0 and at most 1"),
+    ("loop --port 70000", "--port must be at least 1 and at most 65533"),
+    ("loop --room -1", "--room must be at least 0 and at most 100"),
+    ("loop --role plant", "give both the same --key-file"),
+    ("render --side-by-side --shield none", "--side-by-side compares with a shield"),
+    ("requirements --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),
+    ("requirements --losses -1", "max_consecutive_losses"),
+    ("requirements --keep 0", "--keep"),
+    ("requirements --delays 1 1", "different values"),
+    (f"loop --env {CSTR}", "now 5 + 1 + 0 + 1 by --channel and 5 + 1 + 0 + 1 by --downlink"),
+    ("reproduce --starts 0", "--starts must be"),
+    ("reproduce --steps -1", "--steps must be"),
+    ("reproduce --seed -1", "--seed must be"),
+]
+
+ONE_SENTENCE = [
+    ("compare --env CartPole-v1", "unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"),
+    ("compare --env ncs_gym/LinearNCS-v0", "unknown environment"),
+    ("compare --env CSTR-v0", "unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"),
+    ("compare --arms shielded hope", "unknown arm 'hope'", "shielded:MODE"),
+    ("compare --arms shielded shielded", "--arms must be different"),
+    ("compare --arms unshielded,shielded", "'unshielded,shielded' (several are separated by spaces)"),
+    ("compare --config nowhere.json", "cannot read settings nowhere.json"),
+    ("compare --channel loss=1.5", "loss"),
+    ("compare --hyperparams gamma=2", "gamma must be in [0, 1], got 2"),
+    ("compare --certificate nowhere.json", "cannot read certificate nowhere.json"),
+    ("train --hyperparams gama=0.9", "PPO: unknown hyperparameter 'gama'; its hyperparameters are"),
+    ("train --conf-file nowhere.yml", "nowhere.yml"),
+    ("train --arm hope", "unknown arm 'hope'"),
+    ("evaluate nowhere", "no agent in nowhere"),
+    ("evaluate pretrained", "give --env"),
+    ("sweep --losses 0.1 0.1", "--losses must be different"),
+    ("sweep --delays 1 1", "--delays must be different"),
+    ("sweep --arms shielded shielded", "--arms must be different"),
+    ("sweep --downlink-losses 0.1", "has an ideal downlink, which loses nothing"),
+    ("sweep --losses 0.9 --burst-lengths 2", "bursts of mean length 2"),
+    ("sweep --channel loss=0.5", "--channel loss is a side of the grid"),
+    ("sweep --env ncs_gym/TruckTrailer-v0 --mass-factors 0.9", "a LinearProcess has no mass to change"),
+    ("sweep --env ncs_gym/BatchReactor-v0 --quantization-steps 0.1", "rounds to 0.1, the contract allows 0.001"),
+    ("verify nowhere.json", "cannot read certificate nowhere.json"),
+    ("synthesize --out no/such/folder/c.json", "No such file or directory"),
+    ("synthesize --env no_such_module:Plants/Truck-v0", "there is no module 'no_such_module'"),
+    ("synthesize --env tests.nothing:Plants/Truck-v0", "there is no module 'tests.nothing'"),
+    ("synthesize --env ../own_plants:Plants/Truck-v0", "needs the name of a module, got '../own_plants'"),
+    ("synthesize --env ncs_gym:Plants/Tank-v0", "module 'ncs_gym' registers no environment 'Plants/Tank-v0'"),
+    ("synthesize --env Plants/Truck-v0", "unknown environment 'Plants/Truck-v0'"),
+    ("synthesize --env ncs_gym:CartPole-v1", "expected an NCSEnv inside"),
+    ("synthesize --env ncs_gym:ncs_gym/LinearNCS-v0", "no plant of its own"),
+    ("render --out a.avi", "--out must end in one of .gif, .mp4, .png"),
+    ("render --env CartPole-v1", "unknown environment 'CartPole-v1'"),
+    ("render --out nowhere/a.gif", "No such file or directory"),
+    ("render --policy nowhere", "no agent in nowhere"),
+    ("requirements --env nothing", "unknown environment"),
+    (f"loop --env {CRUISE} --channel lag=3", "--channel lag: a channel has no such setting"),
+    (f"loop --env {CRUISE} --downlink delay=0", "--downlink: what is sent at each step arrives at the next at best"),
+    ("loop --env ncs_gym/Nothing-v0", "ncs_gym/Nothing-v0"),
+    (f"loop --env {CRUISE} --key-file /dev/null --role plant", "not a regular file"),
+]  # fmt: skip
+
+# There are a file `file` and a folder `here`.
+UNWRITABLE = [
+    ("synthesize --out here", "Is a directory: here", "name the file"),
+    ("synthesize --out file/c.json", "Not a directory: file;", "choose another path"),
+    ("verify c.json --out here", "Is a directory: here", "name the file"),
+    ("verify c.json --out nowhere/v.json", "No such file or directory: nowhere;", "check the path"),
+    ("evaluate agent --out nowhere/e.json", "No such file or directory: nowhere;", "check the path"),
+    ("audit --out nowhere/a.json", "No such file or directory: nowhere;", "check the path"),
+    ("render --out nowhere/e.gif", "No such file or directory: nowhere;", "check the path"),
+    ("reproduce --out file", "File exists: file;", "choose another path"),
+    ("compare --smoke --out file", "file"),
+    ("study --quote nowhere.md", "No such file or directory: nowhere.md;", "check the path"),
+]
+
+
+@pytest.mark.parametrize(("kind", "given", "words"), SETTINGS)
+def test_settings_are_refused(kind, given, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        kind(**given)
+
+
+@pytest.mark.parametrize(("call", "words"), CALLS)
+def test_calls_are_refused(call, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        call[0](*call[1:])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("line", "words"), USAGE)
+def test_usage_errors_are_the_parsers(line, words):
+    run = ncs(*line.split(), COLUMNS="200")
+    assert run.returncode == 2
+    assert "Traceback" not in run.stderr
+    assert words in " ".join(run.stderr.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(("line", "words"), [(line, words) for line, *words in ONE_SENTENCE])
+def test_other_errors_are_one_sentence_before_anything_is_written(line, words, tmp_path):
+    assert_one_sentence(ncs(*line.split(), cwd=tmp_path), *words)
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize(("line", "words"), [(line, words) for line, *words in UNWRITABLE])
+def test_file_that_cannot_be_written_is_refused_before_anything_is_computed(line, words, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "here").mkdir()
+    run = ncs(*line.split(), cwd=tmp_path)
+    assert_one_sentence(run, *words)
+    assert run.stdout == ""
+    assert (tmp_path / "file").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "here"}
+
+
+@pytest.mark.parametrize("text", ["1.5", "1e-3", "1e400", "1e-999999999", "1e99999999999999999999", "nan", "inf", ""])
+def test_what_is_no_whole_number_of_steps_is_refused(text):
+    said = ncs("train", "--steps", text, COLUMNS="200")
+    assert said.returncode == 2
+    assert f"--steps: expected a whole number below 1e15, such as 100000 or 1e5, got {text!r}" in said.stderr
+    assert "no type matching" not in said.stderr

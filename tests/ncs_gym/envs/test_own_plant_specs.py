@@ -1,0 +1,209 @@
+"""Specs of environments with plants of users' own are JSON, and make the same environment again."""
+
+import copy
+import json
+import pickle
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+from ncs_gym import (
+    AdversarialDisturbance,
+    BallDisturbance,
+    BoxDisturbance,
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    GilbertElliott,
+    LinearPlant,
+    LinearProcess,
+    NCSVectorEnv,
+    RandomChannel,
+    Regulation,
+    SetpointTracking,
+    SinusoidDisturbance,
+    SphereDisturbance,
+    TraceChannel,
+    register_plant,
+    truck_trailer,
+)
+from ncs_gym.processes import CartPoleProcess, nonlinear_cart_pole
+from shields import SafetyShield
+from tests.certificates import certificate_of
+
+LINEAR = "ncs_gym/LinearNCS-v0"
+BURSTS = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5)
+SETTINGS = [
+    {},
+    {"channel": Channel(loss=BURSTS, delay=1)},
+    {"channel": TraceChannel(trace=(0, 1, -1, 2))},
+    {"channel": Channel(max_consecutive_losses=1), "contract": ChannelContract(max_age=5)},
+    {"channel": Channel(max_consecutive_losses=1), "downlink": Channel(delay=1, max_consecutive_losses=1)},
+    {"task": SetpointTracking(output=np.array([1.0, 0.0]), reach=0.1, width=1.0)},
+    {"task": Regulation(state_cost=np.eye(2), input_cost=[[0.5]])},
+    {"disturbance": BallDisturbance()},
+    {"disturbance": BoxDisturbance()},
+    {"disturbance": BoxDisturbance(np.array([0.001, 0.002]))},
+    {"disturbance": SinusoidDisturbance(period=7.0)},
+    {"disturbance": SphereDisturbance()},
+    {"disturbance": AdversarialDisturbance()},
+    {"disturbance": AdversarialDisturbance(M=np.diag([1.0, 2.0]))},
+    {"disturbance": AdversarialDisturbance(rows=np.array([[1.0, -1.0]]))},
+    {"initial_set": Ellipsoid(np.diag([0.01, 0.02]))},
+    {"process": LinearProcess()},
+    {"horizon": np.int64(50), "terminate_on_violation": np.bool_(True), "observe": ("age", "error")},
+]
+
+
+def own_plant():
+    """A plant that no module registers."""
+    return LinearPlant(
+        A=[[0.9, 0.1], [0.0, 0.8]],
+        B=[[0.0], [0.1]],
+        box=[1.0, 2.0],
+        u_max=1.5,
+        dt=0.1,
+        gamma=1e-4,
+        disturbance_bound=[0.01, 0.02],
+        sensor_bound=0.01,
+        initial_bound=0.02,
+        error_gain=[[0.1, 0.2]],
+        state_names=["level", "rate"],
+        state_units=["m", "m/s"],
+    )
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Registers plants for the time of a test."""
+    monkeypatch.setattr("gymnasium.envs.registration.registry", before := dict(gym.registry))
+    monkeypatch.setattr("gymnasium.registry", before)
+    return register_plant
+
+
+def assert_moves_alike(one, other):
+    for env in (one, other):
+        env.reset(seed=3)
+    for step in range(12):
+        action = np.full(one.action_space.shape, np.sin(step), np.float32)
+        (first, reward, *_), (second, same_reward, *_) = one.step(action), other.step(action)
+        np.testing.assert_array_equal(first, second)
+        np.testing.assert_array_equal(reward, same_reward)
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_spec_of_a_plant_of_ones_own_makes_the_same_environment_again(settings):
+    made = gym.make(LINEAR, plant=own_plant(), **settings)
+    text = made.spec.to_json()
+    loaded = gym.make(EnvSpec.from_json(text))
+    assert json.loads(loaded.spec.to_json()) == json.loads(text)
+    assert loaded.unwrapped.plant.fingerprint == made.unwrapped.plant.fingerprint
+    assert loaded.unwrapped.plant.state_names == ("level", "rate")
+    assert loaded.unwrapped.channel == made.unwrapped.channel
+    assert type(loaded.unwrapped.disturbance) is type(made.unwrapped.disturbance)
+    assert_moves_alike(made, loaded)
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_spec_of_a_registered_plant_is_json(settings, registered):
+    registered("Plants/Own-v0", own_plant(), max_episode_steps=20, **settings)
+    spec = gym.spec("Plants/Own-v0")
+    for twin in (EnvSpec.from_json(spec.to_json()), pickle.loads(pickle.dumps(spec)), copy.deepcopy(spec)):
+        assert twin == spec
+        assert_moves_alike(gym.make("Plants/Own-v0"), gym.make(twin))
+
+
+def test_spec_of_a_vector_environment_is_json(registered):
+    channels = [Channel(loss=0.1), Channel(loss=BURSTS, delay=1)]
+    registered("Plants/Own-v0", own_plant())
+    for made in (
+        gym.make_vec(LINEAR, num_envs=2, plant=own_plant(), channel=channels),
+        gym.make_vec("Plants/Own-v0", num_envs=2),
+    ):
+        again = gym.make_vec(EnvSpec.from_json(made.spec.to_json()))
+        assert isinstance(again, NCSVectorEnv)
+        assert again.episode_channels == made.episode_channels
+        assert_moves_alike(made, again)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        replace(truck_trailer(), between_samples=3),
+        LinearPlant.from_statespace(
+            ([[0.0, 1.0], [-1.0, -1.0]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))),
+            0.1,
+            input_delay=2,
+            box=1.0,
+            u_max=1.0,
+            disturbance_bound=Ellipsoid(1e-4 * np.eye(2)),
+            sensor_bound=0,
+            initial_bound=0.01,
+        ),
+        nonlinear_cart_pole(),
+    ],
+    ids=["between_samples", "input_delay", "remainder"],
+)
+def test_document_of_a_plant_has_all_of_it(plant):
+    document = json.loads(json.dumps(plant.document))
+    again = LinearPlant.read(document)
+    assert (again.fingerprint, again.assumptions, str(again)) == (plant.fingerprint, plant.assumptions, str(plant))
+    assert again.document == plant.document == document
+
+
+def test_process_of_a_plant_of_ones_own_is_json():
+    kwargs = {"plant": nonlinear_cart_pole(), "process": CartPoleProcess(pole_mass=0.11)}
+    channel = Channel(max_consecutive_losses=1)
+    made = gym.make(LINEAR, channel=channel, **kwargs)
+    again = gym.make(EnvSpec.from_json(made.spec.to_json()))
+    assert again.unwrapped.process == made.unwrapped.process
+    assert_moves_alike(made, again)
+
+
+def test_environments_of_one_document_share_the_plant():
+    plant = own_plant()
+    made = gym.make(LINEAR, plant=plant)
+    assert gym.make(made.spec).unwrapped.plant is plant
+    text = made.spec.to_json()
+    assert gym.make(EnvSpec.from_json(text)).unwrapped.plant is gym.make(EnvSpec.from_json(text)).unwrapped.plant
+
+
+def test_shielded_and_randomized_environment_is_made_again_from_its_spec(registered):
+    registered("Plants/Own-v0", own_plant(), max_episode_steps=20)
+    channels = [Channel(loss=0.2), TraceChannel(trace=(0, -1))]
+    certificate = certificate_of(own_plant())
+    made = SafetyShield(RandomChannel(gym.make("Plants/Own-v0"), channel=channels), certificate)
+    again = gym.make(EnvSpec.from_json(made.spec.to_json()))
+    assert isinstance(again, SafetyShield)
+    assert_moves_alike(made, again)
+
+
+def test_relative_path_of_a_plant_and_a_path_object_are_json(registered, tmp_path, monkeypatch):
+    own_plant().save(tmp_path / "plant.json")
+    monkeypatch.chdir(tmp_path)
+    registered("Plants/Own-v0", "plant.json")
+    for spec in (gym.spec("Plants/Own-v0"), gym.make(LINEAR, plant=tmp_path / "plant.json").spec):
+        made = gym.make(EnvSpec.from_json(spec.to_json()))
+        assert made.unwrapped.plant.fingerprint == own_plant().fingerprint
+
+
+@pytest.mark.parametrize(
+    "document",
+    [{}, {"format": "ncs-gym plant 1"}, {"format": "ncs-gym plant 1", "plant": {"A": [[1.0]]}}, {"plant": {1, 2}}],
+    ids=str,
+)
+def test_document_of_no_plant_is_one_sentence(document):
+    with pytest.raises(ValueError, match="plant") as caught:
+        gym.make(LINEAR, plant=document)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_holds_functions_stays_what_it_is():
+    """Gymnasium says then that the spec is no JSON; nothing is lost without a word."""
+    made = gym.make(LINEAR, plant=own_plant(), disturbance=lambda rng, plant, nominal: np.zeros(2))
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        made.spec.to_json()
+    assert_moves_alike(made, gym.make(made.spec))

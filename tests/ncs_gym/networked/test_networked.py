@@ -1,0 +1,309 @@
+"""The network around environments that are not ours: what is seen, what acts, and that nothing else changes."""
+
+import json
+import pickle
+import warnings
+from itertools import count
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import DelayObservation, TimeLimit
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from ncs_gym import Channel, GilbertElliott, Networked, RandomChannel, RequestActions, TraceChannel
+from tests.ncs_gym.networked.environments import Counter
+
+BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
+LATE = Channel(loss=0.3, delay=1, jitter=2)
+EVERYTHING = {
+    "channel": Channel(loss=BURSTS, delay=1, jitter=2, send_period=2),
+    "downlink": LATE,
+    "observe": ("age", "arrived", "pending_actions"),
+}
+
+
+def run(env, steps, seed=0):
+    """What an environment returns for actions 1, 2, ..., from the reset on."""
+    returned = [env.reset(seed=seed)]
+    for k in range(steps):
+        returned.append(env.step(np.array([k + 1.0])))
+    return returned
+
+
+def counts(returned):
+    return [int(each[0][0]) for each in returned]
+
+
+def ages_of_trace(delays, steps):
+    """Ages of the newest sample at steps 0..steps, by going through all packets at each; sample k is sent at step k."""
+    ages = []
+    for now in range(steps + 1):
+        arrived = [s for s in range(1, now + 1) if delays[s - 1] >= 0 and s + delays[s - 1] <= now]
+        ages.append(now - max(arrived, default=0))
+    return ages
+
+
+@pytest.mark.parametrize("trace", [(0,), (2,), (0, 3, -1, 1, -1, -1, 0), (5, 0, 0, 4, -1, 2, 2)])
+def test_newest_sample_that_arrived_is_seen(trace):
+    steps = 40
+    returned = run(Networked(Counter(), TraceChannel(trace=trace)), steps)
+    ages = [each[-1]["measurement_age"] for each in returned]
+    rounds = [trace[offset:] + trace[:offset] for offset in range(len(trace))]  # a record begins anywhere
+    assert ages in [ages_of_trace((each * steps)[:steps], steps) for each in rounds]
+    assert counts(returned) == [step - age for step, age in enumerate(ages)]
+    assert [each[-1]["packet_arrived"] for each in returned[1:]] == list(np.diff(counts(returned)) > 0)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
+@pytest.mark.parametrize("channel", [None, Channel()])
+def test_perfect_network_changes_nothing(env_id, channel):
+    bare, networked = (
+        gym.make(env_id),
+        Networked(
+            gym.make(env_id),
+            channel,
+            channel,
+            neutral=None if channel is None else 0 if env_id != "Pendulum-v1" else None,
+        ),
+    )
+    bare.action_space.seed(0)
+    first, own = bare.reset(seed=0), networked.reset(seed=0)
+    over = False
+    while not over:
+        assert np.array_equal(first[0], own[0])
+        assert first[1:-1] == own[1:-1]
+        assert first[-1].items() <= own[-1].items()
+        action = bare.action_space.sample()
+        first, own = bare.step(action), networked.step(action)
+        over = first[2] or first[3]
+
+
+def test_delay_is_that_of_gymnasium():
+    ours, theirs = Networked(gym.make("Pendulum-v1"), Channel(delay=3)), DelayObservation(gym.make("Pendulum-v1"), 3)
+    ours.reset(seed=1), theirs.reset(seed=1)
+    for k in range(50):
+        seen, wanted = (env.step(np.array([np.sin(k)], np.float32))[0] for env in (ours, theirs))
+        assert k < 2 or np.array_equal(seen, wanted)  # before the first arrival: the start, and theirs zeros
+
+
+@pytest.mark.parametrize(
+    ("late", "idle", "acted"),
+    [
+        # Commands 1, 2, ... that arrive after 0, 2, 0, lost, 1, 0, 3, 0 steps, around again.
+        ("apply", "hold", [1, 1, 3, 3, 3, 6, 6, 8, 9, 9]),
+        ("apply", "neutral", [1, 0, 3, 0, 0, 6, 0, 8, 9, 0]),
+        ("drop", "hold", [1, 1, 3, 3, 3, 6, 6, 8, 9, 9]),
+        ("queue", "hold", [1, 1, 3, 2, 2, 5, 6, 8, 9, 7]),
+    ],
+)
+def test_commands_that_are_late_act_as_asked_for(late, idle, acted):
+    trace = (0, 2, 0, -1, 1, 0, 3, 0)
+    seed = next(each for each in count() if _begins_at_its_first(trace, each))
+    returned = run(Networked(Counter(), downlink=TraceChannel(trace=trace), late=late, idle=idle), 10, seed)
+    infos = [each[-1] for each in returned[1:]]
+    assert [info["acted"] for info in infos] == acted
+    assert [info["action_applied"][0] for info in infos] == acted
+    assert all(
+        info["action_age"] == step + 1 - act for step, (info, act) in enumerate(zip(infos, acted, strict=True)) if act
+    )
+
+
+def _begins_at_its_first(trace, seed):
+    """Whether the record of a downlink begins at its first packet for a seed: nothing is held or late then."""
+    env = Networked(Counter(), downlink=TraceChannel(trace=trace), late="drop", idle="neutral")
+    return [each[-1]["acted"] for each in run(env, 8, seed)[1:]] == [1, 0, 3, 0, 0, 6, 0, 8]
+
+
+def test_fixed_delay_of_commands_is_not_late():
+    infos = [each[-1] for each in run(Networked(Counter(), downlink=Channel(delay=2), late="drop"), 6)[1:]]
+    assert [info["acted"] for info in infos] == [0, 0, 1, 2, 3, 4]
+    assert [info["action_age"] for info in infos] == [1, 2, 2, 2, 2, 2]
+
+
+def test_each_key_has_a_channel_of_its_own():
+    env = Networked(Counter("dict"), {"count": Channel(delay=3), "odd": Channel(send_period=2)}, observe=("age",))
+    assert env.reset(seed=0)[0]["image"].shape == (84, 84, 4)
+    for k in range(1, 8):
+        seen, *_, info = env.step(np.zeros(1))
+        assert seen["count"] == max(k - 3, 0)
+        assert seen["odd"] == 0
+        assert (seen["image"] == k).all()
+        assert info["measurement_age"] == {"count": min(k, 3), "image": 0, "odd": k % 2}
+        assert seen["age"].tolist() == list(info["measurement_age"].values())
+
+
+def test_what_is_seen_where_nothing_arrived():
+    lost = Channel(send_period=3)
+    assert counts(run(Networked(Counter(), lost), 7)) == [0, 0, 0, 3, 3, 3, 6, 6]
+    assert counts(run(Networked(Counter(), lost, fill="zero"), 7)) == [0, 0, 0, 3, 0, 0, 6, 0]
+
+    def predicted(last, age, actions):
+        assert actions[-age:].tolist() == [[last[0] + 1 + k] for k in range(age)]  # decided since the sample
+        return last + age
+
+    assert counts(run(Networked(Counter(), lost, fill=predicted), 7)) == [0, 1, 2, 3, 4, 5, 6, 7]
+
+
+def test_entries_are_what_infos_say_and_actions_are_those_decided():
+    env = Networked(gym.make("CartPole-v1"), LATE, LATE, ("age", "arrived", "pending_actions"), neutral=1, pending=3)
+    assert env.observation_space.shape == (4 + 1 + 1 + 2 * 3,)
+    seen, info = env.reset(seed=0)
+    decided, over = [1, 1, 1], False
+    while not over:
+        assert seen[4:6].tolist() == [info["measurement_age"], info["packet_arrived"]]
+        assert seen[6:].reshape(3, 2).argmax(axis=1).tolist() == decided[-3:]
+        decided.append(len(decided) % 2)
+        seen, _, *ends, info = env.step(decided[-1])
+        over = any(ends)
+
+
+def test_entries_of_other_observations_have_names():
+    space = Networked(Counter("image"), LATE, observe=("age", "pending_actions"), pending=2).observation_space
+    assert list(space) == ["age", "observation", "pending_actions"]
+    assert space["pending_actions"].shape == (2, 1)
+    assert "arrived" in Networked(Counter("dict"), LATE, observe=("arrived",)).observation_space.spaces
+    with pytest.raises(ValueError, match="have an entry 'age' of their own"):
+        Networked(Networked(Counter("dict"), LATE, observe=("age",)), observe=("age",))
+
+
+@pytest.mark.parametrize("kind", ["image", "buffers"])
+def test_large_observations_are_what_they_were_when_they_were_taken(kind):
+    env = Networked(Counter(kind), Channel(loss=0.3, delay=2, jitter=3))
+    env.reset(seed=0)
+    for k in range(60):
+        seen, *_, info = env.step(np.zeros(1))
+        assert (seen == (k + 1 - info["measurement_age"]) % 256).all()
+
+
+def test_large_observations_that_arrive_are_not_copied():
+    env = Networked(Counter("image"))
+    env.reset(seed=0)
+    given = []
+    inner, step = env.env, env.env.step
+    inner.step = lambda action: given.append(step(action)) or given[-1]
+    seen = [env.step(np.zeros(1))[0] for _ in range(5)]
+    assert all(np.shares_memory(one, other[0]) for one, other in zip(seen[2:], given[2:], strict=True))
+
+
+def test_quantized_floats_stay_in_their_space():
+    env = Networked(gym.make("Pendulum-v1"), Channel(quantization_step=0.3))
+    env.reset(seed=0)
+    for _ in range(50):
+        seen = env.step(np.array([1.0], np.float32))[0]
+        assert env.observation_space.contains(seen)
+        assert np.isclose(seen / 0.3, np.rint(seen / 0.3), atol=1e-5)[np.abs(seen) < env.observation_space.high].all()
+
+
+def test_network_does_not_depend_on_what_the_environment_draws():
+    ages = [
+        [each[-1]["measurement_age"] for each in run(Networked(Counter(extra_draws=draws), LATE), 50, seed=4)]
+        for draws in (0, 3)
+    ]
+    assert ages[0] == ages[1]
+    assert ages[0] != [each[-1]["measurement_age"] for each in run(Networked(Counter(), LATE), 50, seed=5)]
+
+
+def test_rewards_travel_with_samples_if_asked_to_and_nothing_is_lost():
+    now, later = (run(Networked(Counter(length=30), LATE, delay_reward=late), 30) for late in (False, True))
+    assert [each[1] for each in now[1:]] == list(range(1, 31))
+    assert sum(each[1] for each in later[1:]) == sum(range(1, 31))
+    for k, each in enumerate(later[1:-1], 1):
+        newest = k - each[-1]["measurement_age"]
+        assert sum(other[1] for other in later[1 : k + 1]) == sum(range(1, newest + 1))
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "Taxi-v4", "Blackjack-v1"])
+@pytest.mark.parametrize("settings", [{"channel": LATE}, EVERYTHING], ids=["uplink", "everything"])
+def test_checkers_pass(env_id, settings):
+    neutral = {} if env_id == "Pendulum-v1" else {"neutral": 0}
+    env = Networked(gym.make(env_id), **settings, **neutral)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # both warn of what is wrapped
+        check_env(env, skip_render_check=True)
+        sb3_check_env(env)
+
+
+def test_spec_survives_json_and_pickling():
+    env = Networked(gym.make("CartPole-v1"), **EVERYTHING, neutral=1, late="queue")
+    text = env.spec.to_json()
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(text))
+    assert json.loads(again.spec.to_json()) == json.loads(text)
+    for other in (again, pickle.loads(pickle.dumps(env))):
+        seen, wanted = other.reset(seed=3), env.reset(seed=3)
+        for _ in range(8):
+            assert np.array_equal(seen[0], wanted[0])
+            seen, wanted = other.step(1), env.step(1)
+
+
+def test_channels_of_episodes_are_drawn_or_given_and_other_options_reach_the_environment():
+    inner = Networked(Counter(), Channel(delay=1))
+    env = RandomChannel(inner, channel=[Channel(delay=k) for k in range(5)])
+    delays = {env.reset(seed=seed)[1] and inner.episode_channel.delay for seed in range(40)}
+    assert delays == set(range(5))
+    info = env.reset(options={"channel": Channel(delay=9), "start": 3})[1]
+    assert (inner.episode_channel.delay, info["options"]) == (9, {"start": 3})
+    inner.reset()
+    assert inner.episode_channel.delay == 1
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+def test_samples_on_request_cost_and_come_only_then(env_id):
+    env = RequestActions(Networked(gym.make(env_id), Channel(on_request=True)), cost=0.5)
+    bare = gym.make(env_id)
+    env.reset(seed=0), bare.reset(seed=0)
+    for k in range(8):
+        ask = k % 3 == 0
+        action = [0, int(ask)] if env_id == "CartPole-v1" else np.array([0.5, 1.0 if ask else -1.0], np.float32)
+        seen, reward, *_, info = env.step(np.array(action))
+        wanted, plain, *_ = bare.step(0 if env_id == "CartPole-v1" else np.array([0.5], np.float32))
+        assert reward == pytest.approx(plain - 0.5 * ask)
+        assert info["measurement_age"] == k % 3
+        assert np.array_equal(seen[:-2], wanted) == ask
+        assert seen[-2] == k % 3
+
+
+def test_time_limits_stand_inside_and_outside():
+    for env in (TimeLimit(Networked(Counter(), LATE), 7), Networked(TimeLimit(Counter(), 7), LATE)):
+        assert [each[3] for each in run(env, 7)[1:]] == [False] * 6 + [True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"channel": 3}, "channel must be a Channel, or a dictionary of its fields, got 3"),
+        ({"channel": {"los": 1}}, "channel has the key 'los', which observations do not have"),
+        ({"channel": {"count": Channel()}}, "channel has the key 'count', which observations do not have"),
+        ({"downlink": Channel(send_period=2)}, "a downlink sends a command at every step"),
+        ({"downlink": LATE}, "has no zero: give neutral="),
+        ({"downlink": LATE, "neutral": 7}, "neutral must be an action, got 7"),
+        ({"observe": "age"}, "observe must be different ones of age, arrived, pending_actions, got 'age'"),
+        ({"observe": ("age", "age")}, "observe must be different ones"),
+        ({"fill": "nothing"}, "fill must be 'last', 'zero' or a function"),
+        ({"late": "never"}, "late must be one of 'apply', 'drop', 'queue', got 'never'"),
+        ({"idle": 0}, "idle must be one of 'hold', 'neutral', got 0"),
+        ({"pending": 0}, "pending must be"),
+        ({"delay_reward": 1}, "delay_reward must be"),
+    ],
+)
+def test_wrong_settings_are_one_sentence(settings, sentence):
+    with pytest.raises(ValueError, match=sentence.replace("(", r"\(")):
+        Networked(gym.make("CartPole-v1"), **settings)
+
+
+def test_networks_that_do_not_fit_are_one_sentence():
+    with pytest.raises(ValueError, match="an NCSEnv has its own network"):
+        Networked(gym.make("ncs_gym/TruckTrailer-v0"))
+    with pytest.raises(ValueError, match="has no floats to quantize"):
+        Networked(gym.make("FrozenLake-v1"), Channel(quantization_step=0.1))
+    with pytest.raises(ValueError, match="has no zero"):
+        Networked(gym.wrappers.TransformObservation(Counter(), None, gym.spaces.Box(1.0, 2.0, (1,))), fill="zero")
+    with pytest.raises(ValueError, match="made for channels with on_request=False"):
+        Networked(Counter()).reset(options={"channel": Channel(on_request=True)})
+    with pytest.raises(ValueError, match="has an ideal downlink"):
+        Networked(Counter()).reset(options={"downlink": Channel()})
+    with pytest.raises(ValueError, match="sends samples by itself"):
+        Networked(Counter()).request()
+    with pytest.raises(ValueError, match="a function for fill is for one channel"):
+        Networked(Counter("dict"), {"count": Channel()}, fill=lambda *given: None)

@@ -1,0 +1,131 @@
+"""The vector network does what the single one does, in all modes of autoreset."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from ncs_gym import Channel, GilbertElliott, Networked, TraceChannel, VectorNetworked, VectorRandomChannel
+from tests.ncs_gym.networked.environments import Counter
+
+BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
+LATE = Channel(loss=0.4, delay=1, jitter=2)
+KEYS = "measurement_age", "packet_arrived", "action_age", "action_applied", "packets"
+
+
+def predicted(last, age, actions):
+    return last + np.float32(0.001) * np.asarray(age, np.float32)[..., None] % np.float32(0.05)
+
+
+SETTINGS = {
+    "nothing": {},
+    "losses": {"channel": Channel(loss=0.4)},
+    "everything": {"channel": Channel(loss=BURSTS, delay=1, jitter=3, send_period=2, quantization_step=0.05)},
+    "both": {"channel": Channel(delay=2), "downlink": LATE},
+    "dropped": {"downlink": LATE, "late": "drop", "idle": "neutral"},
+    "queued": {"downlink": Channel(loss=0.4, jitter=4), "late": "queue"},
+    "zeros": {"channel": LATE, "fill": "zero", "observe": ("age", "arrived", "pending_actions")},
+    "predictor": {"channel": LATE, "fill": predicted, "delay_reward": True},
+    "record": {"channel": TraceChannel(trace=(0, 3, -1, 1, -1, -1, 0)), "observe": ("age",), "delay_reward": True},
+}
+
+
+def rows(value, e):
+    """What a batch says of an environment."""
+    return {key: rows(each, e) for key, each in value.items()} if isinstance(value, dict) else value[e]
+
+
+def same(one, other):
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "dict"])
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
+def test_one_environment_is_that_of_the_single_network(env_id, settings):
+    def make():
+        return Counter("dict") if env_id == "dict" else gym.make(env_id)
+
+    if env_id == "dict" and callable(settings.get("fill")):
+        settings = {"channel": {"count": LATE, "image": Channel(loss=0.5)}}
+    if env_id == "CartPole-v1" and "downlink" in settings:
+        settings = settings | {"neutral": 0}
+    one, many = Networked(make(), **settings), VectorNetworked(SyncVectorEnv([make]), **settings)
+    seen, seen_by_many = one.reset(seed=3), many.reset(seed=3)
+    assert same(seen[0], rows(seen_by_many[0], 0))
+    one.action_space.seed(0)
+    for _ in range(80):
+        action = one.action_space.sample()
+        seen, seen_by_many = one.step(action), many.step(np.array([action]))
+        assert same(seen[0], rows(seen_by_many[0], 0))
+        assert seen[1] == pytest.approx(seen_by_many[1][0])
+        for key in KEYS:
+            assert same(seen[-1][key], rows(seen_by_many[-1][key], 0)), key
+        if seen[2] or seen[3]:
+            return
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("late", ["apply", "queue"])
+def test_episodes_that_end_at_different_times_begin_anew_alone(mode, late):
+    lengths = 5, 7, 11
+    settings = {"channel": Channel(delay=2, send_period=2), "downlink": Channel(delay=1), "late": late}
+    makes = [lambda length=length: Counter(length=length) for length in lengths]
+    many = VectorNetworked(SyncVectorEnv(makes, autoreset_mode=mode), **settings)
+    singles = [Networked(make(), **settings) for make in makes]
+    for env in (many, *singles):
+        env.reset(seed=0)
+    over = [False] * 3
+    for k in range(40):
+        actions = np.arange(3.0)[:, None] + 10.0 * k
+        if mode is AutoresetMode.DISABLED and any(over):
+            seen, info = many.reset(options={"reset_mask": np.array(over)})
+            for e in np.flatnonzero(over):
+                assert seen[e] == singles[e].reset()[0]
+            over = [False] * 3
+        seen, rewards, terminated, _, info = many.step(actions)
+        for e, env in enumerate(singles):
+            if over[e] and mode is AutoresetMode.NEXT_STEP:
+                wanted, own = env.reset()
+                over[e] = False
+            else:
+                wanted, reward, over[e], _, own = env.step(actions[e])
+                assert (rewards[e], terminated[e]) == (reward, over[e])
+                if over[e] and mode is AutoresetMode.SAME_STEP:
+                    assert info["final_obs"][e] == wanted
+                    assert info["final_info"]["measurement_age"][e] == own["measurement_age"]
+                    (wanted, own), over[e] = env.reset(), False
+            assert seen[e] == wanted, (k, e)
+            assert [info[key][e] for key in KEYS] == [own[key] for key in KEYS], (k, e)
+
+
+def test_networks_of_a_batch_are_independent_and_have_the_rate_asked_for():
+    many = VectorNetworked(SyncVectorEnv([Counter] * 64), Channel(loss=0.3))
+    many.reset(seed=0)
+    arrived = np.array([many.step(np.zeros((64, 1)))[-1]["packet_arrived"] for _ in range(200)])
+    assert arrived.mean() == pytest.approx(0.7, abs=0.02)
+    assert abs(np.corrcoef(arrived.T)[np.triu_indices(64, 1)].mean()) < 0.01
+
+
+def test_channels_of_episodes_are_drawn_also_where_they_begin_by_themselves():
+    inner = VectorNetworked(SyncVectorEnv([lambda: Counter(length=4)] * 3), Channel())
+    env = VectorRandomChannel(inner, [Channel(delay=k) for k in range(4)])
+    env.reset(seed=0)
+    ages = np.array([env.step(np.zeros((3, 1)))[-1]["measurement_age"] for _ in range(200)])
+    assert set(ages[3::5].ravel()) == {0, 1, 2, 3}  # of last steps: the delays drawn
+
+
+def test_many_large_observations_are_what_they_were():
+    env = VectorNetworked(SyncVectorEnv([lambda: Counter("image")] * 2, copy=False), LATE)
+    env.reset(seed=0)
+    for k in range(40):
+        seen, *_, info = env.step(np.zeros((2, 1)))
+        assert (seen == ((k + 1 - info["measurement_age"]) % 256)[:, None, None, None]).all()
+
+
+def test_what_vector_environments_cannot_have_is_one_sentence():
+    with pytest.raises(ValueError, match="samples on request are for single environments"):
+        VectorNetworked(SyncVectorEnv([Counter]), Channel(on_request=True))
+    with pytest.raises(ValueError, match="an NCSVectorEnv has one"):
+        VectorNetworked(gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2))

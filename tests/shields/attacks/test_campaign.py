@@ -1,0 +1,270 @@
+"""The campaign: one adversary against every claim, in every case and mode; and twins of it that it has to win.
+
+`make test` runs a part of every case and mode, `make test-slow` the whole, by the same function. All claims that a run
+makes are compared in it; whatever is false names its claim.
+"""
+
+from collections import Counter
+from contextlib import contextmanager
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from shields import SafetyFilter, SafetyShield
+from shields.runtime import safety_filter
+from shields.runtime.backup_plans import plan_check
+from shields.runtime.guarantee import OLD_SAMPLE
+from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
+from tests.shields.attacks.cases import CASES, case
+from tests.shields.attacks.worlds import (
+    AGE,
+    ALL_TIMES,
+    BOX,
+    ERROR,
+    SAFE_SET,
+    through_estimators,
+    through_loop,
+    through_shield,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning")
+
+MODES = ("project", "switch", "boundary", "lookahead")
+# Environments and steps behind one network in the part, and behind each of them in the whole.
+SIZES = {
+    "SafetyShield": ((None, 60), (None, 400)),
+    "VectorSafetyShield": ((30, 40), (100, 150)),
+    "SafeLoop": ((1, 150), (1, 600)),
+}
+# How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
+# than the safe set.
+CLOSE = {SAFE_SET: 0.9, BOX: 0.4, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
+SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 1.0}
+WITH_REMAINDER = [name for name in CASES if name.endswith("with remainder")]
+
+
+def attacked(name, mode, through, network, seed, is_whole=False, of=None, **world):
+    """What comes of an attack on a case, or on another one `of` its kind."""
+    count, steps = SIZES[through][is_whole]
+    target = of or case(name)
+    if through == "SafeLoop":
+        return through_loop(target, mode, network, steps, seed, **world)
+    return through_shield(target, mode, network, count, steps, seed)
+
+
+def campaign() -> list:
+    """All of case x mode x what is attacked; the part is every mode of vectors and one mode of the others."""
+    rows = []
+    for c, name in enumerate(CASES):
+        for m, mode in enumerate(MODES):
+            for t, through in enumerate(SIZES):
+                if through == "SafeLoop" and name in WITH_REMAINDER:  # only the environments have their processes
+                    continue
+                row = name, mode, through
+                if through == "VectorSafetyShield" or (c + m + t) % len(MODES) == 0:
+                    rows.append(pytest.param(*row, False, id="-".join(row)))
+                rows.append(pytest.param(*row, True, id="-".join((*row, "whole")), marks=pytest.mark.slow))
+    return rows
+
+
+@pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
+def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
+    first = [*CASES].index(name) + MODES.index(mode)
+    networks = range(first, first + (len(case(name).networks) if is_whole else 1))
+    outcomes = [attacked(name, mode, through, network, network, is_whole) for network in networks]
+    for outcome in outcomes:
+        assert not outcome.lost
+        false = {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0}
+        assert not false
+        if outcome.counts["guaranteed"] == outcome.counts["steps"]:  # else starts may not have been proved at all
+            far = {claim: gauge for claim, gauge in outcome.largest.items() if gauge < SHARE[through] * CLOSE[claim]}
+            assert not far
+    counts = sum((outcome.counts for outcome in outcomes), Counter())
+    assert counts["overridden"] < counts["steps"]
+    if mode != "lookahead":  # there a plan may save every proposal
+        assert counts["overridden"] > 0 or through == "SafetyShield"  # which has few steps
+        assert counts["guaranteed"] == counts["steps"]
+    elif through == "VectorSafetyShield":
+        assert min(counts["planned"], counts["stored"], counts["outside S"]) > 0
+        assert counts["guaranteed"] > 0.3 * counts["steps"]
+
+
+@pytest.mark.parametrize(("count", "steps"), [(40, 60), pytest.param(200, 500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", CASES)
+def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
+    for network in range(len(case(name).networks) if steps > 100 else 1):
+        outcome, error_set, seen = through_estimators(case(name), network, count, steps, network)
+        assert not outcome.lost
+        assert 0.9 < outcome.largest[ERROR] <= 1.0
+        assert case(name).contract is None or outcome.largest[AGE] == 1.0
+        # Shapes recur: they are compared in exact arithmetic, in the part some of all ages.
+        by_age = sorted(seen, key=lambda each: each[1])
+        for shape, age in by_age if steps > 100 else by_age[:: len(by_age) // 15 + 1]:
+            certified = error_set.shape_at(age)
+            running = np.frombuffer(shape).reshape(certified.shape)
+            assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
+
+
+@contextmanager
+def errors_forgotten(patch):
+    """The filter takes the estimate for the state."""
+    one, many = SafetyFilter.errors_of, SafetyFilter.errors_of_many
+    patch.setattr(SafetyFilter, "errors_of", lambda shield, shape: one(shield, 1e-6 * shape))
+    patch.setattr(SafetyFilter, "errors_of_many", lambda shield, shapes: many(shield, 1e-6 * shapes))
+    yield {}
+
+
+@contextmanager
+def set_enlarged(patch, of, factor=1.5):
+    """A certificate of a larger set, which nobody verifies; episodes start where they would in the right one."""
+    right, scaled = of.certificate, None
+    if right.polytope is not None:
+        scaled = replace(right.polytope, rows=right.polytope.rows / factor)
+    wrong = replace(right, L=factor**2 * right.L, polytope=scaled)
+    for check in ("require_valid", "require_computable"):
+        patch.setattr(safety_filter, check, lambda *_: None)
+    yield {"of": replace(of, claimed=wrong, start=of.start / factor)}
+
+
+@contextmanager
+def tightened_less(patch, left_out):
+    """Plans are checked as if some of what may happen did not."""
+    tightenings = plan_check.tightenings
+
+    def less(prediction, shapes):
+        known = tightenings(prediction, shapes)
+        if left_out == "everything":
+            return known._replace(row_limits=np.ones_like(known.row_limits))
+        return known._replace(row_limits=known.row_limits + prediction.plant.disturbance.support(prediction.rows))
+
+    patch.setattr(plan_check, "tightenings", less)
+    yield {}
+
+
+@contextmanager
+def plans_turned_round(patch):
+    """What is stored is not what was certified."""
+    decide = SafetyFilter.decide_knowing
+
+    def turned(*arguments):
+        decision = decide(*arguments)
+        return decision if decision.stored else decision._replace(plan=-decision.plan)
+
+    patch.setattr(SafetyFilter, "decide_knowing", turned)
+    yield {}
+
+
+def without_the_grid(name):
+    """A case whose box is certified at the sampling instants alone, and which is judged at all times."""
+    timed = case(name)
+    return replace(timed, plant=replace(timed.plant, between_samples=None), at_all_times=True)
+
+
+def tried(patch, defect, name, mode, through):
+    """Outcomes of attacks on a case with a defect, or in a world that is worse than promised."""
+    of = case(name)
+    kinds = {
+        "errors forgotten": lambda: errors_forgotten(patch),
+        "set enlarged": lambda: set_enlarged(patch, of),
+        "plans checked with nothing": lambda: tightened_less(patch, "everything"),
+        "plans checked with a disturbance less": lambda: tightened_less(patch, "a step"),
+        "plans turned round": lambda: plans_turned_round(patch),
+    }
+    worlds = {
+        "no filter": {},
+        "downlink not known": {"aware": False},
+        "disturbances three times as large": {"rough": 3.0},
+        "samples later than promised": {"late": 2},
+        "times between samples not counted": {"of": without_the_grid(name)} if "at all times" in name else {},
+    }
+    mode = "monitor" if defect == "no filter" else mode
+    for seed in range(8):
+        if defect in kinds:
+            with kinds[defect]() as world:
+                yield attacked(name, mode, through, seed, seed, **world)
+        else:
+            yield attacked(name, mode, through, seed, seed, **worlds[defect])
+
+
+VECTOR, SCALAR, LOOP = "VectorSafetyShield", "SafetyShield", "SafeLoop"
+PLANNED = ("cruise", "cart-pole", "batch reactor", "cart-pole, polytope", "batch reactor, polytope")
+BOTH_WAYS = [name for name in CASES if name.endswith("both ways")]
+LINEAR = [name for name in CASES if name not in WITH_REMAINDER]
+PROMISED = [name for name in LINEAR if case(name).contract]
+AT_ALL_TIMES = [name for name in CASES if name.endswith("at all times")]
+ONE_STEP = MODES[:3]
+
+
+def turns(names, modes, through):
+    """Each case in one of the modes."""
+    return [(name, modes[c % len(modes)], through) for c, name in enumerate(names)]
+
+
+def each(names, modes, through):
+    return [(name, mode, through) for name in names for mode in modes]
+
+
+STATE = (SAFE_SET, BOX)
+# Which claims become false with which defect, where that is sought, whether it counts though the guarantee was
+# withdrawn, and every how many rows are tried in the part.
+TWINS = {
+    "errors forgotten": ((SAFE_SET,), turns(CASES, ONE_STEP, VECTOR), False, 1),
+    "set enlarged": (STATE, turns(CASES, ("lookahead", *ONE_STEP), VECTOR), False, 3),
+    "no filter": (STATE, turns(CASES, ["monitor"], SCALAR), True, 3),
+    "disturbances three times as large": (STATE, turns(LINEAR, MODES, LOOP), True, 3),
+    "downlink not known": ((SAFE_SET,), each(BOTH_WAYS, ONE_STEP, LOOP), True, 1),
+    "samples later than promised": ((AGE,), turns(PROMISED, MODES, LOOP), True, 3),
+    "times between samples not counted": ((ALL_TIMES,), each(AT_ALL_TIMES, MODES, VECTOR), False, 1),
+    "plans checked with nothing": ((BOX,), each(PLANNED, ["lookahead"], VECTOR), False, 1),
+    "plans checked with a disturbance less": ((BOX,), each(PLANNED, ["lookahead"], LOOP), False, 1),
+    "plans turned round": ((BOX,), each(PLANNED[:3], ["lookahead"], LOOP), False, 1),
+}
+
+
+def twins() -> list:
+    return [
+        pytest.param(defect, *row, id="-".join((defect, *row)), marks=[pytest.mark.slow] if k % every else [])
+        for defect, (_, rows, _, every) in TWINS.items()
+        for k, row in enumerate(rows)
+    ]
+
+
+@pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
+def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
+    claims, _, anyway, _ = TWINS[defect]
+    for outcome in tried(monkeypatch, defect, name, mode, through):
+        gauges = outcome.ever if anyway else outcome.largest
+        if max(gauges[claim] for claim in claims) > 1.0:
+            return
+    raise AssertionError(dict(gauges))
+
+
+@pytest.mark.parametrize("name", ["cruise", "cart-pole, position and angle"])
+def test_sensor_noise_larger_than_assumed_takes_errors_out_of_their_ellipsoids(name):
+    outcome, _, _ = through_estimators(case(name), 0, 40, 100, 0, rough=1.5)
+    assert outcome.ever[ERROR] > 1.0
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("name", ["cart-pole", "batch reactor"])
+def test_broken_contract_ends_the_guarantee_before_anything_is_left(name, mode):
+    outcome = attacked(name, mode, LOOP, 0, 0, is_silent=True)
+    assert max(outcome.largest[claim] for claim in STATE) <= 1.0 < outcome.ever[BOX]
+    assert outcome.lost == {OLD_SAMPLE}
+    assert 0 < outcome.counts["guaranteed"] < outcome.counts["steps"]
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("env_id", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
+def test_registered_environments_are_shielded_as_they_come(env_id, mode):
+    made = lambda: gym.make(f"ncs_gym/{env_id}-v0", disturbance="adversarial", terminate_on_violation=False)  # noqa: E731
+    rng, shielded, bare = np.random.default_rng(0), SafetyShield(made(), mode=mode), made()
+    for env, is_left in ((shielded, False), (bare, True)):
+        env.reset(seed=0)
+        for _ in range(120):
+            action = np.where(rng.random(env.action_space.shape) < 0.9, 1.0, -1.0).astype(np.float32)
+            *_, info = env.step(action)
+            assert info.get("shield_guaranteed", True)
+        assert (info["episode_violations"] > 0.0) is is_left

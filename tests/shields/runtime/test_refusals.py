@@ -1,0 +1,350 @@
+"""What shields, filters, loops, layers and nodes refuse, with the words that say why: a new refusal is a new row."""
+
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, replace
+from functools import cache, partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import VectorActionWrapper
+from gymnasium.wrappers import (
+    Autoreset,
+    ClipAction,
+    MaxAndSkipObservation,
+    RepeatAction,
+    RescaleAction,
+    StickyAction,
+    TransformAction,
+)
+
+from agents import LoopConfig, ShieldSettings
+from ncs_gym import (
+    Actuator,
+    Channel,
+    ChannelContract,
+    Command,
+    Ellipsoid,
+    Estimator,
+    LinearPlant,
+    NCSEnv,
+    NCSVectorEnv,
+    Packet,
+    Remainder,
+    UnstablePlantError,
+    batch_reactor,
+    cart_pole,
+    certified_error_set,
+    truck_trailer,
+)
+from ncs_gym.network.wire import Wire
+from shields import (
+    CertificateError,
+    ControllerNode,
+    SafeLoop,
+    SafetyFilter,
+    SafetyShield,
+    VectorSafetyShield,
+    synthesize,
+)
+from shields.nodes import StepClock
+from shields.runtime.one_step import certified_root
+from shields.runtime.safe_loop import NOT_STARTED
+from shields.torch import SafeLayer
+from tests import arrays
+from tests.certificates import certificate_of
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+PLANT, OTHER, CART, REACTOR = truck_trailer(mass=4000.0), truck_trailer(), cart_pole(), batch_reactor()
+CONTRACT = gym.make("ncs_gym/CartPole-v0").unwrapped.contract  # type: ignore[attr-defined]
+CERTIFICATE, OF_CART = certificate_of(PLANT), certificate_of(CART, CONTRACT)
+SCALAR, VECTOR = gym.make(CRUISE), gym.make_vec(CRUISE, num_envs=2)
+SYNC = gym.make_vec(CRUISE, num_envs=2, vectorization_mode="sync")
+ASKED, KEPT = Channel(on_request=True), Channel(loss=0.2, delay=1, max_consecutive_losses=2)
+BOUNDS = {"box": [1.0, 1.0], "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
+STABLE = {"A": [[0.9, 0.1], [0.0, 0.8]]} | BOUNDS
+LOCAL = LinearPlant(B=[[0.0], [0.3]], u_max=1.0, remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "x"), **STABLE)
+THIN = np.random.default_rng(0).standard_normal((6, 6)) * 10.0 ** np.linspace(-9, 0, 6)
+NONE, ONE, TWO = torch.zeros((2, 2)), torch.zeros((2, 1)), np.zeros(2)
+KNOWN = np.zeros((5, 2)), np.tile(CERTIFICATE.Sigma, (5, 1, 1)), np.zeros((5, 1))
+
+
+class Wider(gym.Wrapper):
+    """Changes the action space."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+
+class Scaled(VectorActionWrapper):
+    """Changes actions."""
+
+    def actions(self, actions):
+        return 0.5 * actions
+
+
+def loop_of(channel=None, **settings) -> SafeLoop:
+    """A loop in which nothing was decided yet."""
+    return SafeLoop(CERTIFICATE, PLANT, Channel() if channel is None else channel, **settings)
+
+
+@cache
+def safety_filter() -> SafetyFilter:
+    """One that only answers."""
+    return SafetyFilter(CERTIFICATE, PLANT)
+
+
+def stepped(kind: Any, env: Any, **options: Any) -> None:
+    """Steps a shield that was not reset, or in vain."""
+    shield = kind(env, CERTIFICATE)
+    if options:
+        with pytest.raises(ValueError, match="option"):
+            shield.reset(options=options)
+    shield.step(np.zeros(shield.action_space.shape))
+
+
+def node_of(**settings) -> ControllerNode:
+    """A controller of a loop with these settings."""
+    loop = SafeLoop(OF_CART, CART, Channel(), **settings)
+    return ControllerNode(loop, Wire(CART, 4, bytes(32)), None, StepClock(0.02), np.zeros(4), known=True)  # type: ignore[arg-type]
+
+
+INNER = {
+    "ClipAction": ClipAction,
+    "RescaleAction": lambda env: RescaleAction(env, np.float32(-0.5), np.float32(0.5)),
+    "StickyAction": lambda env: StickyAction(env, 0.5),
+    "RepeatAction": lambda env: RepeatAction(env, 2),
+    "MaxAndSkipObservation": lambda env: MaxAndSkipObservation(env, 2),
+    "TransformAction": lambda env: TransformAction(env, lambda a: -a, env.action_space),
+    "Autoreset": Autoreset,
+    "SafetyShield": lambda env: SafetyShield(env, CERTIFICATE),
+}
+UNPROVED = r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"
+MISPLACED = r"delay is a setting of the channel: give channel=Channel\(delay=...\)"
+ESTIMATE = r"an estimate .*shape \(2,\)|shape \(2,\)"
+# What is called, with what, the error, and words of its message.
+REFUSALS: list[tuple[Callable[..., Any], tuple, dict[str, Any], type[Exception], str]] = [
+    # Shields: what they wrap.
+    *[
+        (lambda wrap: SafetyShield(wrap(SCALAR), CERTIFICATE), (wrap,), {}, ValueError, f"must be inside {name}, which")
+        for name, wrap in INNER.items()
+    ],
+    (SafetyShield, (Wider(SCALAR), CERTIFICATE), {}, ValueError, "changes the action space"),
+    (SafetyShield, (VECTOR, CERTIFICATE), {}, ValueError, "use VectorSafetyShield"),
+    (SafetyShield, (SYNC, CERTIFICATE), {}, ValueError, r"wrappers=\[SafetyShield\]"),
+    (VectorSafetyShield, (SYNC, CERTIFICATE), {}, ValueError, r"wrappers=\[SafetyShield\]"),
+    (VectorSafetyShield, (SCALAR, CERTIFICATE), {}, ValueError, "use SafetyShield for"),
+    (VectorSafetyShield, (Scaled(VECTOR), CERTIFICATE), {}, ValueError, "must be inside Scaled"),
+    (
+        lambda: VectorSafetyShield(VectorSafetyShield(VECTOR, CERTIFICATE)),
+        *((), {}, ValueError, "must be inside VectorSafetyShield"),
+    ),
+    (
+        *(SafetyShield, (gym.make("Pendulum-v1"),), {}, ValueError),
+        r"needs an NCSEnv inside, got PendulumEnv, which has no linear model .*: docs/own_plant\.md says how",
+    ),
+    # Shields: their settings.
+    *[
+        (kind, (env, CERTIFICATE), setting, ValueError, words)
+        for kind, env in ((SafetyShield, SCALAR), (VectorSafetyShield, VECTOR))
+        for setting, words in (
+            ({"mode": "off"}, "mode must be"),
+            ({"penalty": -1.0}, "penalty must be"),
+            ({"penalty": np.nan}, "penalty must be"),
+            *(({"on_unproved": wrong}, UNPROVED) for wrong in ("log", None, ["warn"])),
+        )
+    ],
+    *[
+        (kind, (env, certificate), {}, error, words)
+        for kind, env in ((SafetyShield, SCALAR), (VectorSafetyShield, VECTOR))
+        for certificate, error, words in (
+            (7, ValueError, "certificate must be a Certificate"),
+            ("missing.json", CertificateError, "cannot read certificate"),
+            (certificate_of(OTHER), CertificateError, "another plant"),
+            (replace(CERTIFICATE, L=1.5 * CERTIFICATE.L), CertificateError, "does not verify"),
+        )
+    ],
+    (ShieldSettings, (CERTIFICATE,), {"on_unproved": "maybe"}, ValueError, "on_unproved must be one of"),
+    # Shields: when they are stepped.
+    (stepped, (SafetyShield, NCSEnv(PLANT)), {}, gym.error.ResetNeeded, "reset"),
+    (stepped, (SafetyShield, NCSEnv(PLANT)), {"bad": 1}, gym.error.ResetNeeded, "reset"),
+    (stepped, (VectorSafetyShield, NCSVectorEnv(2, plant=PLANT)), {}, gym.error.ResetNeeded, "reset"),
+    # Environments.
+    (gym.make, (CRUISE,), {"delay": "a", "loss": 0.1}, ValueError, MISPLACED),
+    (gym.make_vec, (CRUISE,), {"delay": "a", "loss": 0.1}, ValueError, MISPLACED),
+    (LoopConfig, (), {"env": "ncs_gym/Nothing-v0"}, ValueError, "'ncs_gym/Nothing-v0' is no registered environment"),
+    # Filters.
+    (SafetyFilter, (replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), {}, CertificateError, r"\(S\)"),
+    (SafetyFilter, (CERTIFICATE, OTHER), {}, CertificateError, "another plant"),
+    *[
+        (SafetyFilter, given, {}, ValueError, "SafetyFilter takes a Certificate")
+        for given in ((PLANT, CERTIFICATE), (CERTIFICATE, "plant"), ("certificate", PLANT))
+    ],
+    (SafetyFilter, (CERTIFICATE, PLANT, "hope"), {}, ValueError, "mode must be one of"),
+    (SafetyFilter, (CERTIFICATE, PLANT, "project", 3), {}, ValueError, 'horizon is for mode "lookahead"'),
+    (
+        *(SafetyFilter, (CERTIFICATE, LinearPlant(B=np.ones((2, 13)), u_max=1.0, **STABLE), "boundary"), {}),
+        *(ValueError, "at most 12 inputs, got 13"),
+    ),
+    *[
+        (lambda x_hat: safety_filter().fallback_input(x_hat), (x_hat,), {}, ValueError, ESTIMATE)
+        for x_hat in (np.zeros(3), [np.nan, 0.0], "here")
+    ],
+    *[
+        (lambda *given: safety_filter().decide_many(*given), given, {}, ValueError, "must be numbers of shape")
+        for given in ((KNOWN[0][0], *KNOWN[1:]), (KNOWN[0], KNOWN[1][:4], KNOWN[2]), (*KNOWN[:2], KNOWN[2][:, :0]))
+    ],
+    (certified_root, (np.ones((2, 2)),), {}, CertificateError, "too thin"),
+    (certified_root, (0.5 * (THIN @ THIN.T + (THIN @ THIN.T).T),), {}, CertificateError, "too thin"),
+    (synthesize, (LOCAL,), {"method": "paper"}, ValueError, "remainder_bound"),
+    # The layer of PyTorch.
+    *[
+        (lambda *given: SafeLayer(CERTIFICATE, PLANT)(*given), given, {}, ValueError, words)
+        for given, words in (
+            ((torch.tensor([[np.nan], [0.0]]), NONE), "actions must be finite numbers"),
+            ((torch.tensor([[np.inf], [0.0]]), NONE), "actions must be finite numbers"),
+            ((ONE, torch.tensor([[np.nan, 0.0], [0.0, 0.0]])), "estimates must be finite numbers"),
+            ((ONE, NONE, torch.full((2, 2), np.nan)), "error_shapes must be finite numbers"),
+            ((np.zeros((2, 1)), NONE), "actions must be a tensor of floats.* got ndarray"),
+            ((torch.zeros((2, 1), dtype=torch.int64), NONE), "tensor of floats.* got one of torch.int64"),
+            ((torch.tensor(0.0), NONE), r"actions must have shape \(0, 1\)"),
+            ((torch.zeros(1), torch.zeros(2)), r"actions must have shape \(1, 1\) beside 1 actions, got \(1,\)"),
+            ((ONE, torch.zeros(3, 2)), r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)"),
+            ((ONE, NONE, torch.zeros(3, 2, 2)), r"error_shapes must have shape \(2, 2\) or \(2, 2, 2\)"),
+            ((ONE, "estimates"), "estimates must be numbers, got str"),
+            ((ONE, None), "estimates must"),
+        )
+    ],
+    (
+        *(SafeLayer, (certificate_of(REACTOR, ChannelContract(3, 1e-3)), REACTOR, -np.eye(4)), {}),
+        *(ValueError, "positive semidefinite"),
+    ),
+    # Loops: their settings, and calls before an episode has begun.
+    (SafeLoop, (OF_CART, CART, CONTRACT), {}, ValueError, "channel must be a Channel"),
+    (SafeLoop, (OF_CART, CART, Channel(quantization_step=0.1)), {}, ValueError, "rounds more coarsely"),
+    (SafeLoop, (OF_CART, OTHER, Channel()), {}, CertificateError, "another plant"),
+    (SafeLoop, (OF_CART, CART, Channel(), "hope"), {}, ValueError, "mode must be"),
+    *[(loop_of, (), {"on_unproved": wrong}, ValueError, UNPROVED) for wrong in ("log", None, ["warn"])],
+    (lambda: loop_of().receive(), (), {}, RuntimeError, "call start"),
+    (lambda: loop_of().decide(0.0), (), {}, RuntimeError, "call start"),
+    (lambda: loop_of().step(0.0), (), {}, RuntimeError, "call start"),
+    (Estimator, (CART, KEPT), {}, UnstablePlantError, r"error_set=certified_error_set\(plant, contract\)"),
+    # What stands at the other end.
+    *[(Actuator, (1, 1, u_max), {}, ValueError, "u_max must be a size") for u_max in (-1.0, [1.0, 2.0], "10", np.nan)],
+    (Actuator(1, 1).receive, ([Command(0, np.zeros((2, 1)), 0, (True,))],), {}, ValueError, "as many requests or none"),
+    (node_of, (), {"downlink": Channel(delay=1)}, ValueError, "downlink=Channel"),
+    (node_of, (), {"echo_age": 5}, ValueError, "downlink=Channel"),
+]
+
+
+@pytest.mark.parametrize(("call", "given", "settings", "error", "words"), REFUSALS)
+def test_wrong_use_is_refused_in_a_sentence(call, given, settings, error, words):
+    with pytest.raises(error, match=words):
+        call(*given, **settings)
+
+
+NO_PACKET, NO_ECHO = r"a packet is Packet\(stamp, measurement\)", r"an echo is what Actuator.echo says"
+ON_REQUEST = "on_request=True"
+PACKETS = [
+    *(Packet(1, np.zeros(3)), Packet(1.5, TWO), (1,), None, Packet(1, "near"), Packet("1", TWO)),
+    *(Packet(1, TWO, 0.5), Packet(1, TWO, None), (1, TWO, 0, 0)),
+]
+# Whether something has been decided, what is called, the error, and words of its message.
+OF_LOOP: list[tuple[bool, Callable[[SafeLoop], Any], type[Exception], str]] = [
+    *[
+        (
+            True,
+            partial(lambda loop, given: loop.receive(given), given=given),
+            ValueError,
+            "must be a list of Packet",
+        )
+        for given in (None, Packet(1, TWO), 0.5, np.array(1.0))
+    ],
+    *[
+        (True, partial(lambda loop, given: loop.receive([Packet(1, TWO), given]), given=given), ValueError, NO_PACKET)
+        for given in PACKETS
+    ],
+    *[
+        (True, partial(lambda loop, given: loop.receive(echoes=[given]), given=given), ValueError, NO_ECHO)
+        for given in (None, 5, ("1", 0, b"", 0), (1, 0, "", 0), (1, 0))
+    ],
+    (False, lambda loop: loop.receive(), RuntimeError, "receive was called twice"),
+    (True, lambda loop: loop.decide(0.0), RuntimeError, "decide was called twice"),
+    (False, lambda loop: loop.command(), RuntimeError, "call decide before command"),
+    (False, lambda loop: loop.decide(0.0, ask=True), ValueError, ON_REQUEST),
+    (True, lambda loop: loop.request, ValueError, ON_REQUEST),
+    *[
+        (decided, partial(lambda loop, given: loop.start(*given), given=given), ValueError, words)
+        for decided in (False, True)
+        for given, words in (
+            (([0.0],), r"x_hat0 = \(.*, .*\) must have shape"),
+            (([np.nan, 0.0],), r"x_hat0 = \(.*\) must be finite"),
+            (([0.0, 0.0], [1.0]), "initial_set must have shape"),
+            (([0.0, 0.0], Ellipsoid(np.eye(3))), "initial_set must have dimension 2"),
+        )
+    ],
+    (True, lambda loop: loop.start(TWO, TWO, known=False), ValueError, "initial_set says what is known"),
+    (True, lambda loop: loop.start(TWO, known="yes"), ValueError, "known must be"),
+]
+
+
+@pytest.mark.parametrize(("decided", "call", "error", "words"), OF_LOOP)
+def test_refused_call_of_a_loop_changes_nothing(decided, call, error, words):
+    loop, twin = loop_of(), loop_of()
+    for each in (loop, twin):
+        each.start([0.01, 0.01])
+        each.step(0.1)
+        each.receive([Packet(1, [0.01, 0.01])])
+        if decided:
+            each.decide(0.1)
+    with pytest.raises(error, match=words):
+        call(loop)
+    for each in (loop, twin):
+        if not decided:
+            each.decide(0.1)
+        each.receive([Packet(2, [0.01, 0.01])])
+    arrays.assert_equal(loop.estimate, twin.estimate)
+    assert str(loop) == str(twin)
+    assert loop.guaranteed
+    assert loop.measurement_age == 0
+
+
+def test_request_is_said_once_something_is_decided():
+    loop = loop_of(ASKED)
+    assert (loop.guaranteed, loop.reason) == (False, NOT_STARTED)
+    loop.start(TWO)
+    with pytest.raises(RuntimeError, match="call decide before request"):
+        _ = loop.request
+    loop.decide(0.0)
+    assert loop.request in (False, True)
+
+
+def test_what_is_refused_elsewhere_is_taken_where_it_belongs():
+    """The rows above say no for their own reasons, not for others."""
+    assert SafeLoop(OF_CART, CART, KEPT).contract == CONTRACT
+    Estimator(CART, KEPT, error_set=certified_error_set(CART, CONTRACT))
+    assert SafetyShield(gym.Wrapper(SCALAR), CERTIFICATE.document).filter.mode == "project"
+    node_of(downlink=Channel(delay=1), echo_age=5)
+
+
+@pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved", "channel"])
+@pytest.mark.parametrize(("kind", "env"), [(SafetyShield, SCALAR), (VectorSafetyShield, VECTOR)])
+def test_settings_of_a_shield_cannot_be_changed(kind, env, name):
+    shield = kind(env, CERTIFICATE)
+    with pytest.raises(AttributeError, match=f"{name} is a setting of {kind.__name__}"):
+        setattr(shield, name, getattr(shield, name))
+
+
+@pytest.mark.parametrize("name", ["filter", "contract", "input_delay"])
+def test_settings_of_a_loop_cannot_be_changed(name):
+    with pytest.raises(AttributeError, match=f"{name} is a setting of SafeLoop"):
+        setattr(loop_of(), name, None)
+
+
+@pytest.mark.parametrize("name", ["mode", "plant", "certificate", "test"])
+def test_filter_cannot_be_changed_once_it_is_verified(name):
+    with pytest.raises(FrozenInstanceError):
+        setattr(safety_filter(), name, getattr(safety_filter(), name))

@@ -1,0 +1,169 @@
+"""Scalar shields, vector shields and loops without Gymnasium say the same of the same draws, feature by feature."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    GilbertElliott,
+    LinearPlant,
+    NCSVectorEnv,
+    Remainder,
+    SpeedTracking,
+    TraceChannel,
+    batch_reactor,
+    cart_pole,
+    truck_trailer,
+)
+from shields.runtime import guarantee
+from shields.runtime.safety_filter import MODES
+from tests.certificates import certificate_of
+from tests.ncs_gym.envs.same_draws import compare
+from tests.plants import random_plant
+from tests.shields.attacks.cases import RANDOM
+
+TRUCK, CART, REACTOR = truck_trailer(mass=4000.0), cart_pole(), batch_reactor()
+BOUNDS = {"box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "sensor_bound": 0.001, "initial_bound": 0.001}
+LOCAL = LinearPlant(
+    A=[[0.9, 0.1], [0.0, 0.8]],
+    B=[[0.0], [0.3]],
+    disturbance_bound=0.0,
+    remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"),
+    **BOUNDS,
+)
+SPARSE = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
+ASKED = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
+BURSTS = GilbertElliott(p_good_to_bad=0.15, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
+LATE_CART = {"channel": Channel(loss=0.6, max_consecutive_losses=2, jitter=2), "contract": ChannelContract(4)}
+
+
+def gust(rng, plant, nominal_next):
+    """Three times too strong now and then."""
+    return (3.0 if rng.random() < 0.1 else 0.9) * plant.nominal_disturbance.sample_boundary(rng)
+
+
+def edge(plant, scale):
+    """Starts in the ellipsoid of the plant's own certificate, blown up or shrunk."""
+    return {"initial_set": Ellipsoid(scale**2 * certificate_of(plant).L)}
+
+
+@dataclass(frozen=True)
+class Feature:
+    """What environments are made with, in which modes, and what must have happened for the row to say anything."""
+
+    plant: LinearPlant
+    settings: dict[str, Any] = field(default_factory=dict)
+    modes: tuple[str, ...] = ("project",)
+    reasons: tuple[str, ...] = ("",)
+    safe_set: str = "ellipsoid"
+    options: dict[str, Any] | None = None
+    count: int = 3
+
+
+OUTSIDE = {"state": np.array([[1.99, 1.98], [0.0, 0.0], [-2.05, 1.0]])}
+IN_BOX = {"state": np.array([[0.99, 0.99], [0.2, 0.2], [-0.9, -0.9]])}
+DRAWN = {"channel": lambda rng: Channel(loss=0.2, delay=int(rng.integers(3)))}
+GOES_ON, NEVER = ("", guarantee.NOT_KNOWN_INSIDE), (guarantee.NO_DOWNLINK_CONTRACT,)
+FEATURES = {
+    "one input, in every mode": Feature(TRUCK, {"channel": SPARSE, "disturbance": "adversarial"}, MODES),
+    "an unstable plant with a contract": Feature(CART, LATE_CART, ("project", "lookahead", "monitor"), count=2),
+    "some outputs": Feature(
+        RANDOM["n=3 m=2 p=1"], {"channel": Channel(0.3, 0.01, delay=1, jitter=2)}, ("project", "switch", "boundary")
+    ),
+    "a polytope": Feature(random_plant(0, 4, 2), {"channel": Channel(loss=0.3)}, safe_set="polytope"),
+    "bursts": Feature(TRUCK, {"channel": Channel(BURSTS, jitter=2)}, ("switch",)),
+    "a trace": Feature(TRUCK, {"channel": TraceChannel(trace=(0, 2, -1, -1, 1, 0))}),
+    "drawn channels": Feature(TRUCK, {"channel": Channel(loss=0.2, delay=2)}, options=DRAWN),
+    "a task, and episodes that end": Feature(
+        TRUCK, {"task": SpeedTracking(change_probability=0.2), "terminate_on_violation": True}, ("monitor",)
+    ),
+    "starts anywhere": Feature(TRUCK, {"channel": SPARSE}, ("project", "lookahead"), GOES_ON, options=OUTSIDE),
+    "between the samples": Feature(truck_trailer(mass=4000.0, between_samples=2), {"channel": SPARSE}),
+    "a remainder": Feature(LOCAL, {}, ("monitor", "project"), (guarantee.LEFT_MODEL, ""), options=IN_BOX),
+    "gusts": Feature(
+        REACTOR,
+        {"disturbance": gust, "allow_assumption_violation": True, "contract": ChannelContract(3)},
+        reasons=("", guarantee.ALARM),
+    ),
+    "Gaussian noise": Feature(
+        truck_trailer(mass=4000.0, delta=0.97),
+        {"noise": "gaussian"},
+        ("project", "monitor"),
+        ("", guarantee.ALARM),
+    ),
+    "a broken contract": Feature(
+        REACTOR,
+        {"channel": Channel(loss=0.7), "contract": ChannelContract(2)},
+        ("project", "monitor"),
+        ("", guarantee.OLD_SAMPLE),
+    ),
+    "everything broken at once": Feature(
+        REACTOR,
+        {
+            "channel": Channel(loss=0.6, quantization_step=1e-3),
+            "contract": ChannelContract(2, 1e-3),
+            "disturbance": lambda rng, plant, nominal: 4.0 * plant.disturbance.sample_boundary(rng),
+            "allow_assumption_violation": True,
+        },
+        ("monitor",),
+        ("", guarantee.ALARM, guarantee.OLD_SAMPLE),
+    ),
+    "a downlink": Feature(TRUCK, {"channel": SPARSE, "downlink": KEPT, **edge(TRUCK, 0.98)}, ("boundary", "lookahead")),
+    "a downlink, starts anywhere": Feature(
+        TRUCK, {"channel": SPARSE, "downlink": KEPT}, ("project", "lookahead"), GOES_ON, options=OUTSIDE
+    ),
+    "a broken downlink": Feature(
+        TRUCK,
+        {"downlink": Channel(loss=0.3, delay=1), "downlink_contract": ChannelContract(2)},
+        ("project", "lookahead"),
+        ("", guarantee.LATE_INPUT),
+    ),
+    "a broken downlink without a delay": Feature(
+        TRUCK,
+        {"downlink": Channel(loss=0.1), "downlink_contract": ChannelContract(0)},
+        reasons=("", guarantee.LATE_INPUT),
+    ),
+    "a downlink without a contract": Feature(TRUCK, {"downlink": Channel(loss=0.1)}, reasons=NEVER),
+    "an unstable plant behind a downlink": Feature(
+        CART, {"channel": KEPT, "downlink": Channel(delay=2)}, ("project", "lookahead"), count=1
+    ),
+    "samples on request": Feature(CART, {"channel": ASKED, "contract": ChannelContract(9, 1e-4)}, count=2),
+    "samples on request behind a downlink": Feature(
+        CART,
+        {
+            "channel": ASKED,
+            "contract": ChannelContract(9, 1e-4),
+            "downlink": Channel(0.5, delay=1, max_consecutive_losses=1),
+        },
+        count=2,
+    ),
+}
+RESETS = "NextStep", "SameStep"
+# Each row with one way to begin anew, in turn; with the other one in the slow tests.
+ROWS = [
+    pytest.param(name, mode, reset, marks=[pytest.mark.slow] * (number % 2 != RESETS.index(reset)))
+    for number, (name, mode) in enumerate((name, mode) for name, feature in FEATURES.items() for mode in feature.modes)
+    for reset in RESETS
+]
+
+
+@pytest.mark.filterwarnings("ignore:the channel may lose any number of packets in a row")
+@pytest.mark.parametrize(("name", "mode", "reset"), ROWS)
+def test_scalar_shields_vector_shields_and_loops_agree(name, mode, reset):
+    feature = FEATURES[name]
+    settings = {"max_episode_steps": 17, "autoreset_mode": reset} | feature.settings
+    many = NCSVectorEnv(feature.count, plant=feature.plant, **settings)
+    certificate = certificate_of(feature.plant, many.certificate_contract, feature.safe_set)
+    seen = compare(many, 45, feature.options, certificate, mode, anew=(9, 31))
+    assert set(feature.reasons) <= seen.reasons
+    assert seen.interventions > 0 or mode in ("monitor", "lookahead")
+    assert seen.plans > 0 or mode != "lookahead"
+    assert seen.forced > 0 or not many.channel.on_request
+    assert (guarantee.ALARM in seen.reasons) == (seen.alarms > 0)
+    assert many.episodes.min() > 2

@@ -1,0 +1,111 @@
+"""Samples that are of no use are not thrown away without a word, and what is said names the cause."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, truck_trailer
+from ncs_gym.processes.plant_step import PlantSimulation
+from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
+from shields.runtime.guarantee import ALARM, NOT_FINITE
+from tests.certificates import certificate_of
+
+PLANT = truck_trailer(mass=4000.0)
+
+
+def started(**settings):
+    loop = SafeLoop(certificate_of(PLANT), PLANT, **{"channel": Channel(delay=1)} | settings)
+    loop.start(np.zeros(2))
+    return loop
+
+
+@pytest.mark.parametrize("ahead", [1, 7])
+@pytest.mark.parametrize("call", ["step", "receive"])
+def test_samples_ahead_of_the_loop_are_named_once_to_who_hands_them_over(ahead, call):
+    loop = started()
+    loop.step(0.0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for step in range(1, 300):
+            packets = [Packet(step + ahead, np.zeros(2), loop.episode)]
+            if call == "step":
+                loop.step(0.0, packets)
+            else:
+                loop.receive(packets)
+                loop.decide(0.0)
+    assert loop.discarded == (0, 299, 0)
+    (warning,) = caught
+    assert warning.category is UnusedPacketsWarning
+    assert "its stamp is ahead of the loop, which is at step 1" in str(warning.message)
+    assert warning.filename == __file__
+
+
+def test_samples_of_a_clock_that_agrees_are_not_named():
+    loop = started()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loop.step(0.0)
+        for step in range(1, 20):
+            loop.step(0.0, [Packet(step, np.zeros(2)), Packet(step, np.zeros(2)), Packet(step - 1, np.zeros(2))])
+    assert loop.discarded == (0, 0, 0)
+
+
+def test_every_reason_is_named_once_and_apart():
+    loop = started()
+    loop.step(0.0)
+    for _ in range(3):
+        loop.step(0.0)
+    strays = [Packet(1, np.zeros(2)), Packet(90, np.zeros(2)), Packet(4, np.zeros(2), 5)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        loop.step(0.0, strays)
+        loop.step(0.0, strays)
+    assert loop.discarded == (2, 2, 2)
+    said = [str(warning.message) for warning in caught]
+    assert len(said) == 3
+    for text in (
+        "later than the 1 steps",
+        "is ahead of the loop, which is at step 4",
+        "episode is not that of the loop",
+    ):
+        assert sum(text in each for each in said) == 1
+
+
+def test_one_sensor_of_two_without_a_reading_is_named_as_that():
+    loop = started()
+    loop.step(0.0)
+    with pytest.warns(GuaranteeLostWarning, match="a sample held NaN or infinity"):
+        loop.step(0.0, [Packet(1, [0.0, np.nan])])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it was said
+        loop.step(0.0, [Packet(2, [0.0, np.nan])])
+    assert loop.reason == NOT_FINITE
+    loop.start(np.zeros(2))
+    loop.step(0.0)
+    with pytest.warns(GuaranteeLostWarning, match="contradicts the assumed bounds"):
+        loop.step(0.0, [Packet(1, [0.0, 9.0], loop.episode)])
+    assert loop.reason == ALARM
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_environments_name_it_as_well(many, monkeypatch):
+    honest, count = PlantSimulation.measure, 0
+
+    def damaged(simulation, rng, state):
+        nonlocal count
+        count += 1
+        measured = honest(simulation, rng, state)
+        if count == 3:
+            measured[1] = np.nan
+        return measured
+
+    monkeypatch.setattr(PlantSimulation, "measure", damaged)
+    settings = {"plant": PLANT, "channel": Channel()}
+    inner = NCSVectorEnv(num_envs=2, **settings) if many else NCSEnv(**settings)
+    env = (VectorSafetyShield if many else SafetyShield)(inner, certificate_of(PLANT), on_unproved="ignore")
+    env.reset(seed=0)
+    reasons = [np.unique(env.step(np.zeros((2, 1) if many else 1, np.float32))[4]["shield_reason"]) for _ in range(5)]
+    assert [each.tolist() for each in reasons] == [[""], [""], [NOT_FINITE], [NOT_FINITE], [NOT_FINITE]]

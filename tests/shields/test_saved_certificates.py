@@ -1,0 +1,121 @@
+"""What `save` writes `load` reads, at the limits of both: polytopes of any size allowed, plants of any numbers."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ncs_gym import LinearPlant
+from ncs_gym.plants.between_samples import MOST_POINTS
+from shields import Certificate, CertificateError, Infeasible, synthesize, verify
+from shields.polytope import MOST_MULTIPLIERS, MOST_ROWS, Polytope
+from shields.synthesis import invariant_polytope
+
+
+def with_polytope(certificate, rows, multipliers, seed=0):
+    """A certificate, not a valid one, with a polytope of so many rows and rows of multipliers, most of them zero."""
+    rng = np.random.default_rng(seed)
+    values = np.zeros((multipliers, rows))
+    values[rng.integers(multipliers, size=50), rng.integers(rows, size=50)] = rng.standard_normal(50)
+    polytope = Polytope(rows=rng.standard_normal((rows, 2)), multipliers=values)
+    return replace(certificate, polytope=polytope)
+
+
+@pytest.mark.parametrize(
+    ("rows", "multipliers"),
+    [(1, 1), (26, 859), (MOST_ROWS, 2 * MOST_ROWS + 1), (MOST_ROWS, MOST_MULTIPLIERS), (2, MOST_MULTIPLIERS)],
+)
+def test_certificate_of_every_size_that_a_polytope_may_have_is_read_again(certificate, rows, multipliers, tmp_path):
+    saved = with_polytope(certificate, rows, multipliers)
+    saved.save(tmp_path / "c.json")
+    assert Certificate.load(tmp_path / "c.json") == saved
+    np.testing.assert_array_equal(
+        Certificate.load(tmp_path / "c.json").polytope.multipliers, saved.polytope.multipliers
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(rows=st.integers(1, MOST_ROWS), multipliers=st.integers(1, 3 * MOST_ROWS), seed=st.integers(0, 9))
+def test_document_of_any_polytope_is_read_again(certificate, rows, multipliers, seed):
+    saved = with_polytope(certificate, rows, multipliers, seed)
+    assert Certificate.read(saved.document) == saved
+
+
+@pytest.mark.parametrize(("rows", "multipliers"), [(MOST_ROWS + 1, MOST_ROWS + 2), (1, MOST_MULTIPLIERS + 1)])
+def test_polytope_that_could_not_be_read_again_cannot_be_made(rows, multipliers):
+    with pytest.raises(CertificateError, match=f"at most {MOST_ROWS} rows and {MOST_MULTIPLIERS} rows of multipliers"):
+        Polytope(rows=np.ones((rows, 1)), multipliers=np.zeros((multipliers, rows)))
+
+
+def test_file_with_too_many_rows_is_refused_before_they_are_expanded(certificate):
+    content = json.loads(json.dumps(with_polytope(certificate, 2, 3).document))
+    content["certificate"]["polytope"]["multipliers"] = [[]] * (MOST_MULTIPLIERS + 1)
+    with pytest.raises(CertificateError):
+        Certificate.read(content)
+
+
+def test_search_ends_with_no_more_rows_than_a_polytope_may_have(monkeypatch):
+    """The row that is followed last adds one to as many as there may be."""
+    monkeypatch.setattr(invariant_polytope, "MOST_ROWS", 20)
+    angles = np.linspace(0.0, np.pi, 21, endpoint=False)
+    rows = np.column_stack([np.cos(angles), np.sin(angles)])
+
+    def predecessor(row):
+        return rows[-1] if np.array_equal(row, rows[-2]) else 0.5 * row
+
+    with pytest.raises(Infeasible, match="more than 20 rows"):
+        invariant_polytope.invariant_rows(rows[:-1], predecessor, 2)
+
+
+@pytest.mark.slow
+def test_certificate_of_a_box_of_many_rows_at_most_points_is_read_again(tmp_path):
+    angles = 0.05 + np.linspace(0.0, np.pi, 13, endpoint=False)
+    model = [[-0.5, 1.0], [-1.0, -0.5]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))
+    plant = LinearPlant.from_statespace(
+        model,
+        0.1,
+        box=np.column_stack([np.cos(angles), np.sin(angles)]),
+        u_max=0.5,
+        disturbance_bound=0.001,
+        sensor_bound=0.001,
+        initial_bound=0.001,
+        between_samples=MOST_POINTS,
+    )
+    certificate = synthesize(plant)
+    assert len(certificate.polytope.multipliers) > 2 * MOST_ROWS
+    certificate.save(tmp_path / "c.json")
+    assert Certificate.load(tmp_path / "c.json") == certificate
+    assert verify(Certificate.load(tmp_path / "c.json"), plant).valid
+
+
+sizes = st.floats(-75.0, 75.0).map(lambda power: 10.0**power) | st.sampled_from([1e-75, 1e-37, 1e37, np.inf])
+
+
+@settings(max_examples=150, deadline=None)
+@given(box=st.lists(sizes, min_size=2, max_size=2), u_max=sizes, bounds=st.lists(sizes, min_size=3, max_size=3))
+def test_every_plant_that_can_be_made_is_read_again(box, u_max, bounds, tmp_path_factory):
+    names = ("disturbance_bound", "sensor_bound", "initial_bound")
+    try:
+        plant = LinearPlant(
+            A=[[0.5, 0.1], [0.0, 0.5]],
+            B=[[0.0], [1.0]],
+            box=box,
+            u_max=u_max,
+            dt=1.0,
+            **dict(zip(names, bounds, strict=True)),
+        )
+    except ValueError:
+        return
+    path = tmp_path_factory.mktemp("plant") / "plant.json"
+    plant.save(path)
+    assert LinearPlant.load(path).fingerprint == plant.fingerprint
+    assert replace(plant).fingerprint == plant.fingerprint
+
+
+def test_half_width_whose_row_is_out_of_range_is_refused_at_once():
+    """1 / 1e-75 is the largest number that rows may not have."""
+    with pytest.raises(ValueError, match="box"):
+        LinearPlant(A=[[0.5]], B=[[1.0]], box=1e-75, u_max=1.0, dt=1.0, disturbance_bound=0.0, sensor_bound=0.0)

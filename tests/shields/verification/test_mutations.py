@@ -1,0 +1,419 @@
+"""One mutation harness for all kinds of proof: what is changed to harm fails in both engines, what verifies is true."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid, LinearPlant, Remainder
+from shields import Certificate, CertificateError, SafetyFilter, synthesize
+from shields.json_documents import document_of
+from shields.verification import require_valid
+from tests.certificates import certificate_of, with_proof
+from tests.plants import named
+from tests.verdicts import assert_true, broken, verified
+
+# Plants of `named`, and what is kept; with a polytope, the ellipsoid is proved, too, but for the first and third servo.
+CASES = {
+    "ellipsoid": ("stable", "ellipsoid"),
+    "ellipsoid, contract": ("unstable", "ellipsoid"),
+    "polytope": ("stable", "polytope"),
+    "polytope, contract": ("unstable", "polytope"),
+    "polytope alone": ("servo", "polytope"),
+    "between samples, ellipsoid": ("oscillator", "ellipsoid"),
+    "between samples": ("oscillator", "polytope"),
+    "between samples, polytope alone": ("servo, at all times", "polytope"),
+    "remainder": ("remainder", "polytope"),
+    "paper": ("stable", "paper"),
+}
+
+
+@cache
+def case(name: str) -> tuple[Certificate, LinearPlant]:
+    plant, contract = named(CASES[name][0])
+    if name == "paper":
+        return synthesize(plant, method="paper"), plant
+    return certificate_of(plant, contract, CASES[name][1]), plant
+
+
+# Every number of the file.
+
+
+def content_of(certificate):
+    return json.loads(json.dumps(certificate.document["certificate"]))
+
+
+def read(content):
+    return Certificate.read(document_of("certificate", "ncs-gym certificate 2", content))
+
+
+def numbers_of(content):
+    """Paths of numbers that must change together, as others contradict each other: both halves of a symmetric matrix,
+    and what is repeated of the largest age."""
+    together = defaultdict(list)
+    for path in paths(content):
+        together[meaning(path, content)].append(path)
+    return list(together.values())
+
+
+def paths(value, path=()):
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return [leaf for key, each in items if key != "provenance" for leaf in paths(each, (*path, key))]
+    return [path] if isinstance(value, int | float) else []
+
+
+def meaning(path, content):
+    if content["ages"] is not None and path[0] in ("Sigma", "multipliers") and path[-1] != "rounding":
+        last = len(content["ages"]["shares"]) - 1
+        path = {
+            "Sigma": ("ages", "sets", "shapes", last, *path[1:]),
+            "error": ("ages", "sets", "rates", last),
+            "inputs": ("ages", "inputs", last, *path[2:]),
+        }.get(path[0] if path[0] == "Sigma" else path[1]) or (
+            *("ages", "shares", last),
+            ("state", "estimate", "disturbance").index(path[1]),
+        )
+    symmetric = path[0] in ("L", "Sigma", "D") or path[2:3] in (("shapes",), ("noise",)) or path[1:2] == ("noise",)
+    return (*path[:-2], *sorted(path[-2:])) if symmetric else path
+
+
+def changes_of(value):
+    """Other values, the smallest changes first."""
+    if isinstance(value, int):
+        return [value - 1, value + 1, -1]
+    return [factor * value for factor in (1.0 - 1e-3, 1.0 + 1e-3, 0.5, 2.0, -1.0, 1e6) if value] + [value + 1.0]
+
+
+def with_value(content, places, value):
+    copy = json.loads(json.dumps(content))
+    for path in places:
+        inner = copy
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = value
+    return copy
+
+
+def entry(content, path):
+    for key in path:
+        content = content[key]
+    return content
+
+
+# Of a large polytope every twentieth number; all of them in the slow tests.
+LARGE = [name for name in CASES if CASES[name] in (("servo", "polytope"), ("oscillator", "polytope"))]
+LARGE += ["between samples, polytope alone"]
+
+
+@pytest.mark.parametrize(
+    ("name", "every"),
+    [(name, 20 if name in LARGE else 1) for name in CASES]
+    + [pytest.param(name, 1, marks=pytest.mark.slow) for name in LARGE],
+)
+def test_every_number_of_a_certificate_counts_and_what_verifies_is_true(name, every):
+    certificate, plant = case(name)
+    content = content_of(certificate)
+    assert verified(read(content), plant).valid
+    tried = {True: 0, False: 0}
+    for index, places in enumerate(numbers_of(content)):
+        if places[0][0] == "polytope" and index % every:
+            continue
+        for value in changes_of(entry(content, places[0])):
+            accepted = is_accepted(with_value(content, places, value), plant)
+            tried[accepted] += 1
+            if not accepted:
+                break
+        else:
+            pytest.fail(f"no change of {places} makes verification fail")
+    assert min(tried.values()) > 0
+
+
+def is_accepted(content, plant):
+    """Whether the document is read and verifies; then it has to be true."""
+    try:
+        certificate = read(content)
+    except CertificateError:
+        return False
+    if not verified(certificate, plant).valid:
+        return False
+    if certificate.method != "paper":
+        assert_true(certificate, plant)
+    return True
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_provenance_proves_nothing_and_the_fingerprint_names_the_plant(name):
+    certificate, plant = case(name)
+    report = verified(certificate, plant)
+    assert report.valid
+    assert verified(replace(certificate, provenance={"volume_of_box_ellipsoid": 7.0}), plant) == report
+    assert broken(replace(certificate, fingerprint="0" * 64), plant) == ["plant: the certificate belongs to it"]
+
+
+# Whole parts, of a certificate or of what a plant derives from its numbers, and the conditions that notice.
+
+
+def with_multipliers(certificate, **change):
+    """A certificate without a contract with other multipliers."""
+    moved = replace(certificate.multipliers, **change)
+    shares = moved.state, moved.estimate, moved.disturbance
+    changed = with_proof(certificate, rate=moved.error, shares=shares, inputs=moved.inputs)
+    return replace(changed, rounding=moved.rounding)
+
+
+def replaced(plant, **values):
+    """The plant with numbers or derived bounds replaced and nothing derived anew, as a faulty derivation leaves it."""
+    assert plant.fingerprint
+    assert plant.disturbance.dim == plant.initial_error.dim >= plant.sensor_error.dim
+    faulty = object.__new__(type(plant))
+    faulty.__dict__.update(plant.__dict__ | values)
+    return faulty
+
+
+def larger(bound, factor):
+    return Ellipsoid(factor * bound.shape_matrix)
+
+
+def remainder(size):
+    return Remainder(Ellipsoid(size * np.eye(2)), False, "an example")
+
+
+def of_three_states(certificate):
+    proofs = (replace(certificate.proofs[0], Sigma=np.eye(3)),)
+    return replace(certificate, L=np.eye(3), K=np.ones((1, 3)), D=np.eye(3), proofs=proofs)
+
+
+def with_polytope(certificate, **changes):
+    return replace(certificate, polytope=replace(certificate.polytope, **changes))
+
+
+def with_other_rows(certificate, change):
+    """The certificate with other rows beyond those of the box, which has two."""
+    rows = certificate.polytope.rows
+    return with_polytope(certificate, rows=np.concatenate([rows[:2], change(rows[2:])]))
+
+
+def without_row(certificate, k):
+    polytope = certificate.polytope
+    multipliers = np.delete(np.delete(polytope.multipliers, k, axis=0), k, axis=1)
+    return with_polytope(certificate, rows=np.delete(polytope.rows, k, axis=0), multipliers=multipliers)
+
+
+def one_entry(array, where, factor):
+    changed = np.array(array)
+    changed[where] *= factor
+    return changed
+
+
+def with_grid(plant, **fields):
+    """The plant as it would be if it had computed other rows between samples."""
+    return replaced(plant, grid_rows=plant.grid_rows._replace(**fields))
+
+
+def every_proof(certificate, **changes):
+    return replace(certificate, proofs=tuple(replace(proof, **changes) for proof in certificate.proofs))
+
+
+def between_rows(certificate, change):
+    """The certificate with other multipliers of the times between samples: those after its rows and inputs."""
+    first = len(certificate.polytope.rows) + len(certificate.K)
+    kept, others = np.split(certificate.polytope.multipliers, [first])
+    return with_polytope(certificate, multipliers=np.concatenate([kept, change(others)]))
+
+
+# Each breaks one condition and no other, so that a verifier without it would accept: the kind of proof, the condition,
+# and (certificate, plant) -> the same, changed.
+ALONE = [
+    ("ellipsoid", "plant", lambda c, p: (replace(c, fingerprint="0" * 64), p)),
+    ("ellipsoid", "shapes", lambda c, p: (with_multipliers(c, inputs=(0.5, 0.5)), p)),
+    ("ellipsoid", "shapes", lambda c, p: (with_multipliers(c, inputs=()), p)),
+    ("ellipsoid", "shapes", lambda c, p: (of_three_states(c), p)),
+    ("ellipsoid", "multipliers: finite", lambda c, p: (with_multipliers(c, rounding=float("inf")), p)),
+    ("ellipsoid", "multipliers: finite", lambda c, p: (with_multipliers(c, state=float("nan")), p)),
+    # With a rate or multiplier below zero the sums of (E1) and (U) have terms of the wrong sign, and hold.
+    ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c, p: (with_multipliers(c, error=-0.5), p)),
+    ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c, p: (with_multipliers(c, error=0.0), p)),
+    ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c, p: (with_multipliers(c, error=1.0), p)),
+    ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c, p: (with_multipliers(c, error=1.5), p)),
+    ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c, p: (with_multipliers(c, inputs=(-0.5,)), p)),
+    ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c, p: (with_multipliers(c, inputs=(1.0,)), p)),
+    ("ellipsoid", "multipliers: lx, le, ld, s > 0", lambda c, p: (with_multipliers(c, estimate=-1e-9), p)),
+    ("ellipsoid", "multipliers: lx, le, ld, s > 0", lambda c, p: (with_multipliers(c, rounding=0.0), p)),
+    ("ellipsoid", "multipliers: lx + le + ld", lambda c, p: (with_multipliers(c, state=c.multipliers.state + 1e-8), p)),
+    ("ellipsoid", "D: the plant's", lambda c, p: (c, replaced(p, disturbance=larger(p.nominal_disturbance, 1 - 1e-6)))),
+    ("ellipsoid", "D: the certificate's", lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 + 2e-9) * c.D)))),
+    ("ellipsoid", "D: the certificate's", lambda c, p: (replace(c, D=(1 - 1.1e-9) * c.D), p)),
+    ("ellipsoid", "N:", lambda c, p: (c, replaced(p, sensor_error=larger(p.sensor_noise.bound, 0.99)))),
+    ("ellipsoid", "r0:", lambda c, p: (c, replaced(p, initial_error=larger(p.initial_noise.bound, 0.99)))),
+    ("ellipsoid", "(E0)", lambda c, p: (c, replaced(p, initial_error=Ellipsoid(1.01 * c.Sigma.max() * np.eye(2))))),
+    ("ellipsoid", "(E1)", lambda c, p: (with_multipliers(c, error=0.5 * (1.0 + c.multipliers.error)), p)),
+    ("ellipsoid", "(E1)", lambda c, p: (with_multipliers(c, error=1e-320), p)),
+    ("ellipsoid", "(I)", lambda c, p: (with_multipliers(c, disturbance=1e-6), p)),
+    ("ellipsoid", "(I)", lambda c, p: (with_multipliers(c, state=1e-320), p)),
+    # Without slack for the rounding of actions to float32 a certificate that is tight in (I) would pass.
+    ("ellipsoid", "(I)", lambda c, p: (with_multipliers(c, rounding=1e-30), p)),
+    ("ellipsoid", "(S) c_1", lambda c, p: (c, replaced(p, box_rows=p.box_rows * [[1.0 + 1e-5], [1.0]]))),
+    ("ellipsoid", "(S) c_2", lambda c, p: (c, replaced(p, box_rows=p.box_rows * [[1.0], [1.0 + 1e-5]]))),
+    ("ellipsoid", "(U) input 1", lambda c, p: (with_multipliers(c, inputs=(1e-12,)), p)),
+    ("remainder", "D: the plant's", lambda c, p: (c, replaced(p, disturbance=larger(p.disturbance, 0.999)))),
+    ("remainder", "D: the plant's", lambda c, p: (c, replaced(p, remainder=remainder(1.001e-4)))),
+    ("remainder", "N:", lambda c, p: (c, replaced(p, sensor_bound=larger(p.sensor_bound, 1.001)))),
+    ("remainder", "r0:", lambda c, p: (c, replaced(p, initial_bound=larger(p.initial_bound, 1.001)))),
+    (
+        "between samples",
+        "D: the plant's",
+        lambda c, p: (c, replaced(p, disturbance_bound=larger(p.disturbance_bound, 1.001))),
+    ),
+    ("between samples", "N:", lambda c, p: (c, replaced(p, sensor_bound=larger(p.sensor_bound, 1.001)))),
+    ("polytope alone", "(L)", lambda c, p: (replace(c, L=1.001 * c.L), p)),
+    ("polytope alone", "D: the certificate's", lambda c, p: (replace(c, D=0.999 * c.D), p)),
+    ("polytope", "shapes", lambda c, p: (with_polytope(c, rows=c.polytope.rows[:, :1]), p)),
+    ("polytope", "shapes", lambda c, p: (with_polytope(c, rows=np.pad(c.polytope.rows, ((0, 0), (0, 1)))), p)),
+    ("polytope alone", "shapes", lambda c, p: (with_polytope(c, rows=c.polytope.rows[:, :1]), p)),
+    ("between samples, polytope alone", "shapes", lambda c, p: (with_polytope(c, rows=c.polytope.rows[:, :1]), p)),
+    ("polytope", "polytope: shapes", lambda c, p: (with_polytope(c, multipliers=c.polytope.multipliers[:-1]), p)),
+    ("remainder", "polytope: its first rows", lambda c, p: (without_row(c, 0), p)),
+    (
+        "remainder",
+        "polytope: its first rows",
+        lambda c, p: (with_polytope(c, rows=one_entry(c.polytope.rows, 0, 1 - 1e-9)), p),
+    ),
+    (
+        "polytope alone",
+        "(P)",
+        lambda c, p: (with_polytope(c, multipliers=one_entry(c.polytope.multipliers, -2, 0.9)), p),
+    ),
+    (
+        "polytope",
+        "(PU) input 1",
+        lambda c, p: (with_polytope(c, multipliers=one_entry(c.polytope.multipliers, -1, 1e3)), p),
+    ),
+    ("between samples", "between samples: the certificate", lambda c, p: (replace(c, between_samples=None), p)),
+    ("between samples, ellipsoid", "between samples: the certificate", lambda c, p: (replace(c, between_samples=4), p)),
+    ("ellipsoid", "between samples: the certificate", lambda c, p: (replace(c, between_samples=3), p)),
+    ("between samples", "polytope: shapes", lambda c, p: (between_rows(c, lambda others: others[:-2]), p)),
+    ("between samples", "(PB)", lambda c, p: (between_rows(c, lambda others: 0.0 * others), p)),
+    ("between samples", "(PB)", lambda c, p: (between_rows(c, lambda others: others[::-1]), p)),
+    ("between samples, ellipsoid", "(B)", lambda c, p: (c, with_grid(p, remainder=0.5 + p.grid_rows.remainder))),
+    (
+        "between samples, ellipsoid",
+        "(G)",
+        lambda c, p: (c, with_grid(p, state=one_entry(p.grid_rows.state, (2, 0, 0), 0.98))),
+    ),
+    (
+        "between samples, ellipsoid",
+        "(G)",
+        lambda c, p: (c, with_grid(p, input=one_entry(p.grid_rows.input, (2, 1, 0), 0.9))),
+    ),
+    ("between samples, ellipsoid", "(G)", lambda c, p: (c, with_grid(p, remainder=0.95 * p.grid_rows.remainder))),
+    ("between samples, ellipsoid", "(G)", lambda c, p: (c, with_grid(p, input=-p.grid_rows.input))),
+    (
+        "between samples, ellipsoid",
+        "(G)",
+        lambda c, p: (c, with_grid(p, **{n: getattr(p.grid_rows, n)[[0, 1, 1]] for n in ("state", "input")})),
+    ),
+    (
+        "between samples",
+        "between samples: the grid",
+        lambda c, p: (c, with_grid(p, state=one_entry(p.grid_rows.state, (0, 0, 0), 1 - 1e-9))),
+    ),
+    (
+        "between samples",
+        "between samples: the grid",
+        lambda c, p: (c, with_grid(p, remainder=np.nan * p.grid_rows.remainder)),
+    ),
+    (
+        "between samples",
+        "between samples: the grid",
+        lambda c, p: (c, with_grid(p, state=p.grid_rows.state[:-1], input=p.grid_rows.input[:-1])),
+    ),
+    (
+        "between samples",
+        "between samples: the grid",
+        lambda c, p: (
+            c,
+            with_grid(
+                p, state=p.grid_rows.state[:, 1:], input=p.grid_rows.input[:, 1:], remainder=p.grid_rows.remainder[1:]
+            ),
+        ),
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "condition", "change"), ALONE)
+def test_condition_alone_makes_a_certificate_invalid(name, condition, change):
+    found = broken(*change(*case(name)))
+    assert {each.split(" of row")[0].split(" at tau")[0] for each in found} == {
+        found[0].split(" of row")[0].split(" at tau")[0]
+    }, found
+    assert found[0].startswith(condition)
+
+
+TOGETHER = [
+    ("ellipsoid", ["(S)"], lambda c: replace(c, L=1.01 * c.L)),
+    ("ellipsoid", ["(S)"], lambda c: replace(c, L=(1 + 1e-5) * c.L)),
+    ("ellipsoid", ["(I)"], lambda c: replace(c, L=0.002 * c.L)),
+    ("ellipsoid", ["(I)", "(U)"], lambda c: replace(c, K=-40.0 * c.K - 1.0)),
+    ("ellipsoid", ["(E1)"], lambda c: with_proof(c, Sigma=0.5 * c.Sigma)),
+    ("ellipsoid", ["(E0)", "(E1)"], lambda c: with_proof(c, Sigma=1e-4 * c.Sigma)),
+    ("ellipsoid", ["L > 0", "(I)"], lambda c: replace(c, L=c.L + 1e-12 * np.eye(2, k=1))),
+    ("ellipsoid", ["L > 0", "(I)"], lambda c: replace(c, L=np.diag([0.9, 0.0]))),
+    ("ellipsoid", ["L > 0", "(I)"], lambda c: replace(c, L=-c.L)),
+    ("ellipsoid, contract", ["(C0)", "(C2)"], lambda c: with_proof(c, 0, Sigma=0.01 * c.proofs[0].Sigma)),
+    ("ellipsoid, contract", ["(C1)"], lambda c: replace(c, updates=replace(c.updates, last=0.9 * c.updates.last))),
+    ("ellipsoid, contract", ["(C2)"], lambda c: replace(c, updates=replace(c.updates, gains=1.5 * c.updates.gains))),
+    ("ellipsoid, contract", ["N:"], lambda c: replace(c, updates=replace(c.updates, noise=0.99 * c.updates.noise))),
+    ("polytope", ["(P)"], lambda c: replace(c, D=1e3 * c.D)),
+    ("polytope", ["(P)"], lambda c: every_proof(c, Sigma=1e6 * c.Sigma)),
+    ("polytope", ["(P)"], lambda c: replace(c, K=c.K + 3.0)),
+    ("polytope", ["(P)"], lambda c: with_polytope(c, multipliers=-c.polytope.multipliers)),
+    ("polytope alone", ["(P)"], lambda c: with_polytope(c, multipliers=(1 - 1e-3) * c.polytope.multipliers)),
+    ("polytope alone", ["(P)"], lambda c: with_polytope(c, multipliers=(1 + 1e-3) * c.polytope.multipliers)),
+    ("polytope alone", ["(P)"], lambda c: with_polytope(c, multipliers=0.0 * c.polytope.multipliers)),
+    ("polytope alone", ["(P)"], lambda c: with_other_rows(c, lambda rows: rows[::-1])),
+    ("polytope alone", ["(P)"], lambda c: with_other_rows(c, lambda rows: 0.97 * rows)),
+    ("polytope alone", ["(P)"], lambda c: without_row(c, 3)),
+    ("polytope alone", ["(P)"], lambda c: replace(c, K=1.02 * c.K)),
+    ("polytope alone", ["(C1)"], lambda c: every_proof(c, Sigma=0.5 * c.proofs[0].Sigma)),
+    # A claim that is not there to be proved.
+    ("polytope alone", ["(I)"], lambda c: every_proof(c, shares=np.array([0.8, 0.1, 0.05]), inputs=np.array([0.5]))),
+    ("paper", ["(C3)"], lambda c: replace(c, L=1.001 * c.L)),
+    ("paper", ["(C2)"], lambda c: replace(c, L=1e-6 * c.L)),
+    ("paper", ["(C7)"], lambda c: replace(c, L=c.L @ np.diag([1.0, 0.9]))),
+    ("paper", ["(C1)"], lambda c: replace(c, K=c.K + 3.0)),
+    ("paper", ["(C4)-(C6)"], lambda c: replace(c, K=c.K + 30.0)),
+    ("paper", ["eps_up and eps"], lambda c: replace(c, kappa=0.7)),
+    ("paper", ["eps_up and eps"], lambda c: replace(c, epsilon=0.1 * c.epsilon)),
+    ("paper", ["0 < kappa, 1"], lambda c: replace(c, rho=2.0)),
+    ("paper", ["plant"], lambda c: replace(c, fingerprint="0" * 64)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "conditions", "change"), TOGETHER)
+def test_changed_part_is_noticed_by_the_right_conditions(name, conditions, change):
+    certificate, plant = case(name)
+    changed = change(certificate)
+    found = broken(changed, plant)
+    for mark in conditions:
+        assert any(each.startswith(mark) for each in found), (mark, found)
+    # It names the first that is broken; another plant in words.
+    words = "another plant" if found[0].startswith("plant") else re.escape(found[0])
+    with pytest.raises(CertificateError, match=words):
+        require_valid(changed, plant)
+    with pytest.raises(CertificateError):
+        SafetyFilter(changed, plant)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_condition_has_been_broken(name):
+    marks = [condition for _, condition, _ in ALONE] + [mark for _, marks, _ in TOGETHER for mark in marks]
+    names = [condition.name for condition in verified(*case(name)).conditions]
+    never = ("polytope: the box bounds every state", "between samples: the box bounds every state")  # a plant has one
+    assert [each for each in names if not each.startswith((*marks, *never))] == []

@@ -1,0 +1,158 @@
+"""Proofs by age of the newest sample: valid, kept by their files, and refused for the right condition when changed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, batch_reactor
+from shields import Certificate, CertificateError
+from shields.json_documents import document_of, write_document
+from tests.certificates import certificate_of, with_proof
+from tests.verdicts import verified
+
+
+@pytest.fixture(scope="module")
+def promised():
+    plant, contract = batch_reactor(), ChannelContract(2, 1e-3)
+    return plant, certificate_of(plant, contract=contract)
+
+
+def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, tmp_path):
+    plant, certificate = promised
+    assert verified(certificate, plant).valid
+    certificate.save(tmp_path / "c.json")
+    loaded = Certificate.load(tmp_path / "c.json")
+    assert verified(loaded, plant).valid
+    assert loaded.contract == certificate.contract
+    np.testing.assert_array_equal(loaded.error_shapes, certificate.error_shapes)
+    np.testing.assert_array_equal(loaded.next_error_shapes, certificate.next_error_shapes)
+    for mine, other in zip(loaded.proofs, certificate.proofs, strict=True):
+        np.testing.assert_array_equal(mine.inputs, other.inputs)
+    assert len(loaded.error_shapes) == 3
+    names = [condition.name for condition in verified(certificate, plant).conditions]
+    assert sum(name.startswith("(C1)") for name in names) == sum(name.startswith("(C2)") for name in names) == 3
+    assert sum(name.startswith("(I)") for name in names) == 3
+    assert sum(name.startswith("(U)") for name in names) == 6
+
+
+def updates(certificate, **change):
+    return replace(certificate, updates=replace(certificate.updates, **change))
+
+
+def at(array, index, factor):
+    changed = array.copy()
+    changed[index] = changed[index] * factor
+    return changed
+
+
+MUTATIONS = {
+    "small first set": (lambda c: with_proof(c, 0, Sigma=1e-6 * c.error_shapes[0]), ["(C0)", "(C2)"]),
+    "a set in between": (lambda c: with_proof(c, 1, Sigma=0.9 * c.error_shapes[1]), ["(C1) Sigma_1"]),
+    "the last set": (lambda c: updates(c, last=0.9 * c.updates.last), ["(C1) Sigma_3"]),
+    "a gain": (lambda c: updates(c, gains=at(c.updates.gains, 1, 1.5)), ["(C2)"]),
+    "no gain": (lambda c: updates(c, gains=at(c.updates.gains, 2, 0.0)), ["(C2)"]),
+    "a rate": (lambda c: with_proof(c, 0, rate=0.5 * c.proofs[0].rate), ["(C1) Sigma_1"]),
+    "a rate above one": (lambda c: with_proof(c, 0, rate=5.0 * c.proofs[0].rate), ["0 < lam_e < 1"]),
+    "a multiplier": (lambda c: updates(c, shares=at(c.updates.shares, 0, 0.01)), ["(C2)"]),
+    "less noise": (lambda c: updates(c, noise=0.9 * c.updates.noise), ["N:"]),
+    "coarser rounding": (lambda c: updates(c, contract=ChannelContract(2, 5e-3)), ["N:"]),
+    "shares of (I)": (
+        lambda c: with_proof(c, 1, shares=at(c.proofs[1].shares, 1, 1e-6)),
+        ["(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0 at age 1"],
+    ),
+    "shares of (U)": (
+        lambda c: with_proof(c, 0, inputs=at(c.proofs[0].inputs, 1, 1e-9)),
+        ["(U) input 2 stays within u_max (1 - 2^-24) at age 0"],
+    ),
+    "multipliers above one": (lambda c: with_proof(c, 2, shares=at(c.proofs[2].shares, 0, 1.5)), ["lx + le + ld <= 1"]),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_mutation_of_a_proof_by_age_is_rejected_for_the_right_condition(name, promised):
+    plant, certificate = promised
+    mutate, expected = MUTATIONS[name]
+    report = verified(mutate(certificate), plant)
+    broken = [condition.name for condition in report.conditions if not condition.holds]
+    for mark in expected:
+        assert any(mark in found for found in broken), (mark, broken)
+
+
+def test_margins_by_age_agree_with_floating_point(promised):
+    plant, certificate = promised
+    margins = {c.name.split(" ")[0] + c.name[-1]: [] for c in verified(certificate, plant).conditions}
+    for condition in verified(certificate, plant).conditions:
+        margins[condition.name.split(" ")[0] + condition.name[-1]].append(condition.margin)
+    s, growth = certificate.updates, certificate.multipliers.rounding
+    shapes = [*certificate.error_shapes, s.last]
+    smallest = lambda matrix: np.linalg.eigvalsh(matrix)[0]  # noqa: E731
+    assert margins["(C0)0"] == [pytest.approx(smallest(shapes[0] - plant.initial_error.shape_matrix), rel=1e-6)]
+    for j, found in enumerate(margins["(C1)0"]):
+        grown = plant.A @ shapes[j] @ plant.A.T / certificate.proofs[j].rate + certificate.D / (
+            1 - certificate.proofs[j].rate
+        )
+        assert found == pytest.approx(smallest(shapes[j + 1] - grown), rel=1e-4)
+    for j, found in enumerate(margins["(C2)0"]):
+        kept = np.eye(plant.n) - s.gains[j] @ plant.H
+        updated = kept @ shapes[j + 1] @ kept.T / s.shares[j]
+        updated += s.gains[j] @ s.noise @ s.gains[j].T / (1 - s.shares[j])
+        assert found == pytest.approx(smallest(shapes[0] - updated), rel=1e-4)
+    closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
+    spread = plant.m * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
+    D_u = (1 + growth) * certificate.D + (1 + 1 / growth) * spread
+    for j, proof in enumerate(certificate.proofs):
+        lx, le, ld = proof.shares
+        grown = closed @ certificate.L @ closed.T / lx + gain @ shapes[j] @ gain.T / le + D_u / ld
+        assert margins[f"(I){j}"] == [pytest.approx(smallest(certificate.L - grown), rel=1e-4)]
+        for k, mu, limit, found in zip(certificate.K, proof.inputs, plant.u_max, margins[f"(U){j}"], strict=True):
+            used = k @ certificate.L @ k / mu + k @ shapes[j] @ k / (1 - mu)
+            assert found == pytest.approx((limit * (1 - 2.0**-24)) ** 2 - used, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: replace(c, proofs=c.proofs[:2]),
+        lambda c: replace(c, proofs=(*c.proofs, c.proofs[0])),
+        lambda c: with_proof(c, 0, Sigma=np.eye(3)),
+        lambda c: updates(c, last=np.eye(3)),
+        lambda c: updates(c, shares=np.zeros(5)),
+        lambda c: updates(c, gains=np.full((3, 4, 2), np.nan)),
+        lambda c: updates(c, contract=ChannelContract(3)),
+        lambda c: replace(c, updates=None),
+    ],
+)
+def test_proof_by_age_that_does_not_fit_together_is_no_certificate(promised, change):
+    _, certificate = promised
+    with pytest.raises(CertificateError):
+        change(certificate)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["multipliers"].update(state=0.5),
+        lambda content: content["multipliers"].update(error=0.5),
+        lambda content: content["multipliers"].update(inputs=[0.5, 0.5]),
+        lambda content: content["Sigma"][0].__setitem__(0, 1.1 * content["Sigma"][0][0]),
+    ],
+)
+def test_file_that_says_two_things_of_the_largest_age_is_refused(promised, change, tmp_path):
+    _, certificate = promised
+    content = certificate.document["certificate"]
+    path = tmp_path / "c.json"
+    write_document(path, document_of("certificate", "ncs-gym certificate 2", content))
+    assert Certificate.load(path) == certificate
+    change(content)
+    write_document(path, document_of("certificate", "ncs-gym certificate 2", content))
+    with pytest.raises(CertificateError, match="wrong kind"):
+        Certificate.load(path)
+
+
+def test_certificate_for_other_outputs_does_not_fit(promised):
+    _, certificate = promised
+    other = batch_reactor(H=np.eye(4), measurement_noise_cov=1e-6 * np.eye(4))
+    report = verified(replace(certificate, fingerprint=other.fingerprint), other)
+    assert not report.valid
+    assert "shapes" in next(condition.name for condition in report.conditions if not condition.holds)
