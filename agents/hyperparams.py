@@ -28,7 +28,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text
+from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text, require_moderate
 from ncs_gym.validation import shown
 
 # The package of each algorithm, which has a class of the same name.
@@ -217,10 +217,16 @@ def _yaml(text: str) -> Any:
     import yaml  # of the extra "train", as everything that is trained needs
 
     try:
-        _require_moderate(yaml.compose(text, Loader=yaml.SafeLoader))
+        require_moderate(yaml.compose(text, Loader=yaml.SafeLoader), _parts_of_node, MOST_HYPERPARAMS)
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
+
+
+def _parts_of_node(node: Any) -> list[Any]:
+    """Returns the nodes in a node of YAML: of a list its entries, of a dictionary keys and values."""
+    parts = node.value if node is not None and isinstance(node.value, list) else []
+    return [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
 
 
 def value_of(name: str, value: Any) -> Any:
@@ -238,22 +244,6 @@ def value_of(name: str, value: Any) -> Any:
             "(nn.ReLU) are read, nothing is evaluated"
         )
     return found
-
-
-def _require_moderate(root: Any) -> None:
-    """Raises ValueError if a YAML document has too many values once all of its aliases are written out."""
-    sizes: dict[int, int] = {}
-
-    def size_of(node: Any) -> int:
-        if id(node) not in sizes:
-            sizes[id(node)] = MOST_HYPERPARAMS + 1  # of one that holds itself
-            parts = node.value if isinstance(node.value, list) else ()
-            flat = (each for part in parts for each in (part if isinstance(part, tuple) else (part,)))
-            sizes[id(node)] = 1 + sum(map(size_of, flat))
-        return sizes[id(node)]
-
-    if root is not None and size_of(root) > MOST_HYPERPARAMS:
-        raise ValueError(f"with its aliases written out it has more than {MOST_HYPERPARAMS:,} values")
 
 
 def literal(text: str) -> Any:

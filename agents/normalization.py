@@ -12,9 +12,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent_file import AgentError
 from agents.pickled_data import Made, array_of, pickled_data
+from ncs_gym.reading import read_file
 
-# Larger files of statistics are not read [bytes].
-MOST_BYTES = 50_000_000
 _STATISTICS = re.compile(r"vec_?normalize", re.IGNORECASE)
 _VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
 
@@ -76,9 +75,7 @@ def read_statistics(path: Path) -> Normalization | None:
         AgentError: If it is no such file, or of observations that are no single array.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ValueError(f"it has more than {MOST_BYTES:,} bytes")
-        saved = pickled_data(path.read_bytes())
+        saved = pickled_data(read_file(path))
         if not isinstance(saved, Made) or saved.name != _VEC_NORMALIZE:
             raise ValueError(f"it is of {getattr(saved, 'name', '') or type(saved).__name__}")
         return _statistics(saved.attributes)

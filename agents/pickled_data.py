@@ -7,11 +7,14 @@ function, it keeps the name; where it calls one, it keeps what it would have bee
 from __future__ import annotations
 
 import pickletools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import prod
 from typing import Any
 
 import numpy as np
+
+from ncs_gym.reading import require_moderate
 
 # How numpy's arrays and numbers are pickled, by numpy 1 and 2, and the types of those that are read.
 _ARRAYS = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
@@ -23,6 +26,8 @@ _VALUES = {"BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT"}
 _VALUES |= {"SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"}
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "EMPTY_SET": set}
+# Most values in a key of a dictionary, shared ones counted wherever they stand: hashes take as long.
+_MOST_IN_KEYS = 1000
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
@@ -146,7 +151,7 @@ class _Machine:
         elif name == "TUPLE":
             push(tuple(self.since_mark()))
         elif name == "FROZENSET":
-            push(frozenset(self.since_mark()))
+            push(frozenset(_hashable(self.since_mark())))
         elif name == "POP":
             self.pop()
         elif name == "POP_MARK":
@@ -185,8 +190,24 @@ class _Machine:
             if isinstance(target, Made):
                 target.state = entries[0]
         elif isinstance(target, dict):
-            target.update(zip(entries[::2], entries[1::2], strict=True))
+            target.update(zip(_hashable(entries[::2]), entries[1::2], strict=True))
         elif isinstance(target, list):
             target.extend(entries)
         elif isinstance(target, set):
-            target.update(entries)
+            target.update(_hashable(entries))
+
+
+def parts_of(value: Any) -> Iterable[Any]:
+    """Returns the values in a part of what `pickled_data` returns."""
+    if isinstance(value, dict):
+        return [*value, *value.values()]
+    if isinstance(value, Made):
+        return (*value.arguments, value.state)
+    return value if isinstance(value, list | tuple | set | frozenset) else ()
+
+
+def _hashable(keys: list[Any]) -> list[Any]:
+    """Returns keys whose hashes are found soon, although tuples may share entries; raises ValueError for others."""
+    for key in keys:
+        require_moderate(key, parts_of, _MOST_IN_KEYS)
+    return keys

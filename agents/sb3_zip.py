@@ -15,8 +15,8 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from agents.agent_file import AgentError
-from agents.pickled_data import Made, Named, array_of, pickled_data
-from ncs_gym.reading import LARGEST_MODEL, MOST_MEMBERS, json_values, read_file
+from agents.pickled_data import Made, Named, array_of, parts_of, pickled_data
+from ncs_gym.reading import LARGEST_MODEL, MOST_HYPERPARAMS, MOST_MEMBERS, json_values, read_file, require_moderate
 
 # Classes of policies, and the algorithms of which each may be; those of a tuple are told apart by their settings.
 _POLICIES: dict[str, tuple[str, ...]] = {
@@ -149,6 +149,7 @@ def _policy_kwargs(path: Path, content: Any) -> dict[str, Any]:
         if isinstance(value, Named) and value.name.startswith(_ACTIVATIONS):
             found[name] = f"nn.{value.name.removeprefix(_ACTIVATIONS)}"
     try:
+        require_moderate(found, parts_of, MOST_HYPERPARAMS)
         return json.loads(json.dumps(found, allow_nan=False, default=_refuse))
     except (ValueError, TypeError, RecursionError) as error:
         raise AgentError(

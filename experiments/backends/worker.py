@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import threading
 import traceback
@@ -65,19 +64,29 @@ def work(parent: Connection, told: Connection, log_folder: Path | None) -> None:
     initialize_worker()
     try:
         while told not in wait([parent, told]):
-            sent = parent.recv_bytes()
+            outcome = _outcome(parent, told, log_folder)
             try:
-                outcome = Outcome(execute_here(pickle.loads(sent), parent.send, told.poll, log_folder))
+                parent.send(outcome)
+            except (EOFError, OSError):
+                raise
             except Exception as error:
-                error.add_note(traceback.format_exc())
-                outcome = Outcome(error=error)
-            try:
-                content = pickle.dumps(outcome)
-            except Exception as error:
-                content = pickle.dumps(Outcome(error=RuntimeError(f"what came of the run cannot be sent: {error}")))
-            parent.send_bytes(content)
+                parent.send(Outcome(error=RuntimeError(f"what came of the run cannot be sent: {error}")))
     except (EOFError, OSError):  # the parent has gone
         os._exit(1)
+
+
+def _outcome(parent: Connection, told: Connection, log_folder: Path | None) -> Outcome:
+    try:
+        run = parent.recv()
+    except (EOFError, OSError):
+        raise
+    except Exception as error:
+        return Outcome(error=error)
+    try:
+        return Outcome(execute_here(run, parent.send, told.poll, log_folder))
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        return Outcome(error=error)
 
 
 def execute_here(

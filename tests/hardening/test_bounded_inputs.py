@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import pickle
 import re
 import socket
 import tracemalloc
@@ -261,12 +262,25 @@ def test_zip_that_unpacks_to_much_is_refused(kind, write):
     content = {
         "outside": bomb,
         "inside": lambda: zipped({"data": [b"{}"], "policy.pth": [bomb()]}),
-        "many": lambda: zipped({f"{i}": [b""] for i in range(1000)}),
+        "many": lambda: zipped({f"{i}": [b""] for i in range(1001)}),
     }[kind]()
     assert len(content) < 1 << 20
     path = write("agent.zip", content)
     with little_memory(), pytest.raises(AgentError, match="unpacks to more than"):
         load_sb3_zip(path, "ncs_gym/CSTR-v0")
+
+
+def test_pickles_whose_parts_share_others_take_little_time_and_memory():
+    from agents.pickled_data import parts_of, pickled_data
+    from ncs_gym.reading import require_moderate
+
+    shared, keys = [], ()
+    for _ in range(40):
+        shared, keys = [shared, shared], (keys, keys)
+    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
+        require_moderate(pickled_data(pickle.dumps(shared)), parts_of)
+    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
+        pickled_data(b"\x80\x03}" + pickle.dumps(keys, 3)[2:-1] + b"Ns.")  # None by these keys
 
 
 def test_settings_name_no_more_runs_and_processes_than_there_may_be():
