@@ -99,8 +99,8 @@ def test_first_feasible_pair_wins():
 
 
 def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_grid():
-    plant = truck_trailer(gamma=3e-6, process_noise_cov=np.zeros((2, 2)))
-    grid = {"dkappa": 0.04, "drho": 0.1}
+    plant = truck_trailer(gamma=1e-5, process_noise_cov=np.zeros((2, 2)))
+    grid = {"dkappa": 0.03, "drho": 0.08}
     first, largest = search_grid(plant, **grid), search_grid(plant, search="largest", **grid)
     assert largest.log_det > first.log_det + 0.1
     model, problem = PaperModel(plant), OptimizationProblem(plant)
