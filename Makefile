@@ -97,7 +97,7 @@ example-times: $(INSTALLED) ## how long each example takes, and what it says (EX
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED) ## the site, in site/
 	$(BIN)/python docs/hooks/build_site.py
-	$(BIN)/python -m pytest -n auto --dist worksteal -m site
+	$(BIN)/python -m pytest -n auto --dist worksteal -m 'site and not slow'
 
 words: ## words of README and of every page
 	@wc -w README.md docs/*.md

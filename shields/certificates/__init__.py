@@ -68,12 +68,15 @@ def synthesis_status() -> Iterator[Callable[[str], None]]:
     """Yields what shows the progress of a synthesis on standard error: a line that changes, or one line in a file."""
     from tqdm import tqdm  # only where there is something to wait for
 
-    if not sys.stderr.isatty():
-        print("synthesizing a certificate, which takes seconds to minutes", file=sys.stderr, flush=True)
+    said = sys.stderr.isatty()
     form = "synthesis, {desc} [{elapsed}]"
     with tqdm(bar_format=form, leave=False, disable=None, delay=_SILENT_SECONDS) as line:
 
         def show(text: str) -> None:
+            nonlocal said
+            if not said:
+                said = True
+                print("synthesizing a certificate, which takes seconds to minutes", file=sys.stderr, flush=True)
             line.set_description_str(text, refresh=False)
             line.update(0)  # which draws, unlike the text alone, only after the delay
 

@@ -37,7 +37,14 @@ def plant_and_contract(env_id):
 def calls(monkeypatch):
     """Arguments of each synthesis."""
     seen, made = [], certificate_of(*named("stable"))
-    monkeypatch.setattr("shields.synthesis.synthesize", lambda *given, **settings: seen.append(given) or made)
+
+    def synthesize(*given, progress, **settings):
+        seen.append(given)
+        for stage in ("initial designs", "volume"):
+            progress(stage)
+        return made
+
+    monkeypatch.setattr("shields.synthesis.synthesize", synthesize)
     return seen
 
 
