@@ -35,8 +35,8 @@ def test_impossible_counts_are_refused(events, trials):
 
 def test_mean_interval_covers_at_its_level():
     rng = np.random.default_rng(0)
-    covered = [low <= 0.0 <= high for low, high in (mean_interval(rng.standard_normal(3)) for _ in range(2000))]
-    assert np.mean(covered) == pytest.approx(0.95, abs=4 * norm.std() * 0.95 * 0.05 / 2000**0.5 * 5)
+    covered = [low <= 0.0 <= high for low, high in (mean_interval(rng.standard_normal(3)) for _ in range(4000))]
+    assert np.mean(covered) == pytest.approx(0.95, abs=4 * norm.std() * 0.95 * 0.05 / 4000**0.5 * 5)
 
 
 def test_mean_interval_needs_two_values():
@@ -45,7 +45,7 @@ def test_mean_interval_needs_two_values():
 
 def test_bootstrap_interval_covers_near_its_level_and_never_leaves_the_values():
     rng = np.random.default_rng(0)
-    draws = [rng.exponential(size=40) for _ in range(200)]
+    draws = [rng.exponential(size=40) for _ in range(400)]
     intervals = [bootstrap_interval(values) for values in draws]
     assert np.mean([low <= 1.0 <= high for low, high in intervals]) == pytest.approx(0.93, abs=0.04)
     assert all(min(v) <= low < high <= max(v) for v, (low, high) in zip(draws, intervals, strict=True))
@@ -77,7 +77,7 @@ def test_stratified_interval_needs_two_runs_in_every_stratum():
 
 def test_hierarchical_interval_covers_what_retraining_changes_and_one_over_episodes_does_not():
     rng, covered, too_narrow = np.random.default_rng(0), [], []
-    for _ in range(75):
+    for _ in range(150):
         runs = rng.normal(0.0, 1.0, (12, 1))
         values = runs + rng.normal(0.0, 1.0, (12, 20))
         low, high = hierarchical_interval(values)
