@@ -63,12 +63,11 @@ def random_case(rng, m):
     return wanted, offset, effect, radius, limit
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("m", [1, 2, 3, 5, pytest.param(12, marks=pytest.mark.slow)])
-def test_projection_agrees_with_a_conic_solver(m, count):
+@pytest.mark.parametrize("m", [1, 2, 3, 5])
+def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
     rng = np.random.default_rng(m)
     compared = bound = failed = 0
-    for _ in range(count):
+    for _ in range(1000):
         wanted, offset, effect, radius, limit = random_case(rng, m)
         found = closest_admissible(wanted, offset, effect, radius, limit)
         try:
@@ -92,9 +91,9 @@ def test_projection_agrees_with_a_conic_solver(m, count):
             a, b, c = (effect.T @ effect).item(), (effect.T @ offset).item(), float(offset @ offset)
             line = closest_on_line(wanted.item(), a, b, c, radius, limit.item())
             assert line == pytest.approx(found.item(), rel=1e-9, abs=1e-9)  # as the scalar shield does it
-    assert compared > 0.3 * count
-    assert failed < 0.01 * count
-    assert m == 1 or bound >= 0.02 * count  # cases in which an input limit binds too
+    assert compared > 300
+    assert failed < 10
+    assert m == 1 or bound > 20  # cases in which an input limit binds too
 
 
 @pytest.mark.parametrize(
@@ -126,18 +125,17 @@ def hard_case(rng):
     return wanted, offset, effect, np.linalg.norm(offset + effect @ inside) * 1.01, np.ones(3)
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
-def test_projection_agrees_with_a_conic_solver_where_limits_bind(count):
+def test_projection_agrees_with_a_conic_solver_where_limits_bind():
     rng = np.random.default_rng(0)
     branched = 0
-    for _ in range(count):
+    for _ in range(1000):
         case = hard_case(rng)
         found, expected = closest_admissible(*case), conic_solution(*case)
         assert found is not None
         distance, best = np.linalg.norm(found - case[0]), np.linalg.norm(expected - case[0])
         assert distance <= best * (1 + 1e-4) + 1e-6
         branched += bool((np.abs(found) == 1.0).any())
-    assert branched > 0.2 * count
+    assert branched > 200
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])
@@ -211,6 +209,22 @@ def test_converges_where_one_input_does_far_more_than_the_others(m):
         assert np.linalg.norm(found - wanted) == pytest.approx(np.linalg.norm(expected - wanted), rel=1e-8)
 
 
+def test_twelve_inputs_are_projected_too():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        effect, offset = rng.standard_normal((6, 12)), 3.0 * rng.standard_normal(6)
+        inside = rng.choice([-1.0, 1.0, 0.2], 12)
+        case = (
+            np.sign(rng.standard_normal(12)),
+            offset,
+            effect,
+            1.2 * np.linalg.norm(offset + effect @ inside),
+            np.ones(12),
+        )
+        found, expected = closest_admissible(*case), conic_solution(*case)
+        assert np.linalg.norm(found - case[0]) <= np.linalg.norm(expected - case[0]) * (1 + 1e-4) + 1e-6
+
+
 @pytest.mark.parametrize("ratio", [1e3, 1e6, 1e9])
 def test_inputs_in_very_different_units_are_both_used(ratio):
     units = np.array([1.0, ratio])
@@ -220,6 +234,21 @@ def test_inputs_in_very_different_units_are_both_used(ratio):
         radius = 0.5 * np.linalg.norm(offset)
         found = closest_admissible(np.zeros(2), offset, effect / units, radius, 1e3 * units)
         assert np.linalg.norm(offset + effect / units @ found) <= radius * (1 + 1e-6)
+
+
+def test_wanted_input_inside_is_returned_as_it_is():
+    wanted = np.array([0.1, -0.2])
+    found = closest_admissible(wanted, np.zeros(2), np.eye(2), 1.0, np.ones(2))
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_limits_and_test_can_both_bind():
+    found = closest_admissible(np.array([1.0, 1.0]), np.array([2.0, 0.0]), np.eye(2), 1.2, np.array([1.0, 1.0]))
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 801)] * 2), axis=-1).reshape(-1, 2)
+    shift = np.array([2.0, 0.0])
+    allowed = grid[np.linalg.norm(grid + shift, axis=1) <= 1.2]
+    best = np.linalg.norm(allowed - 1.0, axis=1).min()
+    assert np.linalg.norm(found - 1.0) == pytest.approx(best, abs=5e-3)
 
 
 def test_out_of_reach_is_none():
