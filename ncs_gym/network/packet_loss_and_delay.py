@@ -116,8 +116,8 @@ def transmit(
     if not (sends if size is None else sends.any()):
         return state, -1 if size is None else np.full(size, -1)
     most = channel.max_consecutive_losses
-    lost = sends * (rng.random(size) < loss) * (consecutive < (UNLIMITED if most is None else most))
-    arrives = sends * (1 - lost)
+    lost = sends & (rng.random(size) < loss) & (consecutive < (UNLIMITED if most is None else most))
+    arrives = sends > lost
     delay: Any = channel.delay
     if isinstance(channel.jitter, np.ndarray) or channel.jitter:
         delay = delay + rng.random(size) * (channel.jitter + 1) // 1

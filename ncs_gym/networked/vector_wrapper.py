@@ -232,28 +232,29 @@ class _Arrivals:
     """
 
     def __init__(self, link: VectorChannelState, count: int) -> None:
-        self.link, self.sample, self._is_own = link, None, False
+        self.link, self.sample = link, None
         self.stamp, self.arrived = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         self.earned = np.zeros(count)
+        # Whether these samples were made here and nobody else has them; whether they have not been handed out yet.
+        self._is_own, self._anew = False, True
         self._past: deque[tuple[Any, np.ndarray]] = deque()
 
     def begin(self, rows: np.ndarray, samples: Any) -> None:
         """Starts episodes in some environments, whose first samples are there."""
-        self._take(rows, samples)
-        self.stamp[rows], self.earned[rows], self.arrived[rows] = 0, 0.0, False
-
-    def _take(self, rows: np.ndarray, samples: Any) -> None:
-        """Takes the samples of some environments; those of all are taken as they are."""
         if len(rows) == len(self.stamp):
             self.sample, self._is_own = samples, False
-            return
-        if not self._is_own:
-            self.sample, self._is_own = handed_out(self.sample, anew=False), True
-        _write(self.sample, samples, rows)
+        else:
+            if not self._is_own:
+                self.sample = handed_out(self.sample, anew=False)
+            _write(self.sample, samples, rows)
+            self._is_own = True
+        self._anew = True
+        self.stamp[rows], self.earned[rows], self.arrived[rows] = 0, 0.0, False
 
     def seen(self) -> Any:
         """Returns the newest samples for the agent."""
-        return handed_out(self.sample, anew=not self._is_own and bool(self.arrived.any()))
+        anew, self._anew, self._is_own = self._anew, False, False
+        return handed_out(self.sample, anew=anew)
 
     def is_new(self, steps: np.ndarray) -> np.ndarray:
         """Returns where the newest sample arrived at this step, as the first of an episode does, shape (N,)."""
@@ -271,10 +272,13 @@ class _Arrivals:
             self._past.pop()
         self.arrived = np.zeros(len(steps), np.bool_)
         for age, arrives in self.link.arrivals():
-            rows = np.flatnonzero(arrives & (steps - age > self.stamp))
+            newer = arrives & (steps - age > self.stamp)
             sample, by_then = self._past[age]
-            self._take(rows, sample)
-            self.stamp[rows], self.earned[rows], self.arrived[rows] = steps[rows] - age, by_then[rows], True
+            everywhere = bool(newer.all())
+            self.sample = sample if everywhere else _where(newer, sample, self.sample)
+            self._is_own, self._anew = not everywhere, True
+            self.stamp, self.earned = np.where(newer, steps - age, self.stamp), np.where(newer, by_then, self.earned)
+            self.arrived = self.arrived | newer
         return sends
 
 
