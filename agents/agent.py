@@ -202,7 +202,7 @@ def _plant_of(env_id: str) -> LinearPlant | None:
 def _is_for_plant_of(env_id: str, fingerprint: str | None) -> bool:
     """Returns whether what was stored with a fingerprint belongs to an environment's plant, or lack of one."""
     plant = _plant_of(env_id)
-    return fingerprint is None if plant is None else fingerprint is not None and plant.has_fingerprint(fingerprint)
+    return fingerprint is None if plant is None else fingerprint is not None and plant.fingerprint == fingerprint
 
 
 def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:

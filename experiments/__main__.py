@@ -42,8 +42,6 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
     "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),
 }
-# Other names of commands.
-_ALIASES = {"certify": "attack"}
 
 
 def main() -> None:
@@ -93,7 +91,6 @@ def parse(arguments: list[str]) -> object:
     from experiments import settings
     from experiments.settings.arguments import beside_those_of_file
 
-    arguments = [_ALIASES.get(each, each) if at == 0 else each for at, each in enumerate(arguments)]
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
     command, rest = "".join(arguments[:1]), arguments[1:]
     if hasattr(kinds.get(command), "config"):

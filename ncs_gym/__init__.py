@@ -12,7 +12,6 @@ from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChanne
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.gaussian_bound import bound_violation_probability
-from ncs_gym.network.gaussian_bound import bound_violation_probability as escape_probability  # noqa: F401  its former name
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.networked import Networked, VectorNetworked

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         Requirement,
         Requirements,
         certify,
-        linear_feedback_tolerance,
         requirements,
         synthesize,
     )
@@ -54,7 +53,6 @@ __all__ = [
     "VectorSafetyShield",
     "certificate_for",
     "certify",
-    "linear_feedback_tolerance",
     "requirements",
     "synthesize",
     "verify",
@@ -65,7 +63,7 @@ __all__ = [
 _NAMES = {
     "synthesis": (
         *("Network", "Requirement", "Requirements"),
-        *("certify", "linear_feedback_tolerance", "requirements", "synthesize"),
+        *("certify", "requirements", "synthesize"),
     ),
     "nodes": ("ActuatorNode", "ControllerNode", "SensorNode"),
 }

@@ -40,7 +40,7 @@ def attack(settings: AttackSettings) -> None:
     cases, kinds = cases_of(settings), len(kinds_of_batches(settings))
     if not settings.unshielded:
         _require_claims(cases)
-    with claim_folder("certify", settings):  # the name of the command in files
+    with claim_folder("attack", settings):
         horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
         plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
         # Smaller batches, so that each kind of each case comes in once within the budget.
@@ -71,7 +71,7 @@ def attack(settings: AttackSettings) -> None:
         document["cases"] = {case: each.document() for case, each in counts.items()}
         if limits:
             document["bound_violation_probability"] = limits
-        write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
+        write_atomically(settings.out / "attack.json", json.dumps(document, indent=1) + "\n")
         if limits and not settings.unshielded:
             require_within(counts, limits)
         elif not settings.unshielded:

@@ -50,7 +50,6 @@ _AXES = {
 _QUANTITIES = {
     "share": "ellipsoid's share of the box [%]",
     "tolerance": "factor on all radii",
-    "yardstick": "factor that a linear controller bears for 15 steps",
 }
 # Progress is counted in these parts of an age that is searched: workers report a thousand at a time.
 _PARTS = 1000
@@ -67,10 +66,9 @@ def requirements(settings: RequirementsSettings) -> None:
             plant,
             **asked,
             tolerance=settings.tolerance,
-            yardstick=settings.yardstick,
             execute=lambda searches: _answers(searches, settings, store),
         )
-        wanted = {"share": True, "tolerance": settings.tolerance, "yardstick": settings.yardstick}
+        wanted = {"share": True, "tolerance": settings.tolerance}
         names = [name for name, is_wanted in wanted.items() if is_wanted]
         tables = [_Table.of(found, asked, name) for name in names]
         figures = {}
@@ -312,8 +310,6 @@ class _Table:
 
 
 def _number(point: Requirement, quantity: str) -> float:
-    if quantity == "yardstick":
-        return point.yardstick or float("nan")
     if point.certificate is None:
         return float("nan")
     return 100.0 * point.share if quantity == "share" else point.tolerance or float("nan")

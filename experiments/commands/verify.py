@@ -31,7 +31,7 @@ def verify(settings: VerifySettings) -> None:
         document = {"env": origin, "valid": report.valid, "conditions": conditions}
         write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
     if not report.valid:
-        if not plant.has_fingerprint(certificate.fingerprint):
+        if plant.fingerprint != certificate.fingerprint:
             raise CertificateError(
                 f"{settings.file} does not verify: it was made for another plant than that of {origin}; without --env "
                 "and --plant the registered environment that it belongs to is found"
@@ -46,7 +46,7 @@ def verify(settings: VerifySettings) -> None:
 
 def _matching_env(certificate: Certificate) -> str:
     for env_id in registered_ids():
-        if registered_env(env_id).plant.has_fingerprint(certificate.fingerprint):
+        if registered_env(env_id).plant.fingerprint == certificate.fingerprint:
             return env_id
     raise CertificateError(
         "the certificate belongs to no registered environment's plant; "

@@ -26,7 +26,7 @@ from ncs_gym.reading import json_values, read_file
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
-_FINISHED = ("summary.json", "certify.json", "runs/*.json")
+_FINISHED = ("summary.json", "attack.json", "runs/*.json")
 _FINISHED_PARTS = {"study": ("*/summary.json",), "train": ("tensorboard/*/checkpoint/agent.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
@@ -35,7 +35,7 @@ _GROWING = {
     "compare": ("seeds", "arms", "baselines"),
     "study": ("seeds", "arms", "baselines", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
-    "certify": ("steps",),
+    "attack": ("steps",),
     "train": ("steps",),
 }
 # Whoever holds the lock of this file has the folder. It is the operating system's: it ends with the process.

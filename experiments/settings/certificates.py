@@ -143,7 +143,7 @@ class AttackSettings(BackendSettings):
     """
 
     steps: float = 1e8
-    out: Path = Path("runs/certify")
+    out: Path = Path("runs/attack")
     random_plants: int = 4
     envs: int = 4096
     mode: Literal["project", "lookahead", "switch", "boundary"] | None = None
@@ -238,8 +238,6 @@ class RequirementsSettings(BackendSettings):
         disturbances: Factors on the radii of the disturbances.
         noises: Factors on the radii of sensor noise and first errors.
         tolerance: Also seek the factor by which all radii may grow in each network.
-        yardstick: Also compute what a linear controller with gains of its own for every step bears over 15 steps: how
-            far from it the tolerances are. It takes seconds for every age, and proves nothing.
         keep: Percentage of the largest share that the cheapest network is to keep.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Accepted by every command; the search is deterministic and does not use it.
@@ -258,7 +256,6 @@ class RequirementsSettings(BackendSettings):
     disturbances: tuple[float, ...] = (1.0,)
     noises: tuple[float, ...] = (1.0,)
     tolerance: bool = False
-    yardstick: bool = False
     keep: float = 90.0
     force: bool = False
     seed: int = 0

@@ -106,8 +106,6 @@ def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
     """
     if not isinstance(value, dict):
         return value
-    if Ellipsoid in kinds and set(value) == {"shape"}:  # the former name of its field
-        return Ellipsoid(value["shape"])
     if value.get("type") in _BY_TYPE:
         kinds = (_BY_TYPE[value["type"]],)
         value = {key: each for key, each in value.items() if key != "type"}

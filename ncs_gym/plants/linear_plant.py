@@ -78,30 +78,6 @@ _KINDS = {
 }
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
-# Fingerprints that registered plants had on various processors (x86) before the last digits of their A and B were the
-# same on all. A certificate or an agent with one of them belongs to the plant of today: what a certificate claims is
-# verified for the numbers of today anyway.
-FORMER_FINGERPRINTS = {
-    "177ea6db2c10f489ba3cd8ac4f550bcba49144e95e7f714551d3193871f948aa": (
-        "29a79af5f1181432d4aca2f00608251d0cfb5c931d2b1a52891c5b2d9711428f",
-        "0801c535bdcaf0781d2a22bc8a29c98232f10983aa974ee6bac5e9f24a90641a",
-    ),
-    "498d4365ce1b7c82e8f7f72490b2a6c638d5352be9511f604179d9a100d7ef23": (
-        "8cda9ead9750b9177572854dc51856bf866c023a0b01c027ee5eb2f738d8e58e",
-    ),
-    "415231d06116184e751fb423e7ade624ca1ad7836c81f9771432b20dd787acc9": (
-        "f2b8bd930f5e99a5a9d28b4772529b90353f9aa7f25ff42faccba8ea4d57c035",
-        "86b5c2b604b005e58a232ddc738542f67b4c446fbe09604c0cf962bc97d98a27",
-        "8459ffddb8aaa5f05a0e5ba4b8616159be91f91f7e2cb2ffc8c8046995f84857",
-        "c974ed748068a35ed2252e443207b1358d503b36034e0aef9b5e7a97595d133f",
-    ),
-    "11e922056fbb24d3d032ed327673ae50290bf75cf5c5fc440c8722b0392ba0d2": (
-        "5018bfaf7f890619cef0f066443a308c7c06b6a919636a9eb9683fac9ddb82b8",
-        "a6809c736123d225310210aa0dd031fa7fab9c41717255e634cd8747afb62b61",
-        "bd2535e8ea23d725f6ec2c7cb813bf3fad707b51fa0ebeb590185825c9c26c7a",
-        "621a5733e36d75366467c7f7cbb6cd4e379fde42b93b98eb8adf8052934d0a6a",
-    ),
-}
 # Stands for a space at which no line ends.
 _UNBROKEN = "\N{NO-BREAK SPACE}"
 
@@ -558,11 +534,6 @@ class LinearPlant(ReadOnlyArrays):
             self.continuous_model, self.box_rows, self.u_max, self.dt, self.between_samples
         )
 
-    @property
-    def C(self) -> np.ndarray:
-        """The former name of `box_rows`, which stays."""
-        return self.box_rows
-
     @cached_property
     def spectral_radius(self) -> float:
         """Largest absolute eigenvalue of A; below 1 exactly when the plant is Schur stable."""
@@ -604,10 +575,6 @@ class LinearPlant(ReadOnlyArrays):
             digest.update(f"between_samples{self.between_samples}".encode())
             digest.update(self.continuous_model.astype("<f8").tobytes())
         return digest.hexdigest()
-
-    def has_fingerprint(self, fingerprint: str) -> bool:
-        """Returns whether a fingerprint is this plant's, or one that it had before (`FORMER_FINGERPRINTS`)."""
-        return fingerprint == self.fingerprint or fingerprint in FORMER_FINGERPRINTS.get(self.fingerprint, ())
 
     @again_if_interrupted
     def constraint_values(self, state: np.ndarray) -> np.ndarray:

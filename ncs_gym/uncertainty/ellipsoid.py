@@ -42,13 +42,8 @@ class Ellipsoid(ReadOnlyArrays):
     shape_matrix: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "shape_matrix", as_covariance(self.shape_matrix, None, "shape"))
+        object.__setattr__(self, "shape_matrix", as_covariance(self.shape_matrix, None, "shape_matrix"))
         self._make_arrays_read_only()
-
-    @property
-    def shape(self) -> np.ndarray:
-        """The former name of `shape_matrix`, which stays."""
-        return self.shape_matrix
 
     @property
     def dim(self) -> int:

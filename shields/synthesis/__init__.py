@@ -7,7 +7,6 @@ which networks leave a plant certifiable. Importing this package imports the sol
 """
 
 from shields.synthesis.certification import certify, synthesize
-from shields.synthesis.linear_feedback import linear_feedback_tolerance
 from shields.synthesis.network_requirements import Network, Requirement, Requirements, requirements
 
 __all__ = [
@@ -15,7 +14,6 @@ __all__ = [
     "Requirement",
     "Requirements",
     "certify",
-    "linear_feedback_tolerance",
     "requirements",
     "synthesize",
 ]

@@ -303,7 +303,7 @@ def carried_over(certificate: Certificate, plant: LinearPlant, contract: Channel
         contract: What the channel promises; None for nothing.
     """
     promised = certificate.contract
-    if plant.has_fingerprint(certificate.fingerprint):
+    if plant.fingerprint == certificate.fingerprint:
         covered = promised is None or (
             contract is not None
             and contract.max_age <= promised.max_age

@@ -21,7 +21,6 @@ from ncs_gym.validation import as_count, as_number, own_error_state
 from shields.certificate import Certificate
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.design_problem import design_problem
-from shields.synthesis.linear_feedback import linear_feedback_tolerance
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.polytope_gain import ellipsoid_margin, most_tolerant_gain
 
@@ -132,8 +131,6 @@ class Requirement:
             harder one.
         tolerance: Factor on all radii for which a certificate verified, too; None if it was not sought.
         bits_per_second: Bits of measurements in a second, without headers; 64 per number that is not quantized.
-        yardstick: Factor on all radii that a linear controller bears over a finite horizon, which proves nothing
-            (`linear_feedback_tolerance`); None if it was not sought.
     """
 
     network: Network
@@ -141,7 +138,6 @@ class Requirement:
     searched: bool
     tolerance: float | None
     bits_per_second: float
-    yardstick: float | None = None
 
     @property
     def share(self) -> float:
@@ -232,7 +228,6 @@ class Requirements:
                     "searched": point.searched,
                     "share": point.share,
                     "tolerance": point.tolerance,
-                    "yardstick": point.yardstick,
                     "packets_per_second": point.network.packets_per_second,
                     "bits_per_second": point.bits_per_second,
                     "certificate_sha256": point.certificate and point.certificate.checksum,
@@ -374,7 +369,6 @@ def requirements(
     disturbances: Sequence[float] = (1.0,),
     noises: Sequence[float] = (1.0,),
     tolerance: bool = False,
-    yardstick: bool = False,
     execute: Executor | None = None,
 ) -> Requirements:
     """Returns which networks leave a plant certifiable, for all combinations of what is given.
@@ -396,8 +390,6 @@ def requirements(
         disturbances: Factors on the radii of the plant's disturbances.
         noises: Factors on the radii of sensor noise and first errors.
         tolerance: Whether to seek, for every network, the factor by which all radii may grow.
-        yardstick: Whether to compute, beside it, what a linear controller bears over a finite horizon
-            (`linear_feedback_tolerance`): some seconds for every age with four states.
         execute: Executes the searches, for instance in parallel; here, one after the other, by default.
 
     Raises:
@@ -433,12 +425,9 @@ def requirements(
     _answer(beyond, execute)
     _never_less(groups)
     ranges = {key: _output_ranges(group.plant) for key, group in groups.items()}
-    points, borne = [], dict[tuple[_Group, float], float]()
+    points = []
     for network in networks:
         key = _group_of(network)
-        if yardstick and (key, network.age) not in borne:
-            contract = _contract(network.age, network.quantization_step)
-            borne[key, network.age] = linear_feedback_tolerance(groups[key].plant, contract)
         certificate, searched, factor = groups[key].answers[network.age]
         bits = network.packets_per_second * _bits_of_sample(ranges[key], network.quantization_step)
         points.append(
@@ -448,7 +437,6 @@ def requirements(
                 searched=searched,
                 tolerance=factor,
                 bits_per_second=bits,
-                yardstick=borne.get((key, network.age)),
             )
         )
     return Requirements(points=tuple(points), largest_ages=tuple(group.largest() for group in groups.values()))

@@ -84,7 +84,7 @@ def verify(
 
 def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
     conditions = paper_conditions if certificate.method == "paper" else certified_conditions
-    belongs = flag("plant: the certificate belongs to it", plant.has_fingerprint(certificate.fingerprint))
+    belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
     return [belongs, *conditions(certificate, plant)]
 
 

@@ -102,7 +102,7 @@ LINKS = ["runs", "models", "models/shielded-0", "figures", "tensorboard", "chann
 
 @pytest.mark.parametrize(
     ("command", "name"),
-    [*(("compare", name) for name in LINKS), *(("certify", name) for name in ("certificates", "runs"))],
+    [*(("compare", name) for name in LINKS), *(("attack", name) for name in ("certificates", "runs"))],
 )
 @pytest.mark.parametrize("is_there", [True, False])
 def test_links_in_an_output_folder_are_refused_before_anything_is_written(command, name, is_there, tmp_path):
@@ -114,7 +114,7 @@ def test_links_in_an_output_folder_are_refused_before_anything_is_written(comman
     target = mine / "secret" if "." in name else mine
     (out / name).symlink_to(target if is_there else mine / "new")
     before = everything_in(tmp_path)
-    extra = ["--steps", "1", "--jobs", "1"] if command == "certify" else ["--smoke"]
+    extra = ["--steps", "1", "--jobs", "1"] if command == "attack" else ["--smoke"]
     assert_one_sentence(ncs(command, *extra, "--out", out), f"{name} is a link", "give another --out")
     assert everything_in(tmp_path) == before
 
@@ -123,7 +123,7 @@ def test_pipes_in_an_output_folder_are_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "runs")
     with (
         pytest.raises(ResultsError, match=r"runs is neither a file nor a folder"),
-        claim_folder("certify", AttackSettings(out=tmp_path)),
+        claim_folder("attack", AttackSettings(out=tmp_path)),
     ):
         pass
 

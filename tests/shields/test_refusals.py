@@ -9,12 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, LinearPlant, truck_trailer
+from ncs_gym import LinearPlant, truck_trailer
 from shields import (
     Certificate,
     CertificateError,
     Infeasible,
-    linear_feedback_tolerance,
     requirements,
     synthesize,
     verify,
@@ -106,7 +105,6 @@ REFUSED = [
     (lambda: requirements(servo(), losses=[-1]), ValueError, "losses"),
     (lambda: requirements(servo(), disturbances=[0.0]), ValueError, "disturbance"),
     (lambda: requirements(FIXED, sampling_periods=[0.5]), ValueError, "from_statespace"),
-    (lambda: linear_feedback_tolerance(servo(), ChannelContract(1), horizon=0), ValueError, "at least one step"),
     *(
         (
             lambda engine=engine: verify(kept(), plant(), engine=engine),

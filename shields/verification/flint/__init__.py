@@ -18,5 +18,5 @@ __all__ = ["flint_conditions"]
 
 def flint_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Yields every condition of a certificate of either method, judged without the code of the first engine."""
-    yield is_so("plant: the certificate belongs to it", plant.has_fingerprint(certificate.fingerprint))
+    yield is_so("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
     yield from (paper_conditions if certificate.method == "paper" else certified_conditions)(certificate, plant)

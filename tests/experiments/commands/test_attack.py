@@ -277,7 +277,7 @@ def settings(out, **changes):
 
 
 def document(folder):
-    return json.loads((folder / "certify.json").read_text())
+    return json.loads((folder / "attack.json").read_text())
 
 
 @pytest.mark.parametrize(("steps", "envs", "batches", "left_out"), [(7_000, 5, 7, 0), (2_500, 4, 3, 1)])
@@ -313,7 +313,7 @@ def test_killed_campaign_goes_on_and_ends_like_one_without_worker_processes(atta
     out = tmp_path / "out"
     killed(*ATTACK, "--jobs", 1, "--out", out, once=lambda: (out / "runs").exists() and len(stored(out)) >= 2)
     assert 2 <= (left := len(stored(out))) < 9
-    assert not (out / "certify.json").exists()
+    assert not (out / "attack.json").exists()
     with no_worker_processes():
         again = ncs(*ATTACK, "--out", out)
     assert f"{left} of 9 runs were finished before" in again.stderr
@@ -324,7 +324,7 @@ def test_interrupted_campaign_goes_on(campaign):
     out, again = campaign
     whole, batches = document(out), stored(out)
     assert (len(batches), whole["total"]["steps"]) == (9, 9 * 8 * 200)
-    (out / "certify.json").unlink()
+    (out / "attack.json").unlink()
     for name in sorted(batches)[:2]:
         (out / "runs" / name).unlink()
     assert "7 of 9 runs were finished before" in again().stderr
@@ -333,12 +333,12 @@ def test_interrupted_campaign_goes_on(campaign):
     assert again("--steps", 10 * 8 * 200).returncode == 0
     assert document(out)["total"]["steps"] == 10 * 8 * 200
     assert len(stored(out)) == 10
-    finished = (out / "certify.json").read_bytes()
+    finished = (out / "attack.json").read_bytes()
     for changes in (("--steps", 9 * 8 * 200), ("--mode", "switch")):
         refused = again(*changes)
         assert refused.returncode == 2
         assert changes[0][2:] in refused.stderr
-        assert (out / "certify.json").read_bytes() == finished
+        assert (out / "attack.json").read_bytes() == finished
     again("--force")
     assert document(out) == whole
     assert len(stored(out)) == 10
@@ -355,7 +355,7 @@ def test_batch_that_fails_is_named_and_what_is_finished_is_kept(tmp_path, small,
         attack(settings(tmp_path))
     assert isinstance(error.value.__cause__, ValueError)
     assert stored(tmp_path) >= {f"TruckTrailerCruise-v0-overtaking-{index}.json" for index in (0, 2)}
-    assert not (tmp_path / "certify.json").exists()
+    assert not (tmp_path / "attack.json").exists()
 
 
 def test_another_certificate_makes_stored_counts_void(campaign):
@@ -446,14 +446,3 @@ def test_either_kind_of_safe_set_is_attacked_and_neither_takes_the_certificates_
         assert document(out)["settings"]["safe_set"] == kind
         assert (document(out)["total"]["exits"], document(out)["total"]["broken_episodes"]) == (0, 0)
     assert len(list((out / "certificates").iterdir())) == 3
-
-
-def test_earlier_name_of_the_command_is_the_same_command(campaign):
-    out, _ = campaign
-    run = ncs("certify", *ATTACK[1:], "--out", out)
-    assert run.returncode == 0, run.stderr
-    assert "step/s" not in run.stderr  # all there, in the folder of the other name
-    helps = [ncs(name, "--help").stdout for name in ("attack", "certify")]
-    assert helps[0] == helps[1]
-    assert "ncs attack" in helps[0]
-    assert "certify" not in ncs("--help").stdout

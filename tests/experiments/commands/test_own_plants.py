@@ -54,7 +54,7 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_work
     short = ("--mode", "project", "--steps", 5 * 8 * 200, "--envs", 8)
     run = ncs("attack", *ENV, *short, "--out", "c", cwd=folder)
     assert run.returncode == 0, run.stderr
-    document = json.loads((folder / "c" / "certify.json").read_text())
+    document = json.loads((folder / "c" / "attack.json").read_text())
     kinds = ("its channel", "perfect", "blackout", "bursts", "overtaking")
     assert set(document["cases"]) == {f"Plants/Truck-v0, {kind}" for kind in kinds}
     assert document["total"]["steps"] == 5 * 8 * 200
@@ -131,7 +131,7 @@ def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tm
         folder = f"of {len(kinds)}"
         run = ncs("attack", *asked, *given, "--out", folder, cwd=tmp_path)
         assert run.returncode == 0, run.stderr
-        document = json.loads((tmp_path / folder / "certify.json").read_text())
+        document = json.loads((tmp_path / folder / "attack.json").read_text())
         assert list(document["cases"]) == [f"plant.json, {kind}" for kind in kinds]
         assert document["total"]["exits"] == document["total"]["unproved"] == document["total"]["lapsed"] == 0
         assert document["total"]["interventions"] > 0
@@ -147,7 +147,7 @@ def test_another_plant_in_the_same_file_is_attacked_anew(tmp_path, without_worke
         run = ncs("attack", *asked, cwd=tmp_path)
         assert run.returncode == 0, run.stderr
         assert "step/s" in run.stderr
-        totals.append(json.loads((tmp_path / "c" / "certify.json").read_text())["total"])
+        totals.append(json.loads((tmp_path / "c" / "attack.json").read_text())["total"])
     assert totals[0] != totals[1]
 
 

@@ -51,15 +51,15 @@ def finished(command, settings, file="summary.json"):
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("sweep", SweepSettings, {"losses": (0.0, 0.3)}, "losses"),
         ("sweep", SweepSettings, {"quantization_steps": (0.1,)}, "quantization_steps"),
-        ("certify", AttackSettings, {"mode": "switch"}, "mode"),
+        ("attack", AttackSettings, {"mode": "switch"}, "mode"),
         ("study", StudySettings, {"budget": 0.5}, "budget"),
         ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
-        ("certify", AttackSettings, {"steps": 1e7}, "steps"),
+        ("attack", AttackSettings, {"steps": 1e7}, "steps"),
         ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
     ],
 )
 def test_folder_with_results_of_other_settings_is_refused(command, kind, change, words, tmp_path):
-    settings = finished(command, kind(out=tmp_path / "out"), "certify.json" if command == "certify" else "summary.json")
+    settings = finished(command, kind(out=tmp_path / "out"), "attack.json" if command == "attack" else "summary.json")
     before = (tmp_path / "out" / "settings.json").read_bytes()
     with pytest.raises(OtherResultsError, match=f"of other settings.*{words}.*: give another --out, or --force"):
         claim_folder(command, replace(settings, **change))
@@ -78,12 +78,12 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
         ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto", "cpus_per_run": 0.5}),
         ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
-        ("certify", AttackSettings, {"steps": 1e9, "jobs": 1}),
+        ("attack", AttackSettings, {"steps": 1e9, "jobs": 1}),
         ("study", StudySettings, {"seeds": 20, "page": Path("docs/results.md"), "smoke": True}),
     ],
 )
 def test_what_changes_no_result_or_adds_to_them_is_taken(command, kind, change, tmp_path):
-    settings = finished(command, kind(out=tmp_path), "certify.json" if command == "certify" else "summary.json")
+    settings = finished(command, kind(out=tmp_path), "attack.json" if command == "attack" else "summary.json")
     claim_folder(command, replace(settings, **change))
 
 
@@ -144,7 +144,7 @@ def test_settings_of_something_else_are_not_replaced(content, tmp_path):
     "arguments",
     [
         *(["compare", "--smoke"], ["train", "--smoke"], ["sweep", "--smoke"], ["study", "--smoke"]),
-        *(["certify", "--steps", "1"], ["reproduce"], ["compare", "--smoke", "--force"]),
+        *(["attack", "--steps", "1"], ["reproduce"], ["compare", "--smoke", "--force"]),
     ],
 )
 def test_folder_that_another_command_has_is_refused(arguments, tmp_path):

@@ -37,7 +37,7 @@ def test_file_gives_back_the_same_plant(name, tmp_path):
     assert str(twin) == str(plant)
     assert (twin.state_names, twin.input_units) == (plant.state_names, plant.input_units)
     for bound in ("disturbance", "sensor_error", "initial_error"):
-        np.testing.assert_array_equal(getattr(twin, bound).shape, getattr(plant, bound).shape)
+        np.testing.assert_array_equal(getattr(twin, bound).shape_matrix, getattr(plant, bound).shape_matrix)
 
 
 def test_file_written_by_hand_takes_plain_terms(tmp_path):

@@ -32,7 +32,7 @@ def designed():
 def test_sets_that_miss_a_declared_bound_make_a_certificate_invalid(designed, name, words):
     plant, certificate = designed
     assert verified(certificate, plant).valid
-    larger = replaced(plant, **{name: Ellipsoid(1.001 * getattr(plant, name).shape)})
+    larger = replaced(plant, **{name: Ellipsoid(1.001 * getattr(plant, name).shape_matrix)})
     found = broken(certificate, larger)
     assert len(found) == 1
     assert found[0].startswith(words)
@@ -48,7 +48,7 @@ def test_disturbance_set_of_the_certificate_that_misses_the_bound_is_noticed(des
 def test_certificate_belongs_to_its_declared_bounds(designed):
     plant, certificate = designed
     for name in BOUNDS:
-        other = replace(plant, **{name: Ellipsoid(0.5 * getattr(plant, name).shape)})
+        other = replace(plant, **{name: Ellipsoid(0.5 * getattr(plant, name).shape_matrix)})
         assert broken(certificate, other)[0].startswith("plant")
 
 
