@@ -11,7 +11,6 @@ trainings, and draws it if matplotlib is installed.
 
 import argparse
 
-import gymnasium as gym
 import numpy as np
 import torch
 from scipy import stats
@@ -122,5 +121,4 @@ def main():
 
 
 if __name__ == "__main__":
-    gym.logger.min_level = gym.logger.ERROR
     main()
