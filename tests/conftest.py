@@ -43,6 +43,20 @@ def pytest_make_parametrize_id(val: Any) -> str | None:
     return None
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of a test with `cases(n)` n cases stay in `make test`, far from each other; the others are slow."""
+    tests: dict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("cases") and not item.get_closest_marker("slow"):
+            tests[item.nodeid.partition("[")[0]].append(item)
+    for cases in tests.values():
+        kept = cases[0].get_closest_marker("cases").args[0]
+        # Multiples of the golden ratio modulo 1 are spread evenly, however many there are.
+        for _, case in sorted(enumerate(cases), key=lambda each: each[0] * 0.618034 % 1.0)[kept:]:
+            case.add_marker("slow")
+
+
 def pytest_collection_finish() -> None:
     """What is imported by now stays: the collector of garbage does not walk through it again and again."""
     gc.freeze()

@@ -276,6 +276,7 @@ def test_files_that_the_makefile_names_exist():
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", GENERIC_NAMES)
 def test_package_of_the_same_name_elsewhere_is_refused_in_one_sentence(name, tmp_path):
     (tmp_path / name).mkdir()
@@ -311,6 +312,7 @@ def run_in(folder, *arguments):
     )
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", GENERIC_NAMES)
 def test_package_that_was_overwritten_is_told_of(installed_copy, name, tmp_path):
     init = installed_copy / name / "__init__.py"

@@ -129,12 +129,10 @@ class Snapshots:
 
     def taken(self, sample: Any) -> Any:
         """Returns a sample that stays as it is."""
-        if isinstance(sample, dict):
-            return {key: self.taken(each) for key, each in sample.items()}
-        if isinstance(sample, tuple):
-            return tuple(map(self.taken, sample))
         if not isinstance(sample, np.ndarray):
-            return sample
+            if isinstance(sample, dict):
+                return {key: self.taken(each) for key, each in sample.items()}
+            return tuple(map(self.taken, sample)) if isinstance(sample, tuple) else sample
         if sample.nbytes <= SMALL or self._reused:
             return sample.copy()
         if len(self._held) < 2:
@@ -150,13 +148,11 @@ def handed_out(sample: Any, *, anew: bool) -> Any:
     Large ones are not copied where they are seen for the first time: an agent that writes into them changes what it
     sees again while nothing arrives.
     """
+    if isinstance(sample, np.ndarray):
+        return sample.copy() if sample.nbytes <= SMALL or not anew else sample
     if isinstance(sample, dict):
         return {key: handed_out(each, anew=anew) for key, each in sample.items()}
-    if isinstance(sample, tuple):
-        return tuple(handed_out(each, anew=anew) for each in sample)
-    if isinstance(sample, np.ndarray) and (sample.nbytes <= SMALL or not anew):
-        return sample.copy()
-    return sample
+    return tuple(handed_out(each, anew=anew) for each in sample) if isinstance(sample, tuple) else sample
 
 
 class Entries:

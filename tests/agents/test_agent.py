@@ -48,6 +48,7 @@ def folder(agent, tmp_path):
     return tmp_path
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("algorithm", SETTINGS)
 def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
     bursts = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5), delay=1)

@@ -49,6 +49,7 @@ def test_training_goes_on_from_an_agent(loop):
         train(loop, 512, 0, hyperparams=SMALL | {"policy_kwargs": {"net_arch": [8]}}, start=first)
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, TrainingStopped])
 def test_interrupted_training_leaves_what_it_learned(loop, tmp_path, kind):
     with pytest.raises((KeyboardInterrupt, TrainingStopped)):
@@ -84,6 +85,7 @@ def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):
     assert Looking.seen > 100
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
 def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
     class Keeping(BaseCallback):

@@ -32,6 +32,7 @@ def test_every_id_has_a_small_agent_with_its_card(env_id):
     assert "violating steps: 0 of 40000" in card
 
 
+@pytest.mark.cases(5)
 @pytest.mark.parametrize("env_id", IDS)
 def test_every_agent_keeps_its_plant_safe_behind_its_shield(env_id):
     if not ENVIRONMENTS[env_id].is_installed:

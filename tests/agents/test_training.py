@@ -78,6 +78,7 @@ def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_wou
     assert one.interventions > 0
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(
     ("algorithm", "settings", "again"),
     [
@@ -137,6 +138,7 @@ def events_of(folder):
     return events
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "settings", "steps"),
     [("PPO", TINY, 1024), pytest.param("SAC", TINY_REPLAY, 1024, marks=pytest.mark.slow)],

@@ -32,6 +32,7 @@ def assert_said_once_for_each_delay(run):
     assert ".py" not in run.stderr
 
 
+@pytest.mark.slow
 def test_warning_of_a_sweep_is_one_sentence_on_its_own_line(tmp_path, without_workers):
     assert_said_once_for_each_delay(ncs(*SWEEP, "--out", tmp_path))
 

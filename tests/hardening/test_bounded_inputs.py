@@ -201,6 +201,7 @@ HUGE = [
 ]
 
 
+@pytest.mark.cases(5)
 @pytest.mark.parametrize("hyperparams", HUGE, ids=[json.dumps(each)[:50] for each in HUGE])
 def test_hyperparameters_that_take_much_memory_are_refused(hyperparams):
     from agents.hyperparams import complete_hyperparams
@@ -253,6 +254,7 @@ def bomb(mebibytes=300):
     return zipped({"data": [bytes(1 << 20)] * mebibytes})
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("kind", ["outside", "inside", "many"])
 def test_zip_that_unpacks_to_much_is_refused(kind, write):
     pytest.importorskip("stable_baselines3")

@@ -30,6 +30,7 @@ def assert_seeds_decide(steps, hashes):
     assert not {name for name in other if first[name] == other[name]}
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bits_in_every_process():
     assert_seeds_decide(10, ["1"])
 

@@ -46,6 +46,7 @@ def vector(size: float, *factors: float) -> np.ndarray:
         return size * np.array(factors)
 
 
+@pytest.mark.cases(20)
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("contract", [None, ChannelContract(2)])
 @pytest.mark.parametrize("mode", MODES)
@@ -66,6 +67,7 @@ def test_loops_go_on_whatever_numpy_is_told_to_raise(mode, contract, size):
             loop.command()
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("mode", MODES)
 def test_filters_say_the_same_whatever_numpy_is_told_to_raise(mode):
     shields = {name: SafetyFilter(certificate_of(PLANT), PLANT, mode) for name in ("loud", "quiet")}
@@ -89,6 +91,7 @@ def test_filters_say_the_same_whatever_numpy_is_told_to_raise(mode):
             loud.fallback_input(vector(x, 1.0, 1.0))
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("size", SIZES[:4])
 @pytest.mark.parametrize("plant", [PLANT, replace(PLANT, between_samples=4), cart_pole()], ids=["", "between", "pole"])
 def test_environments_and_shields_step_whatever_numpy_is_told_to_raise(plant, size):

@@ -17,6 +17,7 @@ SIZES = [
 ]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("n", "m", "seed", "radius"),
     [(1, 1, 0, 0.99), (2, 1, 1, 0.9999), *(pytest.param(*size, marks=pytest.mark.slow) for size in SIZES)],

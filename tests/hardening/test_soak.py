@@ -98,6 +98,7 @@ def test_a_long_run_does_not_grow(loaded):
     assert growth(NCSEnv(loaded, CHANNEL), 1500, 700) < MOST_GROWTH
 
 
+@pytest.mark.slow
 def test_estimators_whose_graph_forgets_histories_do_not_drift(loaded, forgotten):
     run_estimators(loaded, 16, 2)
     assert len(forgotten) > 1

@@ -150,6 +150,7 @@ def test_certificate_says_when_its_claim_holds_and_its_file_keeps_it(tmp_path):
     assert Certificate.load(tmp_path / "wide.json") == wide
 
 
+@pytest.mark.slow
 def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_certificate():
     env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
     plant = replace(env.plant, gamma=0.43)

@@ -24,6 +24,7 @@ def with_polytope(certificate, rows, multipliers, seed=0):
     return replace(certificate, polytope=polytope)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("rows", "multipliers"),
     [(1, 1), (26, 859), (MOST_ROWS, 2 * MOST_ROWS + 1), (MOST_ROWS, MOST_MULTIPLIERS), (2, MOST_MULTIPLIERS)],

@@ -33,6 +33,7 @@ def test_impossible_counts_are_refused(events, trials):
         clopper_pearson(events, trials)
 
 
+@pytest.mark.slow
 def test_mean_interval_covers_at_its_level():
     rng = np.random.default_rng(0)
     covered = [low <= 0.0 <= high for low, high in (mean_interval(rng.standard_normal(3)) for _ in range(4000))]
@@ -43,6 +44,7 @@ def test_mean_interval_needs_two_values():
     assert mean_interval([1.0]) is None
 
 
+@pytest.mark.slow
 def test_bootstrap_interval_covers_near_its_level_and_never_leaves_the_values():
     rng = np.random.default_rng(0)
     draws = [rng.exponential(size=40) for _ in range(400)]
@@ -75,6 +77,7 @@ def test_stratified_interval_needs_two_runs_in_every_stratum():
     assert bootstrap_interval() is None
 
 
+@pytest.mark.slow
 def test_hierarchical_interval_covers_what_retraining_changes_and_one_over_episodes_does_not():
     rng, covered, too_narrow = np.random.default_rng(0), [], []
     for _ in range(150):

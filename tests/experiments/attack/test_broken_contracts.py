@@ -35,6 +35,7 @@ def attacked(monkeypatch, tmp_path):
     return counts_behind
 
 
+@pytest.mark.slow
 def test_what_comes_after_a_broken_contract_is_counted_apart(attacked):
     counts = attacked(Channel(loss=0.3, quantization_step=1e-3))
     assert (counts.exits, counts.violations, counts.broken_episodes, counts.unproved) == (0, 0, 0, 0)

@@ -41,6 +41,7 @@ def first_errors(plant: LinearPlant) -> np.ndarray:
     return errors
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("bound", "use"),
     [

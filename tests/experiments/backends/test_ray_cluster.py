@@ -143,6 +143,7 @@ def test_impossible_address_is_one_sentence(address):
         require_answer(address)
 
 
+@pytest.mark.slow
 def test_run_that_fails_locally_is_named_and_the_finished_are_kept(run, tmp_path):
     # Whichever comes first, the good one is finished by then or ends before the workers do.
     bad = replace(run, policy_kind="trained", index=1, algorithm="SAC", settings={"n_steps": 0})

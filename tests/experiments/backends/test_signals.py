@@ -80,17 +80,20 @@ QUICK = [MOMENTS[i] for i in (1, 7)]
 SLOW = [pytest.param(each, marks=() if each in QUICK else pytest.mark.slow) for each in MOMENTS]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("moment", SLOW)
 @pytest.mark.parametrize("deaf", [True, False], ids=["deaf runs", "runs that report"])
 def test_second_interrupt_ends_everything_without_a_word(moment, deaf):
     require_quiet(*sent_twice(moment, signal.SIGINT, "--seed", str(int(deaf))))
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("moment", SLOW)
 def test_second_termination_ends_everything_without_a_word(moment):
     require_quiet(*sent_twice(moment, signal.SIGTERM))
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("moment", SLOW)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_one_signal_ends_runs_that_report(moment, number):
@@ -118,6 +121,7 @@ def test_workers_end_when_their_parent_is_killed():
     assert "Traceback" not in errors
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_loop_over_a_network_ends_with_its_processes(number, tmp_path):
     command = ["loop", "--env", "ncs_gym/LaneKeeping-v0", "--steps", "1000000", "--port", "47810", "--live", "no"]

@@ -76,6 +76,7 @@ def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
     assert violating(loop, certificate, "lookahead") == 0
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["psf", "trusting"])
 def test_margins_keep_the_box_on_an_ideal_channel_and_larger_ones_keep_it_longer_on_the_real_one(name):
     loop, env, certificate = tank()
@@ -86,6 +87,7 @@ def test_margins_keep_the_box_on_an_ideal_channel_and_larger_ones_keep_it_longer
     assert large < small - 5
 
 
+@pytest.mark.slow
 def test_filter_with_the_tube_of_our_error_sets_keeps_the_box_under_attack():
     loop, env, certificate = tank()
     attack = {"noise": "extreme", "disturbance": "adversarial", "channel": replace(env.channel, loss=1.0)}
@@ -153,6 +155,7 @@ def test_trusting_filter_still_keeps_the_disturbance_out_if_the_estimate_is_true
     assert levels.max() > 0.99
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("safe_set", ["ellipsoid", "polytope"])
 def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(safe_set, certificate, loaded):
     """Two steps, by trying inputs on a grid."""
@@ -193,6 +196,7 @@ def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificat
     assert 0 < changed < len(proposals)
 
 
+@pytest.mark.slow
 def test_predictive_filter_keeps_the_box_between_samples_where_it_counts_there(loaded):
     part, rng = loaded.resampled(loaded.dt / 20), np.random.default_rng(1)
     proposals = loaded.u_max * np.sign(np.repeat(rng.standard_normal(30), 10))[:, None]

@@ -63,6 +63,7 @@ def test_contracts_are_used_up():
             assert contract_of(case.channel) == case.contract
 
 
+@pytest.mark.slow
 def test_batch_has_the_same_counts_after_any_other():
     batches = [(CRUISE, 0), (CRUISE, 1), (OTHER, 2)]
     first = [counts_of(CAMPAIGN, *each) for each in batches]
@@ -137,6 +138,7 @@ def test_lookahead_is_attacked_in_and_outside_the_safe_set_and_keeps_the_box():
     assert total.interventions > 0
 
 
+@pytest.mark.slow
 def test_lookahead_that_leaves_the_box_is_counted(monkeypatch):
     from shields.runtime.backup_plans.plan_check import PlanTest
 
@@ -223,6 +225,7 @@ def test_nature_attains_every_bound():
 GAUSSIAN = replace(CAMPAIGN, noise="gaussian", delta=0.4)
 
 
+@pytest.mark.slow
 def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest():
     case, certificate = cases_of(GAUSSIAN)[CRUISE], certificate_for_case(CRUISE, GAUSSIAN.delta)
     shield, info = attacked_by(GaussianVectorEnv, case, certificate)
@@ -237,6 +240,7 @@ def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest():
     assert levels[0].min() >= levels[1].max() * (1.0 - 1e-9)
 
 
+@pytest.mark.slow
 def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(
     tmp_path, capsys, monkeypatch, without_workers
 ):
@@ -280,6 +284,7 @@ def document(folder):
     return json.loads((folder / "attack.json").read_text())
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("steps", "envs", "batches", "left_out"), [(7_000, 5, 7, 0), (2_500, 4, 3, 1)])
 def test_a_budget_of_steps_is_kept(tmp_path, small, capsys, without_workers, steps, envs, batches, left_out):
     attack(settings(tmp_path, steps=steps, envs=16))
@@ -309,6 +314,7 @@ def stored(folder):
     return {path.name for path in (folder / "runs").iterdir()}
 
 
+@pytest.mark.slow
 def test_killed_campaign_goes_on_and_ends_like_one_without_worker_processes(attacked, tmp_path):
     out = tmp_path / "out"
     killed(*ATTACK, "--jobs", 1, "--out", out, once=lambda: (out / "runs").exists() and len(stored(out)) >= 2)

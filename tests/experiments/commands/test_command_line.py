@@ -166,6 +166,7 @@ def test_finished_study_is_not_overwritten(command, smoke):
     assert digests(out) == before
 
 
+@pytest.mark.slow
 def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
     (tmp_path / "episode.gif").write_text("mine")
     tiny = ("--hyperparams", "n_envs=8", "n_steps=64", "policy_kwargs=dict(net_arch=[8, 8], log_std_init=-4.0)")
@@ -242,6 +243,7 @@ def test_one_agent_is_trained(tmp_path, without_workers):
     assert Agent.load(model).algorithm == "A2C"
 
 
+@pytest.mark.slow
 def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path, without_workers):
     out = tmp_path / "one"
     given = ["--arm", "lookahead", "--horizon", "3", "--hyperparams", "n_envs=8", "n_steps=64", "--steps", "512"]
@@ -269,6 +271,7 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
         assert ("from a" in evaluated.stdout) is (mode == "lookahead")
 
 
+@pytest.mark.slow
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
     grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "256"]
@@ -307,6 +310,7 @@ def assert_verdict_first(printed, last):
     assert lines[-1] == last
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("module", ["experiments.terminal", "tyro", "numpy", "shields"])
 def test_interrupt_while_the_command_starts_is_one_line(module):
     code = f"""
@@ -343,6 +347,7 @@ def test_synthesize_then_verify(tmp_path):
         assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("arguments", [["verify", "--help"], ["verify", "nowhere.json"]], ids=["help", "error"])
 def test_command_does_the_same_in_this_process_and_in_one_of_its_own(arguments, tmp_path):
     own = ncs_process(*arguments, cwd=tmp_path)

@@ -52,6 +52,7 @@ def check(folder):
     return summary, controller
 
 
+@pytest.mark.slow
 def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     out = tmp_path / "loop"
     done = ncs_process(

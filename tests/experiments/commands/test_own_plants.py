@@ -50,6 +50,7 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
     assert_one_sentence(ncs("verify", "certificate.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=folder), "verify")
 
 
+@pytest.mark.slow
 def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_workers):
     short = ("--mode", "project", "--steps", 5 * 8 * 200, "--envs", 8)
     run = ncs("attack", *ENV, *short, "--out", "c", cwd=folder)
@@ -120,6 +121,7 @@ def test_plant_of_a_file_under_a_contract(tmp_path):
     assert_one_sentence(alone, "give --max-age, too")
 
 
+@pytest.mark.slow
 def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tmp_path, without_workers):
     random_plant(3, 2, 1).save(tmp_path / "plant.json")
     asked = ("--plant", "plant.json", "--mode", "project", "--steps", 4 * 8 * 200, "--envs", 8)

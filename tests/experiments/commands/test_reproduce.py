@@ -27,6 +27,7 @@ def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
     assert outcome["largest_estimation_error"] == pytest.approx(0.01)
 
 
+@pytest.mark.slow
 def test_command_leaves_figures_and_summary(tmp_path):
     run = ncs("reproduce", "--starts", 4, "--steps", 50, "--out", tmp_path / "out")
     assert run.returncode == 0, run.stderr

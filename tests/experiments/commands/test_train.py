@@ -13,6 +13,7 @@ SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
 HINT = "This training had no violation and no override"
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("arm", "log_std", "happens"),
     [
@@ -36,6 +37,7 @@ def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, 
 SHORT = ("--episodes", 1, "--hyperparams", *SMALL, "policy_kwargs=dict(net_arch=[8, 8])", "--out")
 
 
+@pytest.mark.slow
 def test_more_steps_go_on_from_the_agent_and_everything_else_is_refused(tmp_path, without_workers):
     folder = tmp_path / "r"
     assert ncs("train", "--steps", 512, *SHORT, folder).returncode == 0
@@ -91,6 +93,7 @@ def stored(folder):
     return {name: value for name, value in result.items() if name != "files"}  # which have the time in them
 
 
+@pytest.mark.slow
 def test_agents_are_trained_and_evaluated_where_the_box_counts_at_all_times(tmp_path, without_workers):
     folder = tmp_path / "cruise"
     at_all_times = ("--between-samples", "4")

@@ -137,6 +137,7 @@ def test_only_if_example_by_sampling():
     assert (inner * (M @ inner)).sum(axis=0).max() > 1.0
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("change", "is_invariant", "breaks_condition"),
     [({}, True, True), ({"radius": Fraction(1, 40)}, False, True), ({"radius": Fraction(1, 500)}, True, False)],

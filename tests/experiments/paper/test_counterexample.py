@@ -45,6 +45,7 @@ def test_step_with_a_point_outside_its_set_is_not_confirmed(monkeypatch):
     assert not worst_step(CASE.closed_loop, CASE.M, BOX, Ball(CASE.epsilon), starts=5).confirmed
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("disturbances", [BOX, Ball(5e-4)])
 def test_worst_step_beats_random_search(disturbances):
     found = worst_step(CASE.closed_loop, CASE.M, disturbances, Ball(CASE.epsilon))

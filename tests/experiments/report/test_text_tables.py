@@ -40,6 +40,7 @@ def cell(**changes):
     return own | {"mass_factor": None, "arms": comparison()["arms"]} | changes
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("runs", [1, 2])
 def test_no_table_prints_a_negative_zero(runs):
     summary = comparison(runs)

@@ -110,6 +110,7 @@ def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of,
     np.testing.assert_allclose(run.training_loop.residual_gain, certificate.K / loaded.u_max)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", ["trusting", "shield at test", "lagrangian", "shielded+residual", "lqr+trusting"])
 def test_every_arm_plays(run_of, name):
     tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
@@ -119,6 +120,7 @@ def test_every_arm_plays(run_of, name):
     assert (result.episodes[0].guaranteed, result.episodes[1].guaranteed) == (2 * (name[:6] == "shield",))
 
 
+@pytest.mark.slow
 def test_predictive_filter_acts_on_trained_agents_in_training_or_at_test_alone():
     tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
     settings, loop = CompareSettings(steps=512, episodes=2, hyperparams=tiny), loop_config("ncs_gym/BatchReactor-v0")

@@ -70,6 +70,7 @@ def results(certificate):
     return {name: run_of(certificate, name).execute(lambda steps: None) for name in names}
 
 
+@pytest.mark.slow
 def test_scenarios_are_stored_beside_the_evaluation_as_trained(certificate, results, tmp_path):
     run, result = run_of(certificate, "proportional+shielded"), results["proportional+shielded"]
     assert tuple(result.scenarios) == ALL

@@ -27,6 +27,7 @@ def test_what_is_asked_for_replaces_the_environments_own():
     assert changed == expected
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("loss", "length", "period"), [(0.3, 4.0, 1), (0.1, 1.0, 1), (0.6, 2.5, 3)])
 def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period):
     # What the channel itself does, packet by packet.

@@ -57,6 +57,7 @@ def compared(tmp_path_factory):
     return settings, trained_agents(settings)
 
 
+@pytest.mark.slow
 def test_agents_are_those_that_the_comparison_left(compared):
     settings, agents = compared
     assert tuple(agents) == ("lookahead",)
@@ -67,6 +68,7 @@ def test_agents_are_those_that_the_comparison_left(compared):
         trained_agents(replace(settings, seeds=3))
 
 
+@pytest.mark.slow
 def test_losses_decide_for_the_regulator_and_nothing_breaks_lookahead(compared):
     settings, agents = compared
     settings = replace(settings, episodes=12, out=settings.out / "channels")

@@ -88,7 +88,7 @@ def test_spec_of_a_plant_s_file_is_json(register, tmp_path):
         {"disturbance": "sphere"},
         {"disturbance": {"half_widths": [0.01, 0.01]}},
         {"disturbance": {"period": 7.0}},
-        {"initial_set": {"shape": [[1.0, 0.0], [0.0, 2.0]]}},
+        {"initial_set": {"shape_matrix": [[1.0, 0.0], [0.0, 2.0]]}},
         {"terminate_on_violation": True, "allow_assumption_violation": True, "horizon": 50},
     ],
     ids=str,

@@ -111,6 +111,7 @@ ENVIRONMENTS = (
 )
 
 
+@pytest.mark.cases(16)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_equals_scalar_environments_with_the_same_draws(name):
     env = ENVIRONMENTS[name]()

@@ -46,6 +46,7 @@ def run(coarsens, steps):
     return estimator.histories, level, unmet
 
 
+@pytest.mark.slow
 def test_histories_that_hardly_recur_soon_do_and_the_error_stays_in_its_set(monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_BYTES", 1 << 19)
     fine, _, many = run(False, 400)

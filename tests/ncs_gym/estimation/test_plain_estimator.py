@@ -103,6 +103,7 @@ STABLE = plants(most_states=4, units=3.0), st.none()
 UNSTABLE = plants(most_states=3, radius=(0.9, 1.3), units=1.0), st.integers(0, 6)  # contracts kept and broken
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("count", [12, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("of", "age"), [STABLE, UNSTABLE], ids=["stable", "unstable"])
 def test_estimator_equals_the_plain_one_bit_for_bit(of, age, count):
@@ -135,6 +136,7 @@ QUICK = ("overtaking", "broken", "one output")  # the others say the same of oth
 EVERY = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in CASES]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", EVERY)
 def test_estimator_equals_the_plain_one_for_long_also_where_it_forgets_in_the_middle_of_an_episode(name, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 30)

@@ -55,6 +55,7 @@ def test_certificate_at_all_times_exists_for_the_contract(name):
     assert all(verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["LaneKeeping", *(pytest.param(each, marks=pytest.mark.slow) for each in IDS[:2])])
 def test_certificate_exists_for_the_contract_and_not_for_four_tenths_more_uncertainty(name):
     env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))

@@ -37,6 +37,7 @@ def test_batched_draws_equal_scalar_ones(name):
         np.testing.assert_allclose(drawn[:, i], one, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_batched_draws_are_distributed_like_scalar_ones():
     plant, rng = truck_trailer(), np.random.default_rng(0)
     pairs = [(source.draw, source.draw_many) for source in (BallDisturbance(), BoxDisturbance(), SphereDisturbance())]

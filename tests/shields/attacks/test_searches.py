@@ -11,6 +11,7 @@ from tests.shields.attacks.cases import RANDOM, TRUCKS
 PLANTS = TRUCKS | RANDOM
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
 @pytest.mark.parametrize("generations", [60, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["4000 kg", "n=2 m=1 p=1", "n=3 m=2 p=1", "n=4 m=3 p=2"])

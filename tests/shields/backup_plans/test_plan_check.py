@@ -95,6 +95,7 @@ def largest_level(plant, certificate, x_hat, shape, plan, step, rng):
     return certificate.safe_set.gauge(ends).max()
 
 
+@pytest.mark.cases(3)
 def test_plans_are_certified_if_every_possible_state_stays_in_the_box_and_ends_in_the_safe_set(case):
     # The box part is exact: where it fails, an error and disturbances leave the box; else the end must be close to S.
     plant, certificate, test = case
@@ -267,6 +268,7 @@ def edge_of(passes, high):
 QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("margin", [0.0, 0.1])
 @pytest.mark.parametrize(("where", "step"), [("box", 1), ("box", 2), ("end", 1), ("end", 2)])
 def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(where, step, margin):
@@ -318,6 +320,7 @@ def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case
     assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
 @pytest.mark.parametrize(("steps", "margin"), [(1, 0.0), (2, 0.0), (2, 0.05)])
 def test_end_is_certified_in_rational_arithmetic_however_far_out_the_estimate_is(steps, margin, size):

@@ -28,6 +28,7 @@ def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
     assert verified(paper, SMALL).valid
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("bounds", "search", "steps"),  # the first search for SMALL is the fixture's
     [
@@ -63,6 +64,7 @@ def test_shield_with_a_paper_certificate_works_but_is_never_guaranteed(paper):
         assert info["state"] @ paper.M @ info["state"] <= 1.0
 
 
+@pytest.mark.slow
 def test_printed_parameters_are_infeasible_and_the_reason_has_figures():
     with pytest.raises(Infeasible, match=r"\(C2\) binds") as caught:
         synthesize(truck_trailer(), method="paper", dkappa=0.05, drho=0.1)  # proven over the whole domain

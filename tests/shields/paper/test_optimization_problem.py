@@ -98,6 +98,7 @@ def test_first_feasible_pair_wins():
         assert problem.largest_eigenvalue(bounds) < bounds.alpha * (1 + 1e-6)
 
 
+@pytest.mark.slow
 def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_grid():
     plant = truck_trailer(gamma=1e-5, process_noise_cov=np.zeros((2, 2)))
     grid = {"dkappa": 0.03, "drho": 0.08}

@@ -51,6 +51,7 @@ def test_ellipsoid_that_is_asked_for_is_infeasible_where_only_a_polytope_is_foun
         synthesize(found(name)[1], contract=AGE, safe_set="ellipsoid")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "given", ["smaller", pytest.param("same", marks=pytest.mark.slow), pytest.param("whole", marks=pytest.mark.slow)]
 )
@@ -73,6 +74,7 @@ def test_an_ellipsoid_that_is_asked_for_comes_without_the_polytope_of_a_candidat
     assert ellipsoid.keeps_ellipsoid
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
 def test_no_attack_leaves_it(mode):
     certificate, plant = found()

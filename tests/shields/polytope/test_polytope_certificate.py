@@ -85,6 +85,7 @@ def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
     assert search.share_of_points(unstable, plant, points) == 0.0
 
 
+@pytest.mark.slow
 def test_gain_of_the_ellipsoid_stays_where_no_other_has_a_larger_polytope():
     all_of_the_box = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, **QUIET)
     assert_gain_stays(all_of_the_box)

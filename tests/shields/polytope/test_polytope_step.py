@@ -53,6 +53,7 @@ def largest_row(shield, estimate, shape, u):
     return worst
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("seed", "n", "m"), [(1, 2, 1), (2, 3, 2), (3, 2, 3)])
 def test_input_passes_exactly_if_every_extreme_point_stays_inside(seed, n, m):
     shield = random_filter(seed, n, m)
@@ -228,6 +229,7 @@ def hostile(name, count, seed):
     return shield, starts, certificate, plant
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("name", ["TruckTrailerCruise", "CartPole", "BatchReactor", "CartPoleTwoWay"])
 @pytest.mark.parametrize("policy", ["outwards", "turned", "random"])
 def test_no_policy_and_no_disturbance_leaves_the_polytope(name, policy):

@@ -43,6 +43,7 @@ def outside_bounds(info):
     return np.einsum("ki,ki->k", errors, np.linalg.solve(shapes, errors[..., None])[..., 0]) > 1.0
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "name", [each if each == "truck" else pytest.param(each, marks=pytest.mark.slow) for each in LOOPS]
@@ -102,6 +103,7 @@ def share_of_exits(delta, noise):
     return outside.mean()
 
 
+@pytest.mark.slow
 def test_share_of_episodes_that_leave_the_safe_set_is_below_the_union_bound_and_close_to_it():
     bound = bound_violation_probability(tight_plant(DELTA), Channel(loss=0.3), STEPS)
     assert bound == pytest.approx(STEPS * DELTA)  # nothing but the process noise is Gaussian
@@ -109,6 +111,7 @@ def test_share_of_episodes_that_leave_the_safe_set_is_below_the_union_bound_and_
     assert share_of_exits(DELTA, "truncated") == 0.0
 
 
+@pytest.mark.slow
 def test_a_smaller_delta_makes_leaving_rarer():
     shares = [share_of_exits(delta, "gaussian") for delta in (DELTA, DELTA / 20.0)]
     assert 0.0 < shares[1] < 0.2 * shares[0]

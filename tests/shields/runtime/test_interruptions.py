@@ -146,6 +146,7 @@ REPRESENTATIVES = [
 ]
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(("kind", "mode", "downlink", "call"), REPRESENTATIVES)
 def test_interrupted_call_of_a_shield_ends_the_guarantee_or_has_not_happened(kind, mode, downlink, call):
     counts = check_wrapper(kind, mode, downlink, call, STRIDE)

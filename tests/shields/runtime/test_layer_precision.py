@@ -25,6 +25,7 @@ def setting(request):
     return layer, torch.tensor(estimates), torch.tensor(rng.uniform(-1.3, 1.3, (300, plant.m)))
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, *COARSE], ids=str)
 def test_every_action_returned_is_admissible_as_it_is(setting, dtype):
     layer, estimates, proposals = setting

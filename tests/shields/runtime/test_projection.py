@@ -63,6 +63,7 @@ def random_case(rng, m):
     return wanted, offset, effect, radius, limit
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("m", [1, 2, 3, 5])
 def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
     rng = np.random.default_rng(m)

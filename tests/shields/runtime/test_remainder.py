@@ -97,6 +97,7 @@ def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
     assert plant.remainder.sentence == LEFT_OUT.sentence
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("downlink", [{}, {"downlink": Channel(delay=1)}])
 def test_inputs_under_way_beyond_their_limits_are_outside_the_model(downlink):
     """S reaches to four times the limits in their direction, the bound of the remainder only to the limits."""

@@ -54,6 +54,7 @@ def test_loop_asks_in_every_step_while_the_state_is_not_known():
     assert not asked[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "contract"),
     [(PLANT, CONTRACT), pytest.param(lane_keeping(), ChannelContract(8, 1e-4), marks=pytest.mark.slow)],

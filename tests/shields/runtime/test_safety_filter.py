@@ -189,6 +189,7 @@ def test_indefinite_error_shapes_of_three_states_are_unusable():
     assert shield.margin(u[[0, 0, 0]], skew, u) == pytest.approx(shield.margin(u[[0, 0, 0]], skew.T, u), abs=1e-15)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("plant", [STRONG, random_plant(3, 3, 2)], ids=["2, 1", "3, 2"])
 @pytest.mark.parametrize("size", [1e150, 1e308])
 def test_huge_estimates_never_give_a_nan_input(size, plant):
@@ -361,6 +362,7 @@ def random_cases(rng, shield, count):
     return estimates, shapes, inputs
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     ("n", "m"),

@@ -122,6 +122,7 @@ def test_solutions_of_a_program_are_those_of_a_fresh_one():
         assert sum(each is not None for each in alone) > 10
 
 
+@pytest.mark.slow
 def test_plans_of_the_solver_are_those_of_a_fresh_filter():
     shared, fresh = (SafetyFilter(*reactor(), mode="lookahead", horizon=3) for _ in range(2))
     certificate, plant = shared.certificate, shared.plant
@@ -159,6 +160,7 @@ def followed(loop: SafeLoop, seed: int, steps: int = 60) -> list[Any]:
     return said
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_deep_copied_loops_in_threads_decide_as_alone(mode):
     certificate, plant = certificate_for(truck_trailer(mass=4000.0)), truck_trailer(mass=4000.0)
@@ -222,6 +224,7 @@ def episodes(env: Any, seed: int) -> list[np.ndarray]:
     return said
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_environments_in_threads_go_as_alone(mode):
     name = "ncs_gym/TruckTrailerCruise-v0"

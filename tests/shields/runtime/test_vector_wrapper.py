@@ -57,6 +57,7 @@ def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
     np.testing.assert_array_equal(actions, [[0.25], [1.0]])
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("mode", "channel"), [("switch", "bursts"), ("boundary", "overtaking"), *(("project", each) for each in CHANNELS)]
 )

@@ -30,6 +30,7 @@ def radii_scaled(plant, factor):
     return replace(plant, **{name: factor**2 * getattr(plant, name) for name in covariances})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [lambda: random_plant(3, 2, 1), *map(slow, (batch_reactor, cart_pole))])
 def test_its_margin_is_what_exact_verification_accepts(make):
     plant, contract = make(), ChannelContract(2)

@@ -35,6 +35,7 @@ def found():
     )
 
 
+@pytest.mark.slow
 def test_every_possible_network_has_a_certificate_that_verifies(found):
     assert {point.certificate is None for point in found.points} == {True, False}
     for point in found.points:
@@ -102,6 +103,7 @@ def test_cheapest_network_keeps_the_share_and_no_cheaper_one_does(found):
     assert bearing.network.most_losses >= 1
 
 
+@pytest.mark.slow
 def test_tolerated_factor_certifies():
     (point,) = requirements(servo(), tolerance=True).points
     assert point.tolerance is not None

@@ -60,6 +60,7 @@ def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
     assert caught.value.certificate is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "n", "m", "volume"),
     [

@@ -47,6 +47,7 @@ def test_truck_trailers_reach_the_measured_volumes(changes, fraction):
 SIZES = [(n, m, seed) for n in (1, 2, 3, 4) for m in (1, 2) for seed in range(2)]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("n", "m", "seed"), [(2, 1, 0), (3, 2, 0), *(slow(*size) for size in SIZES)])
 def test_random_stable_plants_get_a_certificate_that_verifies(n, m, seed):
     plant = random_plant(seed, n, m, p=max(1, n - 1))
@@ -120,6 +121,7 @@ def test_box_with_more_rows_than_states_is_respected():
     assert area_fraction(certificate, plant) > 0.99
 
 
+@pytest.mark.slow
 def test_units_do_not_change_what_is_found():
     base = truck_trailer(mass=4000.0)
     units = np.diag([1e3, 1e-2])
@@ -199,6 +201,7 @@ def test_flat_and_absent_uncertainty_gets_a_certificate(bounds):
     assert verified(synthesize(plant, safe_set="ellipsoid"), plant).valid
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     "answer",
     [cp.SolverError("it failed"), "infeasible_inaccurate", "user_limit", None, np.nan],
@@ -229,6 +232,7 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
             synthesize(truck_trailer(box=OBLIQUE))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, slow(2), slow(3)])
 def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(n, monkeypatch):
     plant = random_plant(12, n, 1)
@@ -250,6 +254,7 @@ def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(n, m
     assert verified(certificate, plant).valid
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("a", "b", "contract"), [(0.0, 1.0, None), (0.5, 0.0, None), (0.5, 1e-6, None), (0.0, 1.0, 2)])
 def test_gain_that_hardly_matters_leaves_positive_multipliers(a, b, contract):
     """The multiplier of an error that no input answers to is tiny, and must not be rounded to zero."""
