@@ -84,7 +84,6 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environme
 	$(BIN)/python benchmarks/kalman_gain.py
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/contracts.py
-	$(BIN)/python benchmarks/verification.py
 	$(BIN)/python benchmarks/numerical_trust.py
 	$(BIN)/python benchmarks/environment_speed.py
 	$(BIN)/python benchmarks/rendering.py

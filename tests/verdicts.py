@@ -9,14 +9,15 @@ from scipy.linalg import expm
 
 from ncs_gym import LinearPlant
 from shields import Certificate, Report, verify
+from tests.second_verifier.verify import verify_again
 
 # For what floats round where a claim is looked at without exact arithmetic.
 ROUNDING = 1.0 + 1e-9
 
 
 def verified(certificate: Certificate, plant: LinearPlant) -> Report:
-    """The report of the first engine, after the second has come to the same verdict on every condition."""
-    first, second = (verify(certificate, plant, engine=engine) for engine in ("rational", "flint"))
+    """The report of the verifier, after the second has come to the same verdict on every condition."""
+    first, second = (judge(certificate, plant) for judge in (verify, verify_again))
     assert first.valid == second.valid, f"{first}\n\n{second}"
     if certificate.method == "paper":  # (C1) and (C7) are stated in other words, and (C1) needs L > 0
         one, other = broken_constraints(first), broken_constraints(second)
@@ -35,7 +36,7 @@ def verified(certificate: Certificate, plant: LinearPlant) -> Report:
 
 
 def broken(certificate: Certificate, plant: LinearPlant) -> list[str]:
-    """The names of the conditions that do not hold, by both engines."""
+    """The names of the conditions that do not hold, by both verifiers."""
     return [condition.name for condition in verified(certificate, plant).conditions if not condition.holds]
 
 

@@ -24,7 +24,7 @@ def verify(settings: VerifySettings) -> None:
         plant = registered_env(origin).plant
     else:
         origin, plant = str(settings.plant), LinearPlant.load(settings.plant)
-    report = shields.verify(certificate, plant, engine=settings.engine)
+    report = shields.verify(certificate, plant)
     print(f"{certificate}\nagainst the plant of {origin}:\n{report}")
     if settings.out is not None:
         conditions = [asdict(condition) for condition in report.conditions]

@@ -63,7 +63,6 @@ class VerifySettings:
         env: Id of an environment with a plant of its own, or module:id; without it, the one whose plant has the
             certificate's fingerprint.
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
-        engine: "flint" judges by a second verifier, written separately on python-flint, with another algorithm.
         out: File for the verdicts (JSON).
         seed: Accepted by every command; the verification is deterministic and does not use it.
     """
@@ -71,7 +70,6 @@ class VerifySettings:
     file: tyro.conf.Positional[Path]
     env: str | None = None
     plant: Path | None = None
-    engine: Literal["rational", "flint"] = "rational"
     out: Path | None = None
     seed: int = 0
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import own_error_state, shown
+from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.errors import CertificateError
 from shields.paper.conditions import paper_conditions
 from shields.verification.certified_conditions import certified_conditions
 from shields.verification.conditions import Condition, flag
-from shields.verification.flint import flint_conditions
 
 # Where the name of a condition says which age, or row of the polytope, it is about.
 _AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+| of row \d+")
@@ -55,9 +53,7 @@ def _line(alike: list[Condition]) -> str:
 
 
 @own_error_state
-def verify(
-    certificate: Certificate, plant: LinearPlant, *, engine: Literal["rational", "flint"] = "rational"
-) -> Report:
+def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
     The conditions are (E0), (E1), (I), (S), (U) of docs/shield_proof.md, and that D, N and r0^2 I contain what
@@ -68,8 +64,6 @@ def verify(
     Args:
         certificate: The certificate.
         plant: The plant, with its bounds.
-        engine: "rational" factorizes matrices of Python's fractions. "flint" is written separately, on python-flint,
-            and decides by the signs of characteristic polynomials; it also checks the chi-square quantiles.
 
     Raises:
         ValueError: If an argument is of another kind.
@@ -77,15 +71,9 @@ def verify(
     if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
         kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
-    if not isinstance(engine, str) or engine not in ("rational", "flint"):
-        raise ValueError(f"engine must be 'rational' or 'flint', got {shown(engine)}")
-    return Report(tuple((_rational_conditions if engine == "rational" else flint_conditions)(certificate, plant)))
-
-
-def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
     conditions = paper_conditions if certificate.method == "paper" else certified_conditions
     belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
-    return [belongs, *conditions(certificate, plant)]
+    return Report((belongs, *conditions(certificate, plant)))
 
 
 # Digests of the certificates and plants, as they were then, that have been verified in this process.

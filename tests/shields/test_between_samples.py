@@ -1,4 +1,4 @@
-"""Shields whose box counts between samples, too: proved by both engines, attacked on a fine grid by another route."""
+"""Shields whose box counts between samples, too: proved by both verifiers, attacked on a fine grid by another route."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from shields.runtime.polytope_step import grid_test
 from shields.runtime.starts import starts_known
 from shields.synthesis.network_requirements import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
+from tests.second_verifier.verify import verify_again
 from tests.verdicts import verified
 
 IDS = {"TruckTrailerCruise": 8, "BatchReactor": 4}
@@ -53,14 +54,14 @@ def worst_between(name, x, u):
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_both_engines_prove_ellipsoid_and_polytope(name):
+def test_both_verifiers_prove_ellipsoid_and_polytope(name):
     plant, plain, wide = found(name, IDS[name])
     assert wide.polytope is not None
     assert plain.between_samples == wide.between_samples == IDS[name]
     assert verified(plain, plant).valid
     assert verified(wide, plant).valid
-    for engine in ("rational", "flint"):
-        names = [condition.name for condition in verify(wide, plant, engine=engine).conditions]
+    for judge in (verify, verify_again):
+        names = [condition.name for condition in judge(wide, plant).conditions]
         assert sum(each.startswith("(G)") for each in names) == len(plant.box_rows)
         for kind in ("(B)", "(PB)"):
             assert sum(each.startswith(kind) for each in names) == len(plant.box_rows) * IDS[name]

@@ -339,12 +339,8 @@ def test_synthesize_then_verify(tmp_path):
     assert_verdict_first(made.stdout, f"saved to {file}")
     assert_verdict_first(checked.stdout, f"{file} verifies")
     assert json.loads((tmp_path / "report.json").read_text())["valid"] is True
-    again = ncs("verify", file, "--engine", "flint")
-    assert again.returncode == 0, again.stderr
-    assert "chi-square" in again.stdout
-    for engine in ("rational", "flint"):
-        other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0", "--engine", engine)
-        assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
+    other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
+    assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
 
 
 @pytest.mark.cases(1)

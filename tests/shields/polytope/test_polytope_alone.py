@@ -26,7 +26,7 @@ def found(name="servo"):
     return certificate_of(plant, contract, "polytope"), plant
 
 
-def test_where_no_ellipsoid_is_found_a_polytope_is_and_both_engines_prove_it(tmp_path):
+def test_where_no_ellipsoid_is_found_a_polytope_is_and_both_verifiers_prove_it(tmp_path):
     _, plant = found()
     certificate = synthesize(plant, contract=AGE)
     assert not certificate.keeps_ellipsoid

@@ -1,4 +1,4 @@
-"""Polytopes that the certified gain keeps in the box: found, proved by both engines, and refused when changed."""
+"""Polytopes that the certified gain keeps in the box: found, proved by both verifiers, and refused when changed."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from shields.synthesis.certification import with_largest_polytope, with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.second_verifier.verify import verify_again
 from tests.verdicts import verified
 
 IDS = {"TruckTrailerCruise": 0.93, "CartPole": 0.43, "BatchReactor": 0.75, "Pendulum": 0.71}
@@ -39,7 +40,7 @@ def found(name):
 
 
 @pytest.mark.parametrize("name", ["TruckTrailerCruise", *(pytest.param(name, marks=pytest.mark.slow) for name in IDS)])
-def test_polytopes_fill_much_more_of_the_box_and_both_engines_prove_them(name):
+def test_polytopes_fill_much_more_of_the_box_and_both_verifiers_prove_them(name):
     _, certificate, plant = found(name)
     wide = with_polytope(certificate, plant)
     assert wide.provenance["polytope_share_of_box"] >= IDS[name] > certificate.provenance["share_of_box"]
@@ -165,9 +166,9 @@ def test_units_of_inputs_do_not_matter():
     K = certificate.K * 1e-39
     found_there = search.invariant_polytope(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
     broken = [
-        [c.name for c in verify(replace(certificate, K=K, polytope=found_there), tiny, engine=engine).conditions
+        [c.name for c in judge(replace(certificate, K=K, polytope=found_there), tiny).conditions
          if not c.holds and c.name.startswith("(P")]
-        for engine in ("rational", "flint")
+        for judge in (verify, verify_again)
     ]  # fmt: skip
     assert broken == [[], []]
 

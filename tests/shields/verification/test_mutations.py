@@ -1,4 +1,4 @@
-"""One mutation harness for all kinds of proof: what is changed to harm fails in both engines, what verifies is true."""
+"""One mutation harness for all kinds of proof: what is changed to harm fails in both verifiers, what verifies is true."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
-from shields.verification.flint.bounds import keeps_enough
-from shields.verification.flint.exact import (
+from tests.second_verifier.bounds import keeps_enough
+from tests.second_verifier.exact import (
     PRECISION,
     at_least_zero,
     definite,

@@ -11,7 +11,7 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
-from shields.verification.flint.exact import (
+from tests.second_verifier.exact import (
     FLOAT32,
     PRECISION,
     ball_at_least_zero,
@@ -22,7 +22,7 @@ from shields.verification.flint.exact import (
     number,
     reach_of,
 )
-from shields.verification.flint.polytope import box_extents
+from tests.second_verifier.polytope import box_extents
 
 
 def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from shields import synthesize, verify
-from shields.verification import flint as second_engine
-from shields.verification.flint.bounds import keeps_enough
-from shields.verification.flint.exact import at_least_zero, definite, is_semidefinite, matrix
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
 from tests.certificates import certificate_of
 from tests.plants import named
+from tests.second_verifier import verify as second_verifier
+from tests.second_verifier.bounds import keeps_enough
+from tests.second_verifier.exact import at_least_zero, definite, is_semidefinite, matrix
+from tests.second_verifier.verify import verify_again
 from tests.shields.verification.test_mutations import replaced, with_multipliers
 from tests.shields.verification.test_rational_matrix import minors_say_semidefinite
 from tests.verdicts import verified
@@ -28,6 +29,8 @@ ROOT = Path(__file__).resolve().parents[3]
 MAY_IMPORT = {
     "ncs_gym",
     "ncs_gym.uncertainty.truncated_gaussian",
+    "ncs_gym.validation",
+    "shields",
     "shields.certificate",
     "shields.polytope",
     "shields.verification.conditions",
@@ -36,7 +39,7 @@ MAY_IMPORT = {
 
 @given(st.integers(0, 100_000), st.integers(1, 4))
 @settings(max_examples=300, deadline=None)
-def test_semidefiniteness_agrees_with_all_principal_minors_and_the_first_engine(seed, n):
+def test_semidefiniteness_agrees_with_all_principal_minors_and_the_first_verifier(seed, n):
     rng = np.random.default_rng(seed)
     factor = rng.integers(-2, 3, (n, rng.integers(1, n + 1)))
     symmetric = factor @ factor.T  # semidefinite, often singular
@@ -69,32 +72,33 @@ def test_margins_beyond_any_float_keep_their_sign():
     assert at_least_zero("(S)", -1 / huge).margin < 0.0
 
 
-def test_margins_are_those_of_the_first_engine(certificate, loaded):
+def test_margins_are_those_of_the_first_verifier(certificate, loaded):
     spring, contract = named("oscillator")
     for each, plant in ((certificate, loaded), (certificate_of(spring, contract, "polytope"), spring)):
-        first, second = (verify(each, plant, engine=engine) for engine in ("rational", "flint"))
+        first, second = (judge(each, plant) for judge in (verify, verify_again))
         margins = {condition.name: condition.margin for condition in second.conditions}
         for condition in first.conditions:
             assert margins[condition.name] == pytest.approx(condition.margin, rel=1e-6, abs=1e-15), condition.name
 
 
-def test_the_engines_have_no_code_in_common():
-    folder = Path(second_engine.__file__).parent
+def test_the_verifiers_have_no_code_in_common():
+    folder = Path(second_verifier.__file__).parent
     for path in folder.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             module = node.module if isinstance(node, ast.ImportFrom) else None
             if module is not None and module.startswith(("ncs_gym", "shields")):
-                own = module.startswith("shields.verification.flint")
-                assert own or module in MAY_IMPORT, (path.name, module)
+                assert module in MAY_IMPORT, (path.name, module)
                 if module == "shields.verification.conditions":
                     assert [alias.name for alias in node.names] == ["Condition"], path.name
 
 
-@pytest.mark.parametrize("slip", ["conditions.is_positive_semidefinite", "flint.exact.is_semidefinite"])
-def test_a_slip_in_one_engine_is_noticed_by_the_other(slip, certificate, loaded, monkeypatch):
+@pytest.mark.parametrize(
+    "slip", ["shields.verification.conditions.is_positive_semidefinite", "tests.second_verifier.exact.is_semidefinite"]
+)
+def test_a_slip_in_one_verifier_is_noticed_by_the_other(slip, certificate, loaded, monkeypatch):
     wrong = with_multipliers(certificate, error=1e-320)
     assert not verified(wrong, loaded).valid
-    monkeypatch.setattr(f"shields.verification.{slip}", lambda *args, **settings: True)
+    monkeypatch.setattr(slip, lambda *args, **settings: True)
     with pytest.raises(AssertionError):
         verified(wrong, loaded)
 
@@ -118,11 +122,11 @@ def test_no_truncation_removes_more_than_delta(delta):
             assert keeps_enough("chi-square", noise, plant).holds
 
 
-def test_quantile_a_hair_too_small_is_noticed_by_the_second_engine(certificate, loaded):
+def test_quantile_a_hair_too_small_is_noticed_by_the_second_verifier(certificate, loaded):
     noise = loaded.process_noise
     for factor, holds in ((1.0, True), (1.0 - 1e-9, False)):
         changed = TruncatedGaussian(noise.covariance, factor * truncation_energy(loaded.delta, loaded.n))
-        report = verify(certificate, replaced(loaded, process_noise=changed), engine="flint")
+        report = verify_again(certificate, replaced(loaded, process_noise=changed))
         broken = [condition.name for condition in report.conditions if not condition.holds]
         assert broken == ([] if holds else ["chi-square: no more than delta of the process noise is truncated"])
 

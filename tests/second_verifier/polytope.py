@@ -12,7 +12,7 @@ from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
 from shields.verification.conditions import Condition
-from shields.verification.flint.exact import (
+from tests.second_verifier.exact import (
     FLOAT32,
     PRECISION,
     ball_at_least_zero,

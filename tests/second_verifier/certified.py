@@ -12,9 +12,9 @@ from flint import fmpq
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
-from shields.verification.flint.between_samples import between_conditions
-from shields.verification.flint.bounds import bound_conditions
-from shields.verification.flint.exact import (
+from tests.second_verifier.between_samples import between_conditions
+from tests.second_verifier.bounds import bound_conditions
+from tests.second_verifier.exact import (
     FLOAT32,
     at_least_zero,
     definite,
@@ -25,7 +25,7 @@ from shields.verification.flint.exact import (
     matrix,
     number,
 )
-from shields.verification.flint.polytope import polytope_conditions
+from tests.second_verifier.polytope import polytope_conditions
 
 
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:

@@ -13,7 +13,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
 from shields.certificate import Updates
 from shields.verification.conditions import Condition
-from shields.verification.flint.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number
+from tests.second_verifier.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number
 
 # No term of a sum of ellipsoids gets a smaller weight.
 _SMALLEST_WEIGHT = 1e-9
