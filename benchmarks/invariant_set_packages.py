@@ -53,7 +53,7 @@ def case_of(name: str) -> Case:
     inputs = K / (plant.u_max * (1.0 - float(ACTION_ROUNDING)) - reach)[:, None]
     pushed = plant.B @ K
     errors = np.sqrt(np.einsum("ij,kjl,il->ki", pushed, certificate.error_shapes, pushed).max(axis=0))
-    W = errors + np.sqrt(np.diag(certificate.disturbances()[0]))
+    W = errors + np.sqrt(np.diag(certificate.D))
     return Case(
         (plant.A + pushed) * widths / widths[:, None], np.concatenate([plant.box_rows, inputs]) * widths, W / widths
     )

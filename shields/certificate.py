@@ -7,14 +7,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, as_setting, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_setting, read_only, shown
 from shields.certificate_text import (
-    METHODS,
     contract_text,
     counted,
     missing_polytope_of,
@@ -26,12 +25,7 @@ from shields.errors import CertificateError
 from shields.json_documents import content_of, document_of, read_content, write_document
 from shields.polytope import Polytope, polytope_content, polytope_of
 
-_FORMAT = "ncs-gym certificate 2"
-# The fields that a certificate of each method has besides L and K, and that one of the other method must not have.
-_FIELDS = {
-    "certified": ("proofs", "D", "rounding"),
-    "paper": ("kappa", "rho", "epsilon", "epsilon_up"),
-}
+_FORMAT = "ncs-gym certificate 3"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,15 +121,6 @@ class Updates(ReadOnlyArrays):
         self._make_arrays_read_only()
 
 
-class PaperConstants(NamedTuple):
-    """What a certificate of method "paper" is verified with, besides L and K; see `Certificate`."""
-
-    kappa: float
-    rho: float
-    epsilon: float
-    epsilon_up: float
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
@@ -151,71 +136,51 @@ class Certificate(ReadOnlyArrays):
         L: Shape of the ellipsoid S = E(L), (n, n) [squares of the states' units].
         K: Gain of the fallback input u = K x_hat, shape (m, n) [input per state].
         proofs: One for each error set: under a channel contract for the ages 0..h of the newest sample, otherwise a
-            single one; none for "paper".
-        D: Shape of the disturbance set that the proofs assume, (n, n); None for "paper".
-        rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32; None for "paper".
+            single one.
+        D: Shape of the disturbance set that the proofs assume, (n, n).
+        rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32.
         updates: What a channel contract adds to the proofs; None without a contract.
-        polytope: The polytope that a shield keeps in place of S; None without one, and for "paper".
+        polytope: The polytope that a shield keeps in place of S; None without one.
         between_samples: The plant's: the state is claimed to be in the box at all times if it is given, None claims it
             at the sampling instants.
-        method: Method of the synthesis, "certified" or "paper".
         fingerprint: Fingerprint of the plant that the certificate belongs to.
-        kappa: Contraction factor of OP; this and the next three are None unless the method is "paper".
-        rho: Bound of OP on the condition number of L.
-        epsilon: Bound on the squared state error of Liu et al. Theorem 3.
-        epsilon_up: Bound on the squared uplink error of Liu et al. Theorem 2.
         provenance: How the certificate was made (solver, versions, volume); it proves nothing.
     """
 
     L: np.ndarray
     K: np.ndarray
-    proofs: tuple[Proof, ...] = ()
-    D: np.ndarray | None = None
-    rounding: float | None = None
+    proofs: tuple[Proof, ...]
+    D: np.ndarray
+    rounding: float
     updates: Updates | None = None
     polytope: Polytope | None = None
     between_samples: int | None = None
-    method: str
     fingerprint: str
-    kappa: float | None = None
-    rho: float | None = None
-    epsilon: float | None = None
-    epsilon_up: float | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if a field is missing, belongs to the other method, or is of the wrong kind."""
+        """Raises CertificateError if a field is of the wrong kind."""
         try:
             self._check_fields()
             L = as_matrix(self.L, (None, None), "L")
             n = len(L)
             object.__setattr__(self, "L", as_matrix(L, (n, n), "L"))
             object.__setattr__(self, "K", as_matrix(self.K, (None, n), "K"))
-            if self.method == "paper":
-                for name in _FIELDS["paper"]:
-                    object.__setattr__(self, name, as_number(getattr(self, name), name))
-            else:
-                object.__setattr__(self, "D", as_matrix(self.D, (n, n), "D"))
-                object.__setattr__(self, "rounding", float(_as_array(self.rounding, (), "rounding")))
-                self._check_error_sets(n)
+            object.__setattr__(self, "D", as_matrix(self.D, (n, n), "D"))
+            object.__setattr__(self, "rounding", float(_as_array(self.rounding, (), "rounding")))
+            self._check_error_sets(n)
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
         self._make_arrays_read_only()
 
     def _check_fields(self) -> None:
-        """Raises ValueError unless exactly the fields of the certificate's method are given."""
-        if self.method not in ("certified", "paper"):
-            raise ValueError(f"its method must be 'certified' or 'paper', got {shown(self.method)}")
+        """Raises ValueError unless the fields that are no arrays are of their kinds."""
         if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
-        given = {name for names in _FIELDS.values() for name in names if getattr(self, name) is not None}
-        given -= set() if self.proofs else {"proofs"}
-        if wrong := [name for names in _FIELDS.values() for name in names if name in given ^ {*_FIELDS[self.method]}]:
-            raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
         for name, kind in (("updates", Updates), ("polytope", Polytope), ("between_samples", int)):
             value = getattr(self, name)
-            if value is not None and (self.method == "paper" or type(value) is not kind):
-                raise ValueError(f"its {name} must be of type {kind.__name__}, and one of method 'paper' has none")
+            if value is not None and type(value) is not kind:
+                raise ValueError(f"its {name} must be of type {kind.__name__}")
 
     def _check_error_sets(self, n: int) -> None:
         """Raises ValueError unless there is a proof for every age, and all error sets have n dimensions."""
@@ -229,26 +194,6 @@ class Certificate(ReadOnlyArrays):
             raise ValueError("either all of its proofs have multipliers of (I), or none has")
         if self.polytope is None and not self.keeps_ellipsoid:
             raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
-
-    def constants(self) -> PaperConstants:
-        """Returns the constants with which the constraints of OP are verified.
-
-        Raises:
-            CertificateError: If the method is "certified", which has none.
-        """
-        if self.kappa is None or self.rho is None or self.epsilon is None or self.epsilon_up is None:
-            raise CertificateError(f"a certificate of method {self.method!r} has no constants of OP to verify")
-        return PaperConstants(self.kappa, self.rho, self.epsilon, self.epsilon_up)
-
-    def disturbances(self) -> tuple[np.ndarray, float]:
-        """Returns D and s, with which the conditions of docs/shield_proof.md are verified.
-
-        Raises:
-            CertificateError: If the method is "paper", which has no error set.
-        """
-        if self.D is None or self.rounding is None:
-            raise CertificateError(f"a certificate of method {self.method!r} has no error set to verify")
-        return self.D, self.rounding
 
     @cached_property
     def M(self) -> np.ndarray:
@@ -277,15 +222,13 @@ class Certificate(ReadOnlyArrays):
         return None if self.updates is None else self.updates.contract
 
     @property
-    def Sigma(self) -> np.ndarray | None:
-        """Shape of the error set, (n, n), under a contract that of the largest age; None for "paper"."""
-        return self.proofs[-1].Sigma if self.proofs else None
+    def Sigma(self) -> np.ndarray:
+        """Shape of the error set, (n, n), under a contract that of the largest age."""
+        return self.proofs[-1].Sigma
 
     @property
-    def multipliers(self) -> Multipliers | None:
-        """The multipliers of the proof, under a contract those of the largest age; None for "paper"."""
-        if not self.proofs or self.rounding is None:
-            return None
+    def multipliers(self) -> Multipliers:
+        """The multipliers of the proof, under a contract those of the largest age."""
         last = self.proofs[-1]
         if last.shares is None or last.inputs is None:
             return Multipliers(error=last.rate, rounding=self.rounding)
@@ -300,14 +243,14 @@ class Certificate(ReadOnlyArrays):
         )
 
     @cached_property
-    def error_set(self) -> Ellipsoid | None:
-        """The certified error set E(Sigma); None for method "paper"."""
-        return None if self.Sigma is None else Ellipsoid(self.Sigma)
+    def error_set(self) -> Ellipsoid:
+        """The certified error set E(Sigma)."""
+        return Ellipsoid(self.Sigma)
 
     @cached_property
     def error_shapes(self) -> np.ndarray:
-        """Shapes of all error sets for which K x_hat keeps the state safe, (k, n, n); k = 0 for method "paper"."""
-        return read_only(np.array([proof.Sigma for proof in self.proofs]).reshape(-1, *self.L.shape))
+        """Shapes of all error sets for which K x_hat keeps the state safe, (k, n, n)."""
+        return read_only(np.array([proof.Sigma for proof in self.proofs]))
 
     @property
     def next_error_shapes(self) -> list[np.ndarray]:
@@ -342,14 +285,13 @@ class Certificate(ReadOnlyArrays):
             safe_set = f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; {inside} "
         widths = ", ".join(f"{width:.4g}" for width in np.sqrt(np.diag(self.L)))
         rows = [
-            ("method", METHODS[self.method]),
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
             ("safe set", f"{safe_set}x'Mx <= 1, that reaches |x_i| <= {widths}"),
             ("claim", f"in the safe box {claim}"),
             ("size", size_of(recorded)),
-            ("polytope", missing_polytope_of(recorded) if self.proofs and self.polytope is None else ""),
+            ("polytope", missing_polytope_of(recorded) if self.polytope is None else ""),
             ("fallback", "u = K x_hat"),
-            ("contract", contract_text(self.method, self.contract)),
+            ("contract", contract_text(self.contract)),
             *provenance_rows(recorded),
         ]
         return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
@@ -412,8 +354,7 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
 
     Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
     """
-    c, last = certificate, certificate.multipliers
-    ages = None
+    c, ages = certificate, None
     if (updates := c.updates) is not None:
         sets = {
             "shapes": [*c.error_shapes.tolist(), updates.last.tolist()],
@@ -427,16 +368,11 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
     return optional | {
         "L": c.L.tolist(),
         "K": c.K.tolist(),
-        "Sigma": None if c.Sigma is None else c.Sigma.tolist(),
-        "D": None if c.D is None else c.D.tolist(),
-        "multipliers": None if last is None else asdict(last),
+        "Sigma": c.Sigma.tolist(),
+        "D": c.D.tolist(),
+        "multipliers": asdict(c.multipliers),
         "ages": ages,
-        "method": c.method,
         "fingerprint": c.fingerprint,
-        "kappa": c.kappa,
-        "rho": c.rho,
-        "epsilon": c.epsilon,
-        "epsilon_up": c.epsilon_up,
         "provenance": c.provenance,
     }
 
@@ -451,13 +387,8 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     Raises:
         KeyError, TypeError, ValueError: If an entry is missing, of a wrong kind, or contradicts another one.
     """
-    names = ("L", "K", "D", "method", "fingerprint", *_FIELDS["paper"], "provenance")
-    fields = {name: content[name] for name in names}
+    fields = {name: content[name] for name in ("L", "K", "D", "fingerprint", "provenance")}
     Sigma, ages = content["Sigma"], content["ages"]
-    if content["multipliers"] is None:
-        if Sigma is not None or ages is not None:
-            raise ValueError("error sets without multipliers")
-        return fields
     stated = Multipliers(**content["multipliers"])
     fields["rounding"] = stated.rounding
     fields["between_samples"] = content.get("between_samples")

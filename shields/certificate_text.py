@@ -9,10 +9,6 @@ from ncs_gym import ChannelContract
 from ncs_gym.validation import printable
 
 _WIDTH, _INDENT = 80, 14
-METHODS = {
-    "certified": "certified",
-    "paper": "paper (OP and Algorithm 1 of Liu et al. as printed)",
-}
 
 
 def size_of(recorded: dict[str, Any]) -> str:
@@ -52,16 +48,13 @@ def table(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def contract_text(method: str, contract: ChannelContract | None, input_delay: int = 0) -> str:
+def contract_text(contract: ChannelContract | None, input_delay: int = 0) -> str:
     """Returns what the channel has to promise.
 
     Args:
-        method: Method of the certificate.
         contract: Contract of the certificate.
         input_delay: What a downlink takes of the contract's age [steps].
     """
-    if method == "paper":
-        return "none; no error set: the guarantee is the paper's own, and a shield with it is never guaranteed"
     if contract is None:
         return "none: any packets may be lost or late"
     step = contract.quantization_step

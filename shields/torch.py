@@ -42,17 +42,14 @@ class SafeLayer(nn.Module):
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
-        ValueError: If the error shape is no positive semidefinite matrix, or there is none.
+        ValueError: If the error shape is no positive semidefinite matrix.
     """
 
     @own_error_state
     def __init__(self, certificate: Certificate, plant: LinearPlant, error_shape: Any = None) -> None:
         super().__init__()
         self.filter = SafetyFilter(certificate, plant)
-        shape = certificate.Sigma if error_shape is None else error_shape
-        if shape is None:
-            raise ValueError("a certificate of the published method carries no error set: give error_shape")
-        self._shape = np.array(shape, dtype=np.float64)
+        self._shape = np.array(certificate.Sigma if error_shape is None else error_shape, dtype=np.float64)
         if not np.isfinite(self.filter.errors_of(self._shape).radius):
             raise ValueError(f"error_shape must be positive semidefinite, shape ({plant.n}, {plant.n})")
 

@@ -67,14 +67,13 @@ def vector_runs(seed: int, steps: int) -> dict[str, str]:
 
 
 def synthesized() -> dict[str, str]:
-    """Whole certificate files, without a contract and with one, and of the published method."""
+    """Whole certificate files, without a contract and with one."""
     sizes = {"B": [[0.1], [0.2]], "box": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-6}
     stable = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], **sizes)
     unstable = LinearPlant(A=[[1.02, 0.1], [0.0, 0.8]], measurement_noise_cov=1e-6 * np.eye(2), **sizes)
     certificates = {
         "certified": synthesize(stable),
         "contract": synthesize(unstable, contract=ChannelContract(1)),
-        "paper": synthesize(stable, method="paper"),
     }
     return {name: json.dumps(certificate.document) for name, certificate in certificates.items()}
 

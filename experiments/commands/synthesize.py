@@ -25,7 +25,6 @@ def synthesize(settings: SynthesizeSettings) -> None:
         with synthesis_status() as show:
             certificate = shields.synthesize(
                 plant,
-                settings.method,
                 contract=contract,
                 safe_set=settings.safe_set,
                 search_gain=settings.search_gain,
@@ -41,9 +40,6 @@ def synthesize(settings: SynthesizeSettings) -> None:
         ) from interrupt
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")
-    if certificate.method == "paper":
-        also = "hold" if certificate.provenance["exact_conditions_hold"] else "were not shown to hold"
-        print(f"guarantee: {certificate.provenance['guarantee']}; our exact conditions {also} for it too")
     print(f"saved to {settings.out}")
 
 

@@ -17,7 +17,7 @@ from experiments.plots.figure_style import STYLE, CaptionedFigure, with_unit
 from experiments.settings.certificates import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
 from ncs_gym.registration import CASE_STUDY_BOX
-from shields import synthesize
+from shields import paper, synthesize
 from shields.paper.feasibility import FeasibilityScan, largest_scale
 
 _ENV = "ncs_gym/TruckTrailer-v0"
@@ -95,7 +95,7 @@ def designs() -> list[StateFeedback]:
         process_noise_cov=scale * plant.process_noise_cov,
         initial_cov=scale * plant.initial_cov,
     )
-    op = synthesize(scaled, "paper", dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
+    op = paper.synthesize(scaled, dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
     box = BoxDisturbance((1.0 - 1e-9) * scale**0.5 * np.asarray(CASE_STUDY_BOX.half_widths))
     return [
         StateFeedback("printed", plant, CASE_STUDY_BOX, example.L, example.K, example.epsilon),

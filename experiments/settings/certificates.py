@@ -23,10 +23,8 @@ class SynthesizeSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`). By default ncs_gym/TruckTrailerCruise-v0.
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
-        method: Synthesis method: ours, whose result is verified exactly, or the published one as printed.
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
-            keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
-            an ellipsoid.
+            keeps in the safe box, which leaves the policy more room. By default the polytope.
         search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
             takes about as long again, longer for polytopes of many rows, and keeps the polytope alone.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
@@ -41,7 +39,6 @@ class SynthesizeSettings:
 
     env: str | None = None
     plant: Path | None = None
-    method: Literal["certified", "paper"] = "certified"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     search_gain: bool = False
     between_samples: int | None = None

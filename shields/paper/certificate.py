@@ -1,118 +1,71 @@
-"""The certificate of the published method, or the reason why there is none."""
+"""The certificate of the published method."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ncs_gym import LinearPlant
-from shields.certificate import Certificate
-from shields.errors import Infeasible
-from shields.paper.algorithm import search_grid
-from shields.paper.bounds import unknown_bounds
-from shields.paper.conditions import paper_conditions
-from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
-from shields.paper.optimization_problem import OPSolution
+from ncs_gym import Ellipsoid
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number
+from shields.certificate_text import counted, table
+from shields.errors import CertificateError
 
 
-def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search: str) -> Certificate:
-    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 4), as printed.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PaperCertificate(ReadOnlyArrays):
+    """A set E(L) and a gain that meet the constraints of OP (Liu et al. Definition 4).
 
-    It carries the guarantee of the paper's own definitions, which assumes e'e <= eps. It has no error set, so a shield
-    with this certificate is never guaranteed.
+    It carries the guarantee of the paper's own definitions, which assumes e'e <= epsilon at every step. It has no error
+    set, so that no shield takes it: `shields.certify(plant, L, K)` proves the same set and gain, if it can be proved.
 
-    Args:
-        plant: The plant with its bounds.
-        dkappa: Grid step of kappa, > 0.
-        drho: Grid step of rho, > 0.
-        search: "first" or "largest".
+    Attributes:
+        L: Shape of the ellipsoid, (n, n) [squares of the states' units].
+        K: Gain of u = K x_hat, shape (m, n) [input per state].
+        kappa: Contraction factor.
+        rho: Bound on the condition number of L.
+        epsilon: Bound on the squared state error of Theorem 3.
+        epsilon_up: Bound on the squared uplink error of Theorem 2.
+        fingerprint: Fingerprint of the plant that it belongs to.
+        provenance: How it was made; it proves nothing.
 
     Raises:
-        Infeasible: If OP has no solution on the grid that meets (C1)-(C7) exactly.
-        ValueError: If an argument is out of range, or the plant has bounds that the paper's theorems do not know.
+        CertificateError: If a field is of the wrong kind.
     """
-    if unknown := unknown_bounds(plant):
-        raise ValueError(
-            f"method 'paper' knows gamma and covariances alone, not {' and '.join(unknown)}: use method 'certified'"
-        )
-    free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
-    if free:
-        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box", "S", free)
-    provenance = {"search": search, "dkappa": dkappa, "drho": drho}
 
-    def meets_constraints(solution: OPSolution) -> bool:
-        conditions = paper_conditions(_certificate(plant, solution, provenance), plant)
-        return all(condition.holds for condition in conditions)
+    L: np.ndarray
+    K: np.ndarray
+    kappa: float
+    rho: float
+    epsilon: float
+    epsilon_up: float
+    fingerprint: str
+    provenance: dict[str, Any] = field(default_factory=dict)
 
-    try:
-        solution = search_grid(plant, dkappa=dkappa, drho=drho, search=search, accept=meets_constraints)
-    except LookupError:
-        raise _diagnosis(plant) from None
-    return _certificate(plant, solution, provenance)
+    def __post_init__(self) -> None:
+        try:
+            n = len(as_matrix(self.L, (None, None), "L"))
+            object.__setattr__(self, "L", as_matrix(self.L, (n, n), "L"))
+            object.__setattr__(self, "K", as_matrix(self.K, (None, n), "K"))
+            for name in ("kappa", "rho", "epsilon", "epsilon_up"):
+                object.__setattr__(self, name, as_number(getattr(self, name), name))
+        except (TypeError, ValueError) as error:
+            raise CertificateError(f"not a certificate: {error}") from error
+        self._make_arrays_read_only()
 
+    @property
+    def ellipsoid(self) -> Ellipsoid:
+        """The ellipsoid E(L)."""
+        return Ellipsoid(self.L)
 
-def _certificate(plant: LinearPlant, solution: OPSolution, provenance: dict[str, Any]) -> Certificate:
-    """Returns the certificate of a solution of OP, not yet verified."""
-    return Certificate(
-        L=solution.L,
-        K=solution.K,
-        method="paper",
-        fingerprint=plant.fingerprint,
-        kappa=solution.bounds.kappa,
-        rho=solution.bounds.rho,
-        epsilon=solution.bounds.epsilon,
-        epsilon_up=solution.bounds.epsilon_up,
-        provenance={
-            "source": "Liu et al. Definition 4 and Algorithm 1",
-            **provenance,
-            "alpha": solution.bounds.alpha,
-            "guarantee": "the paper's own: invariance if e'e <= epsilon at every step",
-        },
-    )
-
-
-def _diagnosis(plant: LinearPlant) -> Infeasible:
-    """Returns the exception that says which constraint binds, by how much, and what would be feasible."""
-    scan = FeasibilityScan(plant)
-    try:
-        best = scan.best(plant)
-    except LookupError as error:
-        return Infeasible(f"OP is infeasible: {error}", "C1", np.inf)
-    full = scan.full_ratio(plant) if best.ratio >= 1.0 else best.ratio
-    if best.ratio >= 1.0 > full:
-        return Infeasible(
-            f"OP is infeasible, the input limit with the communication error (C4)-(C6) binds: with it the largest "
-            f"lambda_min(L)/alpha found is {full:.3g} (without it {best.ratio:.3g}) and must be at least 1",
-            "C5",
-            1.0 - full,
-        )
-    if full >= 1.0:
-        return Infeasible(
-            f"OP has no solution on this grid, but has one near kappa = {best.kappa:.3f}, rho = {best.rho:.3f}: use "
-            "smaller steps dkappa and drho",
-            "grid",
-            0.0,
-        )
-    gamma, noise, scale = largest_gamma(scan, plant), largest_noise_scale(scan, plant), largest_scale(scan, plant)
-    return Infeasible(
-        f"OP is infeasible, (C2) binds: over the whole domain the largest lambda_min(L)/alpha is {best.ratio:.3g} (at "
-        f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible with "
-        f"gamma, Q and P0 all scaled by {scale:.3g}. {_tolerated(gamma, noise)}",
-        "C2",
-        1.0 - best.ratio,
-        {
-            "ratio": best.ratio,
-            "kappa": best.kappa,
-            "rho": best.rho,
-            "largest_gamma": gamma,
-            "largest_noise_scale": noise,
-            "largest_scale": scale,
-        },
-    )
-
-
-def _tolerated(gamma: float, noise: float) -> str:
-    by_gamma = f"enough to lower gamma to {gamma:.3g}" if gamma > 0.0 else "not enough to lower gamma, even to 0"
-    by_noise = f"enough to scale Q by {noise:.3g}" if noise > 0.0 else "not enough to lower Q, even to 0"
-    return f"With Q unchanged it is {by_gamma}; with gamma unchanged it is {by_noise}"
+    def __str__(self) -> str:
+        m, n = self.K.shape
+        widths = ", ".join(f"{width:.4g}" for width in np.sqrt(np.diag(self.L)))
+        rows = [
+            ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
+            ("set", f"x'Mx <= 1, that reaches |x_i| <= {widths}"),
+            ("constants", f"kappa {self.kappa:.4g}, rho {self.rho:.4g}, epsilon {self.epsilon:.4g}"),
+            ("guarantee", "the paper's own: invariance if e'e <= epsilon at every step"),
+        ]
+        return table("Certificate of OP and Algorithm 1 of Liu et al. (shields.paper.verify checks it)", rows)

@@ -8,8 +8,10 @@ from fractions import Fraction
 import numpy as np
 
 from ncs_gym import LinearPlant
-from shields.certificate import Certificate
+from ncs_gym.validation import own_error_state
 from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
+from shields.paper.certificate import PaperCertificate
+from shields.verification import Report
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.rational_matrix import Matrix, add, multiply, quadratic, rational, scale, subtract, transpose
 
@@ -18,8 +20,22 @@ from shields.verification.rational_matrix import Matrix, add, multiply, quadrati
 _ROUNDING = Fraction(1, 10**12)
 
 
-def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Yields (C1)-(C7) for a certificate of method "paper".
+@own_error_state
+def verify(certificate: PaperCertificate, plant: LinearPlant) -> Report:
+    """Returns whether the constraints (C1)-(C7) of OP hold for a certificate and a plant, in exact arithmetic.
+
+    Raises:
+        ValueError: If an argument is of another kind.
+    """
+    if not isinstance(certificate, PaperCertificate) or not isinstance(plant, LinearPlant):
+        kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
+        raise ValueError(f"shields.paper.verify takes a PaperCertificate and a LinearPlant, got {kinds}")
+    belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
+    return Report((belongs, *_conditions(certificate, plant)))
+
+
+def _conditions(certificate: PaperCertificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Yields (C1)-(C7).
 
     U and tau are eliminated: (C4)-(C6) can be met for input i exactly if
     u_max^2 / 2 - K_i L K_i' - |K_i L|^2 eps_up / alpha^2 >= 0.
@@ -31,14 +47,13 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     if unknown := unknown_bounds(plant):
         yield flag(f"bounds: the paper's theorems do not know {' and '.join(unknown)}", False)
         return
-    constants = certificate.constants()
-    kappa, rho = Fraction(constants.kappa), Fraction(constants.rho)
+    kappa, rho = Fraction(certificate.kappa), Fraction(certificate.rho)
     inside = kappa > 0 and rho >= 1 and 1 - kappa * rho >= SMALLEST_GAP
     yield flag("0 < kappa, 1 <= rho, kappa rho < 1", inside)
     if not inside:
         return
-    bounds = PaperModel(plant).at(constants.kappa, constants.rho)
-    stated = np.array([constants.epsilon_up, constants.epsilon])
+    bounds = PaperModel(plant).at(certificate.kappa, certificate.rho)
+    stated = np.array([certificate.epsilon_up, certificate.epsilon])
     agree = np.allclose(stated, [bounds.epsilon_up, bounds.epsilon], rtol=1e-9, atol=0.0)
     yield flag("eps_up and eps are those of Theorems 2 and 3", bool(agree))
     L, K = rational(certificate.L), rational(certificate.K)

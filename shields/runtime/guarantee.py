@@ -23,7 +23,6 @@ LARGE_ERROR = "the error ellipsoid is not inside the certified one"
 OLD_SAMPLE = "the newest sample is older than the contract allows"
 FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
 UNUSABLE = "there is no usable estimate or error shape"
-NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 LEFT_MODEL = "the state is not known to have stayed where the bound of the linear model's remainder holds"
 LATE_INPUT = "the downlink broke its contract: an input decided earlier was not applied"
@@ -33,7 +32,7 @@ UNKNOWN_START = "the samples do not yet tell where the state is"
 NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies what is decided"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
-    "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
+    "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NOT_KNOWN_INSIDE,
     LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED, NOT_FINITE,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
@@ -109,7 +108,6 @@ class GuaranteeMonitor:
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * plant.half_widths / (2.0 if self._input_delay else 1.0)
-        self._has_error_set = certificate.Sigma is not None
         # Of the newest sample at present, while the contract of the certificate holds.
         self._largest_age = np.inf if certificate.contract is None else certificate.contract.max_age - self._input_delay
         self._is_local = plant.remainder is not None
@@ -183,8 +181,6 @@ class GuaranteeMonitor:
         The age of the newest sample used tells a broken contract from other large errors.
         """
         reason = state.broken
-        if not self._has_error_set:
-            reason = _first(reason, True, NO_ERROR_SET)
         if not self._is_promised:
             reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
         reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)

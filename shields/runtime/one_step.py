@@ -347,8 +347,7 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
     extent = np.sqrt(np.diag(certificate.L))
     if certificate.polytope is not None:  # anywhere in the box: x'C'Cx is at most the number of its rows there
         extent = np.maximum(extent, len(plant.box_rows) ** 0.5 * plant.half_widths)
-    if len(certificate.error_shapes):
-        extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
+    extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
     error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
     if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
         raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")

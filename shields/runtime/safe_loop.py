@@ -195,7 +195,7 @@ class SafeLoop:
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
             ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
-            ("contract", contract_text(certificate.method, self._contract, self._input_delay)),
+            ("contract", contract_text(self._contract, self._input_delay)),
             ("downlink", f"inputs take effect {delay} after the decision" if self._input_delay else ""),
             ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
             ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),

@@ -74,34 +74,26 @@ def synthesize(
     safe_set: str | None = None,
     search_gain: bool = False,
     progress: Progress | None = None,
-    dkappa: float = 0.02,
-    drho: float = 0.05,
-    search: str = "first",
     candidates: Sequence[Certificate] = (),
 ) -> Certificate:
     """Returns a verified certificate.
 
-    Method "certified" (docs/shield_proof.md) seeks the largest ellipsoid with hard bounds, and the polytope around it.
-    Where there is no ellipsoid, a polytope alone is sought: it bears larger disturbances and errors. Method "paper"
-    solves OP of Liu et al. as printed with their Algorithm 1; its certificate carries no error set (docs/paper.md).
+    It seeks the largest ellipsoid with hard bounds, and the polytope around it (docs/shield_proof.md). Where there is
+    no ellipsoid, a polytope alone is sought: it bears larger disturbances and errors.
 
     Args:
-        plant: The plant with its bounds, Schur stable for "certified" without a contract.
-        method: "certified" or "paper".
-        contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
+        plant: The plant with its bounds, Schur stable without a contract.
+        method: "certified"; the published method is `shields.paper.synthesize`.
+        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
         safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
-            time the ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper"
-            has an ellipsoid.
+            time the ellipsoid stays, and the printed certificate says why. None is "polytope".
         search_gain: Also seek the gain whose polytope is the largest, which takes about as long again, longer for
-            polytopes of many rows. That gain keeps the polytope alone ("certified").
-        progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
-        dkappa: Grid step of kappa ("paper").
-        drho: Grid step of rho ("paper").
-        search: "first" feasible grid point, as printed, or "largest" volume over the grid ("paper").
+            polytopes of many rows. That gain keeps the polytope alone.
+        progress: Called with a line of text per stage: what is sought, and the volume reached so far.
         candidates: Certificates of tighter problems (closer limits, larger bounds, an older age, a coarser
             quantization). The search is local; no set that one of them proves here is larger than the result's, so that
-            more room is never less ("certified").
+            more room is never less.
 
     Raises:
         Infeasible: If no certificate is found; it names the binding condition and the shortfall.
@@ -110,26 +102,15 @@ def synthesize(
     """
     if not isinstance(plant, LinearPlant):
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
-    if not (isinstance(method, str) and method in ("certified", "paper")):
-        raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
+    if method != "certified":
+        raise ValueError(f"method must be 'certified' (the paper's is shields.paper.synthesize), got {shown(method)}")
     if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
-    if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
-        raise ValueError("candidates must be certificates of method 'certified'")
+    if not all(isinstance(each, Certificate) for each in candidates):
+        raise ValueError("candidates must be certificates")
     as_flag(search_gain, "search_gain")
-    if method == "paper" and (safe_set == "polytope" or search_gain):
-        raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if safe_set == "ellipsoid" and search_gain:
         raise ValueError("search_gain is for polytopes: the search for an ellipsoid finds its gain")
-    if method == "paper":
-        from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
-
-        certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
-        holds = _is_certifiable(plant, certificate.L, certificate.K)
-        description = _description(plant, certificate.L, _volume(plant, certificate.L)) | {
-            "exact_conditions_hold": holds
-        }
-        return replace(certificate, provenance=certificate.provenance | description)
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
@@ -153,7 +134,7 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
     the printed certificate, says why.
 
     Args:
-        certificate: A verified one of method "certified".
+        certificate: A verified one.
         plant: Its plant.
         progress: Called with a line of text now and then.
 
@@ -184,7 +165,7 @@ def with_largest_polytope(
     provenance.
 
     Args:
-        certificate: A verified one of method "certified".
+        certificate: A verified one.
         plant: Its plant.
         progress: Called with a line of text now and then.
 
@@ -298,7 +279,7 @@ def carried_over(certificate: Certificate, plant: LinearPlant, contract: Channel
     its ellipsoid and gain are proved anew, with this plant's error sets; where its gain keeps a polytope alone, that.
 
     Args:
-        certificate: A verified one of method "certified".
+        certificate: A verified one.
         plant: The plant.
         contract: What the channel promises; None for nothing.
     """
@@ -383,14 +364,6 @@ def _design_at(
     best, _ = best_multipliers(problem, problem.error_shapes, scaled_L, scaled_K, multipliers)
     inputs = best_input_multipliers(problem.error_shapes, scaled_L, scaled_K)
     return CandidateDesign(scaled_L, scaled_K, best, inputs, float(np.linalg.slogdet(scaled_L)[1]))
-
-
-def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
-    """Returns whether the certified method's conditions hold for a set and gain, as far as multipliers are found."""
-    try:
-        return certify(plant, L, K) is not None
-    except Infeasible:
-        return False
 
 
 def _certificates(
@@ -649,7 +622,6 @@ def _of_the_problem(plant: LinearPlant, problem: DesignProblem, errors: ErrorSet
         "rounding": problem.rounding,
         "updates": _updates(errors),
         "between_samples": plant.between_samples,
-        "method": "certified",
         "fingerprint": plant.fingerprint,
     }
 

@@ -57,8 +57,8 @@ class Feedback(NamedTuple):
 
 
 def feedback_of(certificate: Certificate) -> Feedback:
-    """Returns the fallback of a certificate of method "certified"."""
-    return Feedback(certificate.K, certificate.error_shapes, certificate.disturbances()[0])
+    """Returns the fallback of a certificate."""
+    return Feedback(certificate.K, certificate.error_shapes, certificate.D)
 
 
 def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:

@@ -68,7 +68,7 @@ def _closed_loop_conditions(
     """Checks (B), and (PB) if there is a polytope: with u = K x_hat every point of the grid is inside."""
     rows, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box_rows)
     assert rows is not None
-    L, K, D = rational(certificate.L), rational(certificate.K), rational(certificate.disturbances()[0])
+    L, K, D = rational(certificate.L), rational(certificate.K), rational(certificate.D)
     errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
     limits, faces = [Fraction(float(limit)) for limit in plant.u_max], None if polytope is None else polytope.rows
     G = None if faces is None else rational(faces)

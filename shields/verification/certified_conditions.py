@@ -49,7 +49,7 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
 
 
 def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
-    proofs, (_, rounding) = certificate.proofs, certificate.disturbances()
+    proofs, rounding = certificate.proofs, certificate.rounding
     fractions = [proof.rate for proof in proofs]
     fractions += [mu for proof in proofs if proof.inputs is not None for mu in proof.inputs.tolist()]
     if certificate.updates is not None:
@@ -75,7 +75,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     weight = rational(plant.relative_weight)
     required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
     required = _with_declared(required, plant.remainder_bound, weight)
-    bound, (D, _) = rational(plant.disturbance.shape_matrix), certificate.disturbances()
+    bound, D = rational(plant.disturbance.shape_matrix), certificate.D
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(D), bound))
     identity = rational(np.eye(plant.p))
@@ -113,7 +113,7 @@ def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
 
 def _error_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (E0) and (E1), or (C0), (C1) and (C2): the estimation error is always in the set of its age."""
-    D, A = rational(certificate.disturbances()[0]), rational(plant.A)
+    D, A = rational(certificate.D), rational(plant.A)
     shapes = [rational(proof.Sigma) for proof in certificate.proofs]
     next_shapes = [rational(shape) for shape in certificate.next_error_shapes]
     is_by_age = certificate.updates is not None
@@ -153,7 +153,7 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
         for i, row in enumerate(certificate.polytope.rows):
             yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", 1 - quadratic(rational(row), L))
         return
-    BK, (D, s) = multiply(B, K), certificate.disturbances()
+    BK, D, s = multiply(B, K), certificate.D, certificate.rounding
     D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))
     closed_loop = congruence(add(rational(plant.A), BK), L)
     for j, row in enumerate(plant.box_rows):

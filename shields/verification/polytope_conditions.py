@@ -47,7 +47,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
         return
     G, B, K = rational(rows), rational(plant.B), rational(certificate.K)
     next_rows = multiply(G, add(rational(plant.A), multiply(B, K)))
-    pushed, D = multiply(G, B), rational(certificate.disturbances()[0])
+    pushed, D = multiply(G, B), rational(certificate.D)
     errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
     limits = [Fraction(float(limit)) for limit in plant.u_max]
     multipliers = polytope.multipliers

@@ -9,7 +9,6 @@ from ncs_gym import LinearPlant
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.errors import CertificateError
-from shields.paper.conditions import paper_conditions
 from shields.verification.certified_conditions import certified_conditions
 from shields.verification.conditions import Condition, flag
 
@@ -57,8 +56,7 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
     The conditions are (E0), (E1), (I), (S), (U) of docs/shield_proof.md, and that D, N and r0^2 I contain what
-    its "Setting" says they contain; where there is a polytope (P) and (PU) of docs/shield_proof.md, too. For a
-    certificate of method "paper" they are the constraints of OP (docs/paper.md).
+    its "Setting" says they contain; where there is a polytope (P) and (PU) of docs/shield_proof.md, too.
     Neither a tolerance nor a solver nor a float decides; the margins are for people.
 
     Args:
@@ -71,9 +69,8 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
         kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
-    conditions = paper_conditions if certificate.method == "paper" else certified_conditions
     belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
-    return Report((belongs, *conditions(certificate, plant)))
+    return Report((belongs, *certified_conditions(certificate, plant)))
 
 
 # Digests of the certificates and plants, as they were then, that have been verified in this process.

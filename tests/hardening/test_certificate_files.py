@@ -104,7 +104,7 @@ def forged(content, path):
     """The certificate in a file with a fitting checksum; None if it is refused."""
     text = json.dumps(content)
     literal = json.loads(text, parse_float=str, parse_int=str)
-    path.write_text(json.dumps({"format": "ncs-gym certificate 2", "sha256": digest(literal), "certificate": content}))
+    path.write_text(json.dumps({"format": "ncs-gym certificate 3", "sha256": digest(literal), "certificate": content}))
     return loaded_from(path)
 
 
@@ -138,7 +138,7 @@ def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, dat
 @examples(30)
 def test_documents_of_any_structure_are_refused(tmp_path_factory, extra):
     path = tmp_path_factory.getbasetemp() / "any.json"
-    for document in (extra, [extra], {"format": "ncs-gym certificate 2"} | extra, {"certificate": extra, "sha256": ""}):
+    for document in (extra, [extra], {"format": "ncs-gym certificate 3"} | extra, {"certificate": extra, "sha256": ""}):
         path.write_text(json.dumps(document))
         with pytest.raises(CertificateError):
             Certificate.load(path)

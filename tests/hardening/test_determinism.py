@@ -26,7 +26,7 @@ def assert_seeds_decide(steps, hashes):
         range(len(hashes)), True
     )
     # What has a seed depends on it.
-    assert first.keys() - other.keys() == {"certified", "contract", "paper"}
+    assert first.keys() - other.keys() == {"certified", "contract"}
     assert not {name for name in other if first[name] == other[name]}
 
 

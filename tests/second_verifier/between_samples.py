@@ -88,7 +88,7 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[
     """Checks (B), and (PB) if there is a polytope."""
     grid, polytope, (k, n) = plant.grid_rows, certificate.polytope, plant.box_rows.shape
     assert grid is not None
-    L, K, D = matrix(certificate.L), matrix(certificate.K), matrix(certificate.disturbances()[0])
+    L, K, D = matrix(certificate.L), matrix(certificate.K), matrix(certificate.D)
     errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
     limits = [number(limit) for limit in plant.u_max]
     G = None if polytope is None else matrix(polytope.rows).tolist()

@@ -38,7 +38,7 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield from ranges
     if not all(condition.holds for condition in ranges):
         return
-    D = matrix(certificate.disturbances()[0])
+    D = matrix(certificate.D)
     yield from bound_conditions(D, certificate.updates, plant)
     yield from _error_conditions(certificate, D, plant)
     yield from _safe_set_conditions(certificate, D, plant)
@@ -50,7 +50,7 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
 def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
     """Returns whether all matrices and multipliers are as many and as large as the plant needs."""
     n, m, p, updates = plant.n, plant.m, plant.p, certificate.updates
-    shapes = [(certificate.L, (n, n)), (certificate.K, (m, n)), (certificate.disturbances()[0], (n, n))]
+    shapes = [(certificate.L, (n, n)), (certificate.K, (m, n)), (certificate.D, (n, n))]
     for proof in certificate.proofs:
         shapes.append((proof.Sigma, (n, n)))
         if proof.shares is not None and proof.inputs is not None:
@@ -67,7 +67,7 @@ def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
 
 def _range_conditions(certificate: Certificate) -> Iterator[Condition]:
     """Checks that every multiplier lies where the inequality that uses it is true."""
-    s = certificate.disturbances()[1]
+    s = certificate.rounding
     between = [] if certificate.updates is None else certificate.updates.shares.tolist()
     between += [proof.rate for proof in certificate.proofs]
     between += chain.from_iterable(proof.inputs.tolist() for proof in certificate.proofs if proof.inputs is not None)
@@ -121,7 +121,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
         return
     for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
-    BK, s = B * matrix(certificate.K), number(certificate.disturbances()[1])
+    BK, s = B * matrix(certificate.K), number(certificate.rounding)
     moved = mapped(matrix(plant.A) + BK, L)
     # m B diag(r^2) B' is a sum over the columns of B; D_u times s is (1+s) (s D + that).
     rounding = 0 * D

@@ -9,7 +9,7 @@ import numpy as np
 from flint import arb, ctx, fmpq, fmpq_mat
 
 from ncs_gym import LinearPlant
-from shields.certificate import Certificate
+from shields.paper import PaperCertificate
 from shields.verification.conditions import Condition
 from tests.second_verifier.bounds import keeps_enough
 from tests.second_verifier.exact import (
@@ -30,7 +30,7 @@ _SMALLEST_GAP = 1e-9
 _STATED = fmpq(1, 10**9)
 
 
-def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+def paper_conditions(certificate: PaperCertificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (C1)-(C7); U and tau are eliminated from (C4)-(C6) as docs/paper.md says."""
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
     yield is_so("shapes: L (n, n), K (m, n)", fits)
@@ -40,22 +40,21 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
         if bound is not None and np.any(bound.shape_matrix):
             yield is_so("bounds: the paper's theorems know gamma and covariances alone", False)
             return
-    stated = certificate.constants()
-    kappa, rho = number(stated.kappa), number(stated.rho)
+    kappa, rho = number(certificate.kappa), number(certificate.rho)
     inside = kappa > 0 and rho >= 1 and 1 - kappa * rho >= number(_SMALLEST_GAP)
     yield is_so("0 < kappa, 1 <= rho, kappa rho < 1", bool(inside))
     if not inside:
         return
     with ctx.workprec(PRECISION):
         epsilon_up, epsilon, alpha = _constants(kappa, rho, plant)
-        agree = _is_near(stated.epsilon_up, epsilon_up) and _is_near(stated.epsilon, epsilon)
+        agree = _is_near(certificate.epsilon_up, epsilon_up) and _is_near(certificate.epsilon, epsilon)
         yield is_so("eps_up and eps are those of Theorems 2 and 3", agree)
     yield keeps_enough("chi-square: no more than delta is truncated", plant.process_noise, plant)
     yield from _set_conditions(certificate, kappa, rho, epsilon_up, alpha, plant)
 
 
 def _set_conditions(
-    certificate: Certificate, kappa: Any, rho: Any, epsilon_up: Any, alpha: Any, plant: LinearPlant
+    certificate: PaperCertificate, kappa: Any, rho: Any, epsilon_up: Any, alpha: Any, plant: LinearPlant
 ) -> Iterator[Condition]:
     """Checks the constraints on L and K, given enclosures of the constants."""
     L, K, n = matrix(certificate.L), matrix(certificate.K), plant.n

@@ -40,7 +40,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     if not leads or widths is None:
         return
     G, B, K = matrix(polytope.rows), matrix(plant.B), matrix(certificate.K)
-    D = matrix(certificate.disturbances()[0])
+    D = matrix(certificate.D)
     closed = matrix(plant.A) + B * K
     Lambda = matrix(polytope.multipliers[: r + plant.m])
     rest = fmpq_mat((G * closed).tolist() + K.tolist()) - Lambda * G

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from ncs_gym import LinearPlant
 from ncs_gym.validation import own_error_state
 from shields import Certificate, Report
+from shields.paper import PaperCertificate
 from shields.verification.conditions import Condition
 from tests.second_verifier.certified import certified_conditions
 from tests.second_verifier.exact import is_so
@@ -16,11 +17,14 @@ from tests.second_verifier.paper import paper_conditions
 
 
 @own_error_state
-def verify_again(certificate: Certificate, plant: LinearPlant) -> Report:
-    """What `shields.verify` returns, judged without its code."""
+def verify_again(certificate: Certificate | PaperCertificate, plant: LinearPlant) -> Report:
+    """What `shields.verify` or `shields.paper.verify` returns, judged without its code."""
     return Report(tuple(_conditions(certificate, plant)))
 
 
-def _conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+def _conditions(certificate: Certificate | PaperCertificate, plant: LinearPlant) -> Iterator[Condition]:
     yield is_so("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
-    yield from (paper_conditions if certificate.method == "paper" else certified_conditions)(certificate, plant)
+    if isinstance(certificate, PaperCertificate):
+        yield from paper_conditions(certificate, plant)
+    else:
+        yield from certified_conditions(certificate, plant)

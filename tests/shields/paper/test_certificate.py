@@ -5,24 +5,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import shields
 from ncs_gym import LinearPlant, truck_trailer
-from shields import Infeasible, SafetyShield, certify, synthesize
+from shields import Infeasible, SafetyFilter, SafetyShield, certify, verify
+from shields.paper import synthesize
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_scale
-from shields.runtime.guarantee import NO_ERROR_SET
-from tests.verdicts import verified
+from tests.verdicts import broken, verified
 
 SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 
 
 @pytest.fixture(scope="module")
 def paper():
-    return synthesize(SMALL, method="paper")
+    return synthesize(SMALL)
 
 
-def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
-    assert paper.method == "paper"
-    assert paper.Sigma is paper.error_set is paper.multipliers is None
+def test_certificate_carries_the_papers_constants(paper):
     bounds = PaperModel(SMALL).at(paper.kappa, paper.rho)
     assert (paper.epsilon, paper.epsilon_up) == (bounds.epsilon, bounds.epsilon_up)
     assert verified(paper, SMALL).valid
@@ -38,15 +37,14 @@ def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
 )
 def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search, steps):
     plant = truck_trailer(**bounds)
-    certificate = synthesize(plant, method="paper", search=search, dkappa=steps[0], drho=steps[1])
+    certificate = synthesize(plant, search=search, dkappa=steps[0], drho=steps[1])
     report = verified(certificate, plant)
     assert report.valid, str(report)
     assert {f"(C{i})" for i in (1, 2, 3, 7)} <= {c.name.split()[0] for c in report.conditions}
 
 
-def test_exact_conditions_are_checked_separately(paper):
-    assert paper.provenance["exact_conditions_hold"] is True
-    assert "e'e <= epsilon" in paper.provenance["guarantee"]
+def test_exact_conditions_may_be_proved_for_the_same_set(paper):
+    assert "e'e <= epsilon" in str(paper)
     stronger = certify(SMALL, paper.L, paper.K)
     assert stronger is not None
     assert verified(stronger, SMALL).valid
@@ -54,20 +52,21 @@ def test_exact_conditions_are_checked_separately(paper):
     assert certify(SMALL, paper.L, 2.5 * paper.K) is None
 
 
-def test_shield_with_a_paper_certificate_works_but_is_never_guaranteed(paper):
-    env = SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
-    _, info = env.reset(seed=0)
-    assert info["shield_reason"] == NO_ERROR_SET
-    for _ in range(50):
-        *_, info = env.step(np.ones(1, np.float32))
-        assert not info["shield_guaranteed"]
-        assert info["state"] @ paper.M @ info["state"] <= 1.0
+def test_no_shield_takes_a_certificate_of_the_paper(paper):
+    with pytest.raises(ValueError, match="takes a Certificate"):
+        SafetyFilter(paper, SMALL)
+    with pytest.raises(ValueError, match="a Certificate, its document or path"):
+        SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
+    with pytest.raises(ValueError, match="takes a Certificate and a LinearPlant"):
+        verify(paper, SMALL)
+    with pytest.raises(ValueError, match=r"shields\.paper\.synthesize"):
+        shields.synthesize(SMALL, "paper")
 
 
 @pytest.mark.slow
 def test_printed_parameters_are_infeasible_and_the_reason_has_figures():
     with pytest.raises(Infeasible, match=r"\(C2\) binds") as caught:
-        synthesize(truck_trailer(), method="paper", dkappa=0.05, drho=0.1)  # proven over the whole domain
+        synthesize(truck_trailer(), dkappa=0.05, drho=0.1)  # proven over the whole domain
     error = caught.value
     assert error.binding == "C2"
     assert error.shortfall == pytest.approx(1.0 - 0.034, abs=5e-4)
@@ -89,14 +88,14 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
             gamma=factor * 5e-4, process_noise_cov=factor * 1e-4 * np.eye(2), initial_cov=factor * 1e-4 * np.eye(2)
         )
 
-    assert verified(synthesize(scaled(0.97), "paper", dkappa=0.005, drho=0.01), scaled(0.97)).valid
+    assert verified(synthesize(scaled(0.97), dkappa=0.005, drho=0.01), scaled(0.97)).valid
     with pytest.raises(Infeasible):
-        synthesize(scaled(1.05), "paper", dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
+        synthesize(scaled(1.05), dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
 
 
 def test_too_coarse_a_grid_says_so():
     with pytest.raises(Infeasible, match="use smaller steps") as caught:
-        synthesize(SMALL, method="paper", dkappa=0.4, drho=1.0)
+        synthesize(SMALL, dkappa=0.4, drho=1.0)
     assert caught.value.binding == "grid"
 
 
@@ -111,7 +110,7 @@ def test_units_of_the_state_change_nothing(unit, paper):
         measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,
         initial_cov=SMALL.initial_cov * unit**2,
     )
-    certificate = synthesize(scaled, method="paper")
+    certificate = synthesize(scaled)
     assert verified(certificate, scaled).valid
     assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
     np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
@@ -126,13 +125,13 @@ def one_state(A, B, u_max, gamma, Q, P0):
 @pytest.mark.slow
 def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified():
     with pytest.raises(Infeasible):
-        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), method="paper", dkappa=0.05, drho=0.1)
+        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), dkappa=0.05, drho=0.1)
 
 
 @pytest.mark.slow
 def test_an_input_limit_that_binds_is_named():
     with pytest.raises(Infeasible, match="input limit") as caught:
-        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), method="paper", dkappa=0.05, drho=0.1)
+        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), dkappa=0.05, drho=0.1)
     assert caught.value.binding == "C5"
     assert 0.0 < caught.value.shortfall < 1.0
 
@@ -140,9 +139,28 @@ def test_an_input_limit_that_binds_is_named():
 def test_no_uncertainty_at_all_is_no_division_by_zero():
     zero = np.zeros((2, 2))
     plant = truck_trailer(gamma=0.0, process_noise_cov=zero, initial_cov=zero)
-    assert verified(synthesize(plant, method="paper"), plant).valid
+    assert verified(synthesize(plant), plant).valid
 
 
 @pytest.mark.parametrize("kappa", [float(np.nextafter(1.0, 0.0)), 1.0 - 1e-12, 0.0, -1.0, 1e70])
 def test_constants_at_the_edge_are_rejected_without_an_error(paper, kappa):
     assert not verified(replace(paper, kappa=kappa, rho=1.0), SMALL).valid
+
+
+# What is changed, and the condition that notices.
+CHANGES = [
+    ("(C3)", lambda c: replace(c, L=1.001 * c.L)),
+    ("(C2)", lambda c: replace(c, L=1e-6 * c.L)),
+    ("(C7)", lambda c: replace(c, L=c.L @ np.diag([1.0, 0.9]))),
+    ("(C1)", lambda c: replace(c, K=c.K + 3.0)),
+    ("(C4)-(C6)", lambda c: replace(c, K=c.K + 30.0)),
+    ("eps_up and eps", lambda c: replace(c, kappa=0.7)),
+    ("eps_up and eps", lambda c: replace(c, epsilon=0.1 * c.epsilon)),
+    ("0 < kappa, 1", lambda c: replace(c, rho=2.0)),
+    ("plant", lambda c: replace(c, fingerprint="0" * 64)),
+]
+
+
+@pytest.mark.parametrize(("condition", "change"), CHANGES)
+def test_changed_part_is_noticed_by_the_right_condition(paper, condition, change):
+    assert any(each.startswith(condition) for each in broken(change(paper), SMALL))

@@ -5,7 +5,7 @@ import pytest
 
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
-from shields import Certificate, Decision, SafetyFilter
+from shields import Decision, SafetyFilter
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
@@ -22,8 +22,6 @@ class Reference:
     def reason(self):
         if self.broken:
             return self.broken
-        if self.shield.certificate.Sigma is None:
-            return proof.NO_ERROR_SET
         if not self.inside:
             return proof.NOT_KNOWN_INSIDE
         return "" if self.certified else proof.LARGE_ERROR
@@ -105,21 +103,9 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
             assert reasons[e] == reference.reason
             assert EXPLANATIONS[monitor.reasons(states[e])] == reference.reason
         seen |= set(reasons)
-    never = {proof.OLD_SAMPLE, proof.NO_ERROR_SET, proof.LEFT_MODEL, proof.LATE_INPUT, proof.NO_DOWNLINK_CONTRACT}
+    never = {proof.OLD_SAMPLE, proof.LEFT_MODEL, proof.LATE_INPUT, proof.NO_DOWNLINK_CONTRACT}
     never |= {proof.UNKNOWN_START, proof.NOT_CONFIRMED, proof.NOT_FINITE}
     assert seen == set(EXPLANATIONS) - never
-
-
-def test_a_published_certificate_proves_nothing():
-    plant = TRUCKS["4000 kg"]
-    shield, shown = SafetyFilter(certificate_of(plant), plant), {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1}
-    ours = {"L": shield.certificate.L, "K": shield.certificate.K, "fingerprint": plant.fingerprint}
-    object.__setattr__(shield, "certificate", Certificate(method="paper", epsilon_up=0.2, **ours, **shown))
-    monitor = GuaranteeMonitor(shield)
-    report = LoopObservation(np.zeros(2), shield.errors_of(0.1 * certificate_of(plant).Sigma), False)
-    state = monitor.start(True, True, report)
-    assert EXPLANATIONS[monitor.reasons(state)] == proof.NO_ERROR_SET
-    assert EXPLANATIONS[monitor.reasons(state._replace(broken=1))] == EXPLANATIONS[1]
 
 
 @pytest.fixture

@@ -45,9 +45,9 @@ from shields import (
     SafetyFilter,
     SafetyShield,
     VectorSafetyShield,
-    synthesize,
 )
 from shields.nodes import StepClock
+from shields.paper import synthesize as paper_synthesis
 from shields.runtime.one_step import certified_root
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.torch import SafeLayer
@@ -196,7 +196,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     ],
     (lambda: certified_root(np.ones((2, 2))), CertificateError, "too thin"),
     (lambda: certified_root(0.5 * (THIN @ THIN.T + (THIN @ THIN.T).T)), CertificateError, "too thin"),
-    (lambda: synthesize(LOCAL, method="paper"), ValueError, "remainder_bound"),
+    (lambda: paper_synthesis(LOCAL), ValueError, "remainder_bound"),
     # The layer of PyTorch.
     *[
         (partial(lambda *given: SafeLayer(CERTIFICATE, PLANT)(*given), *given), ValueError, words)

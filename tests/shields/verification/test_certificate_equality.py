@@ -102,10 +102,3 @@ def test_strange_provenance_does_not_stop_printing(certificate, junk):
     names = ("volume_of_box_ellipsoid", "share_of_box", "tolerated_scale", "assumptions", "interrupted_at")
     strange = replace(certificate, provenance=dict.fromkeys(names, junk))
     assert "fallback" in str(strange)
-
-
-def test_certificate_of_the_paper_s_method_prints_its_guarantee():
-    paper = Certificate(
-        L=np.eye(2), K=np.ones((1, 2)), method="paper", fingerprint="0", kappa=0.5, rho=1.2, epsilon=0.1, epsilon_up=0.2
-    )
-    assert "never guaranteed" in str(paper)

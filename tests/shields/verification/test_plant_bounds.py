@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import synthesize
+from shields.paper import synthesize as paper_synthesis
 from tests.certificates import certificate_of
 from tests.plants import named
 from tests.shields.verification.test_mutations import replaced
@@ -54,7 +54,7 @@ def test_certificate_belongs_to_its_declared_bounds(designed):
 
 def test_paper_certificate_proves_nothing_of_bounds_that_its_theorems_do_not_know():
     small = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
-    paper = synthesize(small, method="paper")
+    paper = paper_synthesis(small)
     assert verified(paper, small).valid
     for name in BOUNDS:
         plant = replace(small, **{name: 1e-4})

@@ -142,10 +142,10 @@ def test_file_that_says_two_things_of_the_largest_age_is_refused(promised, chang
     _, certificate = promised
     content = certificate.document["certificate"]
     path = tmp_path / "c.json"
-    write_document(path, document_of("certificate", "ncs-gym certificate 2", content))
+    write_document(path, document_of("certificate", "ncs-gym certificate 3", content))
     assert Certificate.load(path) == certificate
     change(content)
-    write_document(path, document_of("certificate", "ncs-gym certificate 2", content))
+    write_document(path, document_of("certificate", "ncs-gym certificate 3", content))
     with pytest.raises(CertificateError, match="wrong kind"):
         Certificate.load(path)
 

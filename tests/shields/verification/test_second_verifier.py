@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
-from shields import synthesize, verify
+from shields import verify
+from shields.paper import synthesize as paper_synthesis
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
 from tests.certificates import certificate_of
 from tests.plants import named
@@ -32,6 +33,7 @@ MAY_IMPORT = {
     "ncs_gym.validation",
     "shields",
     "shields.certificate",
+    "shields.paper",
     "shields.polytope",
     "shields.verification.conditions",
 }
@@ -133,7 +135,7 @@ def test_quantile_a_hair_too_small_is_noticed_by_the_second_verifier(certificate
 
 def test_paper_certificate_is_judged_by_both_up_to_its_boundary():
     plant = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
-    paper = synthesize(plant, method="paper")
+    paper = paper_synthesis(plant)
     assert verified(paper, plant).valid
     for factor in np.geomspace(0.3, 1.1, 40):
         verified(replace(paper, L=factor * paper.L), plant)
