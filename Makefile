@@ -58,8 +58,10 @@ coverage-report: ## that share, of the tests that ran last
 test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks, and examples in processes of their own
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
-# What CI has time for: that the synthesis still gives the certificates of the package.
-SLOW_PART ?= tests/shields/test_certificates_of_package.py
+# What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit and the study as the pages
+# have them, and the same bits in every process.
+SLOW_PART ?= tests/shields/test_certificates_of_package.py tests/experiments/commands/test_audit.py tests/experiments/study \
+	tests/hardening/test_determinism.py
 test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)
 

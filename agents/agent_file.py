@@ -34,7 +34,7 @@ def document_of(content: dict[str, Any]) -> bytes:
 
 
 def require_names(names: Iterable[str]) -> None:
-    """Returns if files of these names may belong to an agent.
+    """Raises unless files of these names may belong to an agent.
 
     Raises:
         AgentError: If a name is none of `AGENT_FILES`; it may lead out of the agent's folder.

@@ -132,7 +132,7 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
 
 
 def require_moderate_networks(policy_kwargs: Any) -> None:
-    """Returns if networks of these settings are moderate; whether they are right the library says.
+    """Raises unless networks of these settings are moderate; whether they are right the library says.
 
     Raises:
         ValueError: If they have more than `MOST_WEIGHTS` weights, or a count that is larger than `MOST_OUTPUTS`.

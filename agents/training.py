@@ -130,7 +130,7 @@ def untrained(
 
 
 def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
-    """Returns if `train` can begin with these arguments; it raises what `train` does, before anything is computed."""
+    """Raises what `train` would with these arguments, before anything is computed."""
     _trainable(loop, steps, 0, algorithm, complete_hyperparams(algorithm, hyperparams))[0].close()
 
 

@@ -25,7 +25,7 @@ def install_command(extra: str) -> str:
 
 
 def require_own_packages(*names: str) -> None:
-    """Returns if the packages that Python finds by these names are this project's.
+    """Raises unless the packages that Python finds by these names are this project's.
 
     Args:
         names: Some of `GENERIC_NAMES`.

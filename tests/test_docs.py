@@ -163,6 +163,7 @@ def test_functions_that_architecture_names_exist():
         assert re.search(rf"^\s*(?:def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (name, path)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("page", QUICK_PAGES)
 def test_programs_of_a_page_that_train_nothing_print_what_follows_them(page):
     programs = [

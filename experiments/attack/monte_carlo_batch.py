@@ -149,7 +149,7 @@ class MonteCarloBatch:
         return counts + SafetyCounts(broken_episodes=int(broken.sum()), packets=int(info["packets"].sum()))
 
     def require(self, result: SafetyCounts) -> None:
-        """Returns if counts can be this batch's.
+        """Raises unless counts can be this batch's.
 
         Raises:
             ValueError: If a batch of so many episodes cannot have counted this.

@@ -191,7 +191,7 @@ def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, floa
 
 
 def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> None:
-    """Returns if no case's exact interval lies above its bound.
+    """Raises unless no case's exact interval lies above its bound.
 
     Raises:
         SafetyBroken: If one does: then the bound does not hold, or there is an error of one in forty per case.
@@ -205,7 +205,7 @@ def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, floa
 
 
 def require_safe(total: SafetyCounts, *, looks_ahead: bool) -> None:
-    """Returns if the shield kept what it claims in every step.
+    """Raises unless the shield kept what it claims in every step.
 
     Raises:
         SafetyBroken: If it did not.

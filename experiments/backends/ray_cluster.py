@@ -27,7 +27,7 @@ except Exception as error:
 
 
 def require_answer(address: str) -> None:
-    """Returns if a cluster can be joined; tried in a process of its own, because Ray's attempts have no time limit.
+    """Raises unless a cluster can be joined; tried in a process of its own, because Ray's attempts have no time limit.
 
     Raises:
         ClusterError: If it cannot be joined within `CONNECT_TIMEOUT` and `JOIN_TIMEOUT`.

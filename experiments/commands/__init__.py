@@ -14,7 +14,7 @@ from ncs_gym.installation import install_command
 
 
 def require_extra(extra: str, *packages: str) -> None:
-    """Returns if all packages of an optional dependency are installed.
+    """Raises unless all packages of an optional dependency are installed.
 
     Raises:
         ModuleNotFoundError: If one is missing; the message says what to install.

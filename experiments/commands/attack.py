@@ -79,7 +79,7 @@ def attack(settings: AttackSettings) -> None:
 
 
 def _require_claims(cases: dict[str, AttackCase]) -> None:
-    """Returns if something is claimed of every case."""
+    """Raises unless something is claimed of every case."""
     for name, case in cases.items():
         protocol = downlink_protocol(case.downlink, case.downlink_contract)
         if protocol is not None and protocol.contract is None:

@@ -140,7 +140,7 @@ def _require_own_entries(folder: Path) -> None:
 
 
 def require_place(path: Path | None) -> None:
-    """Returns if a command can write a file, which it finds out before it computes what it would lose.
+    """Raises unless a command can write a file, which it finds out before it computes what it would lose.
 
     Raises:
         OSError: If there is a folder in its place, or no folder to write it in.

@@ -73,7 +73,7 @@ class Run(Protocol):
         ...
 
     def require(self, result: Any) -> None:
-        """Returns if a result of the right type, from a file say, can be the run's.
+        """Raises unless a result of the right type, from a file say, can be the run's.
 
         Raises:
             ValueError: If it has a value that the run cannot have had; the message names it.

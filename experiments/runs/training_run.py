@@ -247,7 +247,7 @@ class TrainingRun:
         )
 
     def require(self, result: RunResult) -> None:
-        """Returns if a result can be this run's.
+        """Raises unless a result can be this run's.
 
         Raises:
             ValueError: If it has a value that the run cannot have had; the message names the first.

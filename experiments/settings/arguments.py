@@ -91,7 +91,7 @@ OptionalStepCount = Annotated[int | None, _argument("{None}|INT")]
 
 
 def require_limits(settings: Any, **limits: float | tuple[float, float]) -> None:
-    """Returns if settings keep their limits, the least value or that and the largest; None keeps all.
+    """Raises unless settings keep their limits, the least value or that and the largest; None keeps all.
 
     Raises:
         ValueError: If one does not, or is infinite or NaN.
@@ -105,7 +105,7 @@ def require_limits(settings: Any, **limits: float | tuple[float, float]) -> None
 
 
 def require_horizon(settings: Any, *modes: str | None) -> None:
-    """Returns if the horizon, if there is one, is in its range and belongs to one of these modes or arms.
+    """Raises unless the horizon, if there is one, is in its range and belongs to one of these modes or arms.
 
     Raises:
         ValueError: If it does not.

@@ -149,7 +149,7 @@ def quoted(page: str, tables: Mapping[str, str]) -> str:
 
 
 def require_marks(page: str) -> None:
-    """Returns if a page quotes tables of a study, and none that there is not.
+    """Raises unless a page quotes tables of a study, and none that there is not.
 
     Raises:
         ValueError: If it does not.

@@ -68,6 +68,7 @@ def everything_in(folder):
     return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("name", NAMES)
 def test_result_that_names_another_file_than_those_of_an_agent_is_refused(name, run, result, tmp_path):
     name, folder = name.replace("/{root}", str(tmp_path)), tmp_path / "a" / "study"
@@ -100,6 +101,7 @@ def test_files_of_other_names_are_not_written(name, run, result, tmp_path, monke
 LINKS = ["runs", "models", "models/shielded-0", "figures", "tensorboard", "channels", "runs/shielded-0.json"]
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize(
     ("command", "name"),
     [*(("compare", name) for name in LINKS), *(("attack", name) for name in ("certificates", "runs"))],

@@ -58,6 +58,7 @@ def setup():
     return loop, certificate_of(loop, safe_set="ellipsoid")
 
 
+@pytest.mark.slow
 def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     settings = CompareSettings(env="Tests/Tight-v0", noise="gaussian", episodes=600)
     run = replace(run_of_arm(settings, *setup, "shielded", 0), policy_kind="zero input")

@@ -43,6 +43,7 @@ def test_what_comes_after_a_broken_contract_is_counted_apart(attacked):
     assert 0.9 < counts.level <= 1.0
 
 
+@pytest.mark.slow
 def test_states_outside_after_a_broken_contract_are_no_failure_and_not_hidden(attacked):
     counts = attacked(Channel(loss=1.0, quantization_step=1e-3))
     assert (counts.exits, counts.violations, counts.broken_episodes, counts.unproved) == (0, 0, 0, 0)
@@ -72,6 +73,7 @@ def test_a_downlink_that_breaks_its_contract_is_counted_apart(attacked):
 STEPS, BREAKS, AGAIN = 200, 50, 80
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("broken", "is_proved", "lapsed", "unproved"),
     [

@@ -443,6 +443,7 @@ def test_the_certificate_of_a_case_fits_its_plant_and_contract():
     assert case.certificate().fingerprint == truck_trailer().fingerprint
 
 
+@pytest.mark.slow
 def test_either_kind_of_safe_set_is_attacked_and_neither_takes_the_certificates_of_the_other(campaign):
     out, again = campaign
     for kind in ("polytope", "ellipsoid"):

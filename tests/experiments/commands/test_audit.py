@@ -56,6 +56,7 @@ EXPECTED = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_every_claim_has_its_verdict_and_figures(claims):
     for claim, (start, verdict, figures) in zip(claims, EXPECTED, strict=True):
         assert claim.claim.startswith(start)
@@ -76,11 +77,13 @@ def test_verdicts_follow_the_numbers():
     assert found["epsilon"].verdict == HOLDS
 
 
+@pytest.mark.slow
 def test_rows_that_do_not_hold_show_a_defect_and_no_others_do(claims):
     for claim in claims:
         assert bool(claim.defect) is (claim.verdict == FAILS), claim.claim
 
 
+@pytest.mark.slow
 def test_defects_are_counted_once(claims):
     found = defects(claims)
     assert list(found.values()) == [[3, 7, 11], [5, 6, 12], [9], [13], [14], [15]]
@@ -93,6 +96,7 @@ def text_at(claims, width, monkeypatch):
     return ncs("audit", COLUMNS=str(width)).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [60, 80, 100])
 def test_text_fits_the_terminal_and_is_complete(claims, width, monkeypatch):
     text = text_at(claims, width, monkeypatch)
@@ -105,6 +109,7 @@ def test_text_fits_the_terminal_and_is_complete(claims, width, monkeypatch):
         assert formula in text  # on one line
 
 
+@pytest.mark.slow
 def test_summary_counts_rows_and_distinct_defects(claims, monkeypatch):
     summary = " ".join(text_at(claims, 100, monkeypatch).split("\n\n")[-1].split())
     assert "Of 18 rows 4 hold (2 of them but for rounding), 10 do not hold, 2 are undecided" in summary
@@ -112,12 +117,14 @@ def test_summary_counts_rows_and_distinct_defects(claims, monkeypatch):
     assert "(rows 5, 6, 12)" in summary
 
 
+@pytest.mark.slow
 def test_text_takes_the_width_of_the_terminal(claims, monkeypatch):
     longest = [max(map(len, text_at(claims, width, monkeypatch).splitlines())) for width in (70, 300)]
     assert 60 < longest[0] <= 70
     assert 90 < longest[1] <= 100
 
 
+@pytest.mark.slow
 def test_command_prints_json_and_writes_it(audit):
     printed, written = audit
     assert printed == written
@@ -131,6 +138,7 @@ def test_printed_numbers_are_nowhere_else_in_the_code():
                 assert not printed.search(path.read_text()), path
 
 
+@pytest.mark.slow
 def test_docs_table_says_what_the_audit_prints_and_nothing_else(claims):
     """Row by row: the verdict, and every number."""
     page = (ROOT / "docs" / "paper.md").read_text()
@@ -143,6 +151,7 @@ def test_docs_table_says_what_the_audit_prints_and_nothing_else(claims):
         assert _numbers(computed), number
 
 
+@pytest.mark.slow
 def test_docs_count_what_the_audit_counts(claims):
     text = " ".join((ROOT / "docs" / "paper.md").read_text().split())
     counts = re.search(r"of (\d+) rows (\d+) hold, (\d+) do not \((\d+) distinct defects\), (\d+) are undecided", text)

@@ -141,6 +141,7 @@ def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tm
         assert (Certificate.load(certificate).contract is None) == (given == ())
 
 
+@pytest.mark.slow
 def test_another_plant_in_the_same_file_is_attacked_anew(tmp_path, without_workers):
     asked = ("--plant", "plant.json", "--mode", "project", "--steps", 1, "--envs", 8, "--out", "c")
     totals = []

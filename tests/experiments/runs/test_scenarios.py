@@ -85,6 +85,7 @@ def test_scenarios_are_stored_beside_the_evaluation_as_trained(certificate, resu
     assert store.load(replace(run, scenarios=ALL[:1])) is None
 
 
+@pytest.mark.slow
 def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
     outside = {
         name: [sum(each.largest_level > 1.0 for each in result.scenarios[scenario]) for scenario in ALL]

@@ -37,6 +37,7 @@ def finished(tmp_path_factory):
         yield settings
 
 
+@pytest.mark.slow
 def test_study_leaves_its_files(finished):
     names = {path.name for path in finished.out.iterdir()}
     assert names >= {"report.html", "results.md", "results.txt", "figures"}
@@ -50,6 +51,7 @@ def test_study_leaves_its_files(finished):
     assert "Report of this comparison" in (finished.out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_table_has_every_episode_of_every_environment_arm_condition_and_run(finished):
     rows = pq.read_table(finished.out / "episodes.parquet").to_pylist()
     assert len({(row["environment"], row["arm"], row["condition"], row["run"]) for row in rows}) == 5 * 3 * 2
@@ -59,6 +61,7 @@ def test_table_has_every_episode_of_every_environment_arm_condition_and_run(fini
     assert not any(row["violating"] for row in shielded)
 
 
+@pytest.mark.slow
 def test_page_quotes_and_figures_are_written_where_they_were_asked_for(finished):
     page = finished.page.read_text()
     for link in ("results-return.png", "results-training.png", "results-runs.png"):
@@ -68,6 +71,7 @@ def test_page_quotes_and_figures_are_written_where_they_were_asked_for(finished)
     assert json.loads(finished.page.with_suffix(".json").read_text())["environments"]
 
 
+@pytest.mark.slow
 def test_all_tables_stand_beside_the_page_that_links_to_them(finished):
     assert "(results.txt)" in finished.page.read_text()
     tables = finished.page.with_suffix(".txt").read_text()
@@ -76,6 +80,7 @@ def test_all_tables_stand_beside_the_page_that_links_to_them(finished):
     assert tables == (finished.out / "results.txt").read_text()
 
 
+@pytest.mark.slow
 def test_finished_runs_are_kept_and_give_the_same_summary(finished, capsys):
     before = (finished.out / "summary.json").read_bytes()
     study(finished)

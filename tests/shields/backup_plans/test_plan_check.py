@@ -196,6 +196,7 @@ def test_indefinite_shapes_leave_no_room(case):
     assert np.isnan(tightening.radius).all()
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
 def test_certified_is_true_in_rational_arithmetic_however_far_out_the_estimate_is(size):
     # Estimates along a direction that A annihilates: products of huge numbers cancel.
@@ -289,6 +290,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(wh
     assert 1.0 - margin - 1e-6 < min(levels) <= max(levels) <= 1.0 - margin
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("where", "step"), [("box", 2), ("box", 3), ("end", 2), ("end", 3)])
 def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, step):
     # A is half of the identity and what its own square annihilates, but for rounding.
@@ -379,6 +381,7 @@ def test_a_state_is_known_to_be_in_the_box_in_rational_arithmetic(far, margin):
     assert 1.0 - margin - 1e-2 < min(levels) <= max(levels) <= 1.0 - margin
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and_thin(steps):
     # Disturbances that do not move on add up tightly, and so does an error as small as the smallest multiplier.

@@ -171,6 +171,7 @@ def test_a_given_start_is_followed_under_zero_input():
     assert left > 5
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("count", [16, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 1e7, 1e11])
 def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size, count):
@@ -193,6 +194,7 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
     assert known > count // 2
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("count", [6, pytest.param(120, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
 def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size, count):

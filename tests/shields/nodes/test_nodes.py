@@ -177,6 +177,7 @@ class World:
         return max(np.abs(self.plant.box_rows @ state).max() for state in self.history)
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("seed", "offset", "drift"), [(0, 0.0, 0.0), (1, 1234.0, 3e-4), (2, -77.7, -3e-4)])
 def test_nothing_leaves_the_box_and_the_proof_holds_while_the_network_keeps_its_contract(seed, offset, drift):
     world = World(seed=seed, offset=offset, drift=drift)
@@ -216,6 +217,7 @@ def asking(kind, world):
     }[kind]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("kind", ["never", "at random", "every second", "while it is safe", "while the network loses"])
 def test_samples_on_request_are_never_older_than_the_contract_allows_whoever_asks(kind):
     """There is room for two steps beyond the four of each way."""
@@ -314,6 +316,7 @@ def test_controller_that_is_held_up_decides_the_missed_steps_and_says_so():
         assert (set(reasons) == {""}) is is_kept
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("silence", [1, 100])
 def test_sensor_that_is_restarted_joins_again(silence):
     world = World()

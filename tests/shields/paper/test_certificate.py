@@ -27,6 +27,7 @@ def test_certificate_carries_the_papers_constants(paper):
     assert verified(paper, SMALL).valid
 
 
+@pytest.mark.slow
 @pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("bounds", "search", "steps"),  # the first search for SMALL is the fixture's
@@ -93,6 +94,7 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
         synthesize(scaled(1.05), dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
 
 
+@pytest.mark.slow
 def test_too_coarse_a_grid_says_so():
     with pytest.raises(Infeasible, match="use smaller steps") as caught:
         synthesize(SMALL, dkappa=0.4, drho=1.0)

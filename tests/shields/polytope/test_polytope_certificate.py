@@ -104,6 +104,7 @@ def assert_gain_stays(plant):
     assert synthesize(plant, search_gain=True) == certificate
 
 
+@pytest.mark.slow
 def test_polytope_of_a_candidate_is_kept_where_it_is_larger():
     wide, certificate, plant = found("TruckTrailerCruise")
     wider = with_largest_polytope(certificate, plant)
@@ -300,6 +301,7 @@ def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
     assert "out of reach of float64" in narrow.provenance["no_polytope"]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("seed", "n", "m"), [(0, 2, 1), (5, 2, 2)])
 def test_random_plants_have_polytopes_that_verify_and_hold_under_extreme_points(seed, n, m):
     assert_polytope_holds(seed, n, m)

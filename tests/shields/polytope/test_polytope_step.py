@@ -70,6 +70,7 @@ def test_input_passes_exactly_if_every_extreme_point_stays_inside(seed, n, m):
     assert 20 < passed < 280
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("seed", "n", "m"), [(1, 2, 1), (2, 3, 2), (3, 2, 3)])
 def test_projected_input_is_the_closest_one_of_a_conic_solver(seed, n, m):
     shield = random_filter(seed, n, m)

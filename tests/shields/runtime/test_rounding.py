@@ -86,6 +86,7 @@ def slanted(ratio):
     )
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("ratio", [1.0, pytest.param(1e2, marks=pytest.mark.slow), 1e3])
 def test_passed_means_inside_for_thin_safe_sets(ratio):
     plant = slanted(ratio)

@@ -136,6 +136,7 @@ TOO_LARGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "value", "safe_set"),
     [

@@ -49,6 +49,7 @@ def test_every_possible_network_has_a_certificate_that_verifies(found):
             assert point.certificate.contract.is_kept_by(channel)
 
 
+@pytest.mark.slow
 def test_more_room_is_never_less(found):
     for tight in found.points:
         for loose in found.points:
@@ -146,6 +147,7 @@ def test_plant_without_a_continuous_model_may_be_a_function_of_the_period():
     assert [largest.certified for largest in found.largest_ages] == [np.inf, np.inf]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6))])
 def test_certificate_of_a_tighter_problem_is_a_candidate_of_a_looser_one(seed):
     """Random pairs of input limits, boxes and bounds of a stable plant."""

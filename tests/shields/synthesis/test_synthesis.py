@@ -185,6 +185,7 @@ def test_weak_input_is_what_binds():
     assert caught.value.binding == "U"
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     "bounds",
     [
