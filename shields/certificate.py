@@ -195,6 +195,11 @@ class Certificate(ReadOnlyArrays):
         if self.polytope is None and not self.keeps_ellipsoid:
             raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
 
+    @property
+    def method(self) -> str:
+        """ "certified"; that of a `shields.paper.PaperCertificate` is "paper"."""
+        return "certified"
+
     @cached_property
     def M(self) -> np.ndarray:
         """The inverse of L, shape (n, n)."""

@@ -103,7 +103,7 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
 
 
 def require_fitting_downlink(protocol: DownlinkProtocol | None, downlink: Channel) -> None:
-    """Raises unless a downlink may take the place of a protocol's, whose c and contract stay; it may break the contract.
+    """Raises unless a downlink may take the place of that of a protocol, whose c stays; it may break the contract.
 
     Raises:
         ValueError: If there is no downlink to take the place of, or what is given is none, or delays commands by more
