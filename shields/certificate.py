@@ -197,7 +197,7 @@ class Certificate(ReadOnlyArrays):
 
     @property
     def method(self) -> str:
-        """ "certified"; that of a `shields.paper.PaperCertificate` is "paper"."""
+        """It is "certified"; that of a `shields.paper.PaperCertificate` is "paper"."""
         return "certified"
 
     @cached_property

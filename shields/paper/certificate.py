@@ -56,7 +56,7 @@ class PaperCertificate(ReadOnlyArrays):
 
     @property
     def method(self) -> str:
-        """ "paper"; that of a `shields.Certificate` is "certified"."""
+        """It is "paper"; that of a `shields.Certificate` is "certified"."""
         return "paper"
 
     @property
