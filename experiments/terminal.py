@@ -12,7 +12,7 @@ from typing import Any
 
 # Lines of prose follow the terminal between these widths, and have the greatest where there is no terminal; columns of
 # a table that would be wider than the greatest stand closer together [characters].
-_LEAST_WIDTH, _GREATEST_WIDTH = 60, 100
+_LEAST_WIDTH, _GREATEST_WIDTH = 60, 80
 
 
 def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), left_columns: int = 1) -> str:

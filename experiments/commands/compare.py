@@ -75,9 +75,8 @@ def compare(settings: CompareSettings) -> None:
         write_results(settings.out, summary, files, figures)
         count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
         trained = max(arm["train_steps"] for arm in summary["arms"].values())
-        print(
-            f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n"
-        )
+        per_run = f"{trained:,} training steps per arm, {settings.episodes} episodes per run"
+        print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
         short = ["A smoke run shows that everything runs; its agents have hardly learned."] if settings.smoke else []
         print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
 

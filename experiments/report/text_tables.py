@@ -1,4 +1,4 @@
-"""The tables of results on a terminal, at most 100 columns wide for the usual names."""
+"""The tables of results on a terminal, at most 80 columns wide for the usual names."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ _Arms = dict[str, dict[str, Any]]
 
 
 def summary_text(arms: _Arms, baselines: _Arms) -> str:
-    """Returns the table for a terminal; baselines stand below a rule.
+    """Returns the tables of training and evaluation for a terminal; baselines stand below a rule.
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Left S"
     counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
-    decision the shield of mode "lookahead" had inputs of a certified plan in store. The columns about the training are
-    left out where nothing was trained.
+    decision the shield of mode "lookahead" had inputs of a certified plan in store. The training has a table of its own,
+    of the arms that were trained.
     """
-    trained = any(arm["train_steps"] for arm in (arms | baselines).values())
-    return _text(arms | baselines, len(arms), [*(_TRAINING if trained else []), *_EVALUATION])
+    everything = arms | baselines
+    trained = {name: arm for name, arm in everything.items() if arm["train_steps"]}
+    evaluated = _text(everything, len(arms), _EVALUATION)
+    return f"{_text(trained, len(trained), _TRAINING)}\n\n{evaluated}" if trained else evaluated
 
 
 def scenario_text(scenario: str, arms: _Arms, baselines: _Arms) -> str:
@@ -50,10 +52,10 @@ def scenario_text(scenario: str, arms: _Arms, baselines: _Arms) -> str:
 
 def _text(arms: _Arms, above: int, columns: list[_Column], corner: str = "") -> str:
     """Returns a table, with a rule below so many arms, and a column of plans if an arm looks ahead."""
-    if any(arm["mode"] == "lookahead" for arm in arms.values()):
+    if columns is _EVALUATION and any(arm["mode"] == "lookahead" for arm in arms.values()):
         columns = [*columns[:-1], _PLANNED, columns[-1]]
     titles = list(zip(*(header for header, _ in columns), strict=True))
-    first = ["" for _ in columns] if corner else titles[0]
+    first = ["" if corner and title.endswith(":") else title for title in titles[0]]
     rows = [[corner, *first], *(["", *line] for line in titles[1:])]
     rows += [[name, *(show(arm) for _, show in columns)] for name, arm in arms.items()]
     return text_table(rows, rules=(len(titles), len(titles) + above))
@@ -61,13 +63,13 @@ def _text(arms: _Arms, above: int, columns: list[_Column], corner: str = "") -> 
 
 def _overridden(arm: dict[str, Any], key: str = "intervention_rate") -> str:
     """Returns a rate of interventions; in brackets what a monitor would have done."""
-    text = f"{100 * arm[key]:.1f} %"
+    text = f"{100 * arm[key]:.1f}"
     return {"monitor": f"({text})", None: "-"}.get(arm["mode"], text)
 
 
 def _violating(arm: dict[str, Any]) -> str:
     low, high = arm["eval_violation_rate_ci95"]
-    return f"{100 * arm['eval_violation_rate']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{100 * arm['eval_violation_rate']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _return_text(arm: dict[str, Any]) -> str:
@@ -83,19 +85,19 @@ def _return_text(arm: dict[str, Any]) -> str:
 # Three lines of the header of a column, and its text of the summary of an arm.
 _Column = tuple[tuple[str, str, str], Callable[[dict[str, Any]], str]]
 _TRAINING: list[_Column] = [
-    (("training:", "violating", "steps"), lambda a: f"{a['train_violation_steps']:,}" if a["train_steps"] else "-"),
-    (("", "over-", "ridden"), lambda a: _overridden(a, "train_intervention_rate") if a["train_steps"] else "-"),
+    (("training:", "violating", "steps"), lambda arm: f"{arm['train_violation_steps']:,}"),
+    (("over-", "ridden", "[%]"), lambda arm: _overridden(arm, "train_intervention_rate")),
 ]
 _EVALUATION: list[_Column] = [
-    (("evaluation:", "violating", "episodes"), _violating),
-    (("", "violating", "steps"), lambda arm: f"{arm['eval_violation_steps']:,}"),
+    (("evaluation:", "violating:", "episodes [%]"), _violating),
+    (("", "", "steps"), lambda arm: f"{arm['eval_violation_steps']:,}"),
     (("", "left", "S"), lambda arm: f"{arm['eval_episodes_outside_set']:,}"),
-    (("", "over-", "ridden"), _overridden),
+    (("over-", "ridden", "[%]"), _overridden),
     (("", "return", "[95 % CI]"), _return_text),
 ]
 _PLANNED: _Column = (
-    ("", "from a", "plan"),
-    lambda arm: f"{100 * arm['plan_rate']:.1f} %" if arm["mode"] == "lookahead" else "-",
+    ("from a", "plan", "[%]"),
+    lambda arm: f"{100 * arm['plan_rate']:.1f}" if arm["mode"] == "lookahead" else "-",
 )
 
 

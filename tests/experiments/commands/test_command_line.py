@@ -224,7 +224,7 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
     arm = json.loads((tmp_path / "e.json").read_text())["arms"]["shield: project"]
     assert (arm["eval_episodes"], arm["eval_violation_steps"], arm["guaranteed_episodes"]) == (5, 0, 5)
     assert ", 5 episodes" in run.stdout
-    assert " 0.0 % [0.0, 52.2] " in run.stdout
+    assert " 0.0 [0.0, 52.2] " in run.stdout
     other = ncs("evaluate", model, "--episodes", "5", "--channel", "loss=0.9", "--out", tmp_path / "f.json")
     assert other.returncode == 0, other.stderr
     worse = json.loads((tmp_path / "f.json").read_text())
