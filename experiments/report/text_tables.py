@@ -35,8 +35,8 @@ def summary_text(arms: _Arms, baselines: _Arms) -> str:
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Left S"
     counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
-    decision the shield of mode "lookahead" had inputs of a certified plan in store. The training has a table of its own,
-    of the arms that were trained.
+    decision the shield of mode "lookahead" had inputs of a certified plan in store. The training of those that
+    were trained has a table of its own.
     """
     everything = arms | baselines
     trained = {name: arm for name, arm in everything.items() if arm["train_steps"]}
