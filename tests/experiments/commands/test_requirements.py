@@ -50,5 +50,28 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     assert numbers["lost"] == sum(line.endswith(",") for line in lines)
     assert f"max_age = {numbers['kept']}" in found.stdout
-    assert numbers["kept"] <= numbers["promised"]
-    assert "The environment's contract, max_age = 4" in found.stdout
+    assert numbers["kept"] <= numbers["replay"]
+    assert "Read as a table: 'sent' in s, 'received' in s." in found.stdout
+    assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
+    assert max(map(len, found.stdout.splitlines())) <= 100
+
+
+def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
+    sent = [0.1 * i for i in range(100)] + [75.0 + 0.1 * i for i in range(1000)]
+    lines = "".join(f"{each},{each + 0.25}\n" for each in sent)
+    (tmp_path / "packets.csv").write_text("sent,received\n" + lines)
+    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/Convoy-v0")
+    assert found.returncode == 0, found.stderr
+    said = " ".join(found.stdout.split())
+    assert "Contract kept by the record: max_age = 653 (65.3 s; first half 653, second half" in said
+    assert "Span and number of packets disagree" in said
+    assert "was broken once" in said
+    assert "kept throughout" not in said
+
+
+def test_channel_refuses_a_file_in_one_sentence(tmp_path):
+    (tmp_path / "packets.csv").write_text("0,1\n1,2\n")
+    found = ncs("channel", tmp_path / "packets.csv")
+    assert found.returncode != 0
+    assert len(found.stderr.strip().splitlines()) == 1
+    assert "no names" in found.stderr
