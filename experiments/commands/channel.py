@@ -96,7 +96,7 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
             f"{row['times']:,}",
             _rate(row["per_hour"]),
             f"[{', '.join(map(_rate, row['per_hour_ci95']))}]",
-            _time(row["longest"] * dt),
+            _time(row["longest"] * dt) if row["longest"] else "-",
             *map(_rate, row["halves"]),
         ]
         for row in found["contracts"]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant
 from shields import Certificate, verify
-from tests.command import ncs
+from tests.command import ROOT, environment, ncs
 
 
 @pytest.fixture
@@ -54,6 +56,19 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     assert "Read as a table: 'sent' in s, 'received' in s." in found.stdout
     assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
     assert max(map(len, found.stdout.splitlines())) <= 100
+
+
+@pytest.mark.parametrize("page", ["contracts.md", "requirements.md"])
+def test_pages_show_what_the_command_prints_of_the_record_of_the_example(page, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    path = ROOT / "examples" / "wifi_record.py"
+    subprocess.run([sys.executable, path], cwd=tmp_path, env=environment(), check=True, capture_output=True)
+    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+    assert found.returncode == 0, found.stderr
+    block = (ROOT / "docs" / page).read_text().partition("    ncs channel packets.csv")[2].partition("\n\n    ")[2]
+    shown = [line.removeprefix("    ") for line in block.splitlines()]
+    shown = shown[: next(n for n, line in enumerate(shown) if "in 0.169 % of steps" in line) + 1]
+    assert [line for line in shown if line and line != "..." and line not in found.stdout.splitlines()] == []
 
 
 def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
