@@ -79,7 +79,7 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
     too_old = f", more than the {MAX_AGE} of any contract" if found["kept"] > MAX_AGE else ""
     lines = [
         log.read_as,
-        f"{found['packets']:,} packets in {found['span']:.4g} s, {found['steps']:,} control steps of {_time(dt)}: "
+        f"{found['packets']:,} packets in {_time(found['span'])}, {found['steps']:,} control steps of {_time(dt)}: "
         f"{_placed(empty, found['left_out'])}.",
         log.disagreement,
         f"Lost: {found['lost']:,} packets ({100.0 * found['lost'] / found['packets']:.3g} %), at most "
@@ -115,7 +115,9 @@ def _placed(empty: int, left_out: int) -> str:
 
 
 def _time(seconds: float) -> str:
-    return f"{1000.0 * seconds:.3g} ms" if seconds < 0.9995 else f"{seconds:,.4g} s"
+    if seconds < 0.9995:
+        return f"{1000.0 * seconds:.3g} ms"
+    return f"{seconds:.4g} s" if seconds < 3600.0 else f"{seconds / 3600.0:,.4g} h"
 
 
 def _rate(rate: float) -> str:

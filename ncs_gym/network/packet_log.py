@@ -75,7 +75,7 @@ class PacketLog(ReadOnlyArrays):
             step: Duration of the steps of `ncs loop` [s].
 
         Raises:
-            ValueError: If the file cannot be read, its columns or numbers are ambiguous, it has more than 128 MiB, or
+            ValueError: If the file cannot be read, its columns or numbers are ambiguous, it has more than 256 MiB, or
                 more than two million packets with those that were lost (`ncs_gym.reading`).
         """
         period = None if period is None else as_number(period, "period", low=0.0, low_open=True)
@@ -131,7 +131,11 @@ class PacketLog(ReadOnlyArrays):
         return max(int(np.gcd.reduce(self._samples(dt)[0])), 1)
 
     def channel(self, dt: float, *, quantization_step: float = 0.0) -> TraceChannel:
-        """Returns the channel that replays the record in control steps of duration dt [s], with the ages of `ages`."""
+        """Returns the channel that replays the record in control steps of duration dt [s], with the ages of `ages`.
+
+        Raises:
+            ValueError: If the record spans more than ten million steps, or the trace has more than two million entries.
+        """
         return TraceChannel(trace=self.trace(dt), send_period=self.send_period(dt), quantization_step=quantization_step)
 
     def ages(self, dt: float) -> np.ndarray:
