@@ -241,6 +241,17 @@ def test_ages_are_those_of_the_times_in_the_file(name, written):
     assert promised.max_age >= max(expected)
 
 
+def test_first_packet_that_both_times_say_0_is_lost_where_zeros_mark_what_is_lost(written):
+    assert np.isnan(PacketLog.load(written("sent,received\n0,0\n1,0\n2,2.1\n")).delays[:2]).all()
+    assert PacketLog.load(written("sent,received\n0,0\n1,1.1\n2,2.1\n")).delays[0] == 0.0
+
+
+def test_sample_that_is_later_than_any_channel_allows_counts_as_lost():
+    log = PacketLog(np.arange(1500.0), np.array([*2 * [np.nan], 1000.0, 1001.0, *1496 * [np.nan]]))
+    assert log.trace(1.0)[:4] == (-1, -1, 1000, -1)
+    assert log.ages(1.0)[[1001, 1002, 1499]].tolist() == [1001, 1000, 1497]
+
+
 def test_share_of_lost_packets_counts_those_of_the_summary(written):
     text = f"{LINUX}{ping([(i, 12) for i in range(1, 701)])}\n1000 packets transmitted, 700 received, 30% packet loss\n"
     log = PacketLog.load(written(text))
