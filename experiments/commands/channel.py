@@ -1,23 +1,22 @@
-"""`ncs channel`: what recorded packets say of a network, and which contract it kept."""
+"""`ncs channel`: what a record of packets says of a network, and how often it would have broken which contract."""
 
 from __future__ import annotations
 
 import json
-from collections import Counter
 from typing import Any
 
 import numpy as np
 
+from experiments.analysis.stalls import broken_contracts
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import PacketLog, contract_of
+from ncs_gym.network.channel import in_steps
 from ncs_gym.network.contract import MAX_AGE
+from ncs_gym.reading import MOST_PACKETS
 from shields.atomic_write import write_atomically
-
-# Rows of the table of contracts that are printed: those nearest to what was kept.
-_MOST_ROWS = 12
 
 
 def channel(settings: ChannelSettings) -> None:
@@ -27,119 +26,112 @@ def channel(settings: ChannelSettings) -> None:
     step = settings.sampling_period or (1.0 if env is None else env.plant.dt)
     log = PacketLog.load(settings.file, settings.ping_period, step)
     dt = settings.sampling_period or (log.period if env is None else env.plant.dt)
-    found = _numbers(log, dt, settings.seed)
-    print(_text(log, dt, found))
+    contract = None if env is None else env.contract
+    found = _numbers(log, dt, None if contract is None else contract.max_age)
+    print(_text(log, found))
     if env is not None:
-        print(wrapped(_compared(env.contract, found)))
+        print(wrapped(_compared(contract, found)))
     if settings.out is not None:
         write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
 
 
-def _numbers(log: PacketLog, dt: float, seed: int) -> dict[str, Any]:
-    replayed, trace = log.channel(dt), np.array(log.trace(dt))
-    lost, arrived = trace < 0, log.delays[np.isfinite(log.delays)]
-    ages = log.ages(dt)
-    if not len(ages):
+def _numbers(log: PacketLog, dt: float, asked: int | None) -> dict[str, Any]:
+    arrived = log.delays[np.isfinite(log.delays)]
+    if not len(arrived):
         raise ValueError("none of the packets arrived")
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]])))
-    runs = Counter((edges[1::2] - edges[::2]).tolist())
-    promised = contract_of(replayed)
-    first, second = (int(half.max()) for half in np.array_split(ages, 2))
+    ages = log.ages(dt)
+    samples = len(log.sent) - log.left_out(dt)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isnan(log.delays).astype(np.int8), [0]])))
+    first, second = (int(half.max()) for half in np.array_split(ages, 2) if len(half))
     return {
-        "packets": len(trace),
+        "read_as": log.read_as,
+        "disagreement": log.disagreement,
+        "packets": len(log.sent),
+        "span": float(log.sent[-1] - log.sent[0]),
         "sampling_period": dt,
-        "send_period": replayed.send_period,
-        "lost": int(lost.sum()),
-        "runs_of_losses": {str(length): count for length, count in sorted(runs.items())},
+        "steps": len(ages),
+        "steps_with_a_packet": samples,
+        "left_out": log.left_out(dt),
+        "lost": len(log.sent) - len(arrived),
+        "most_lost_in_a_row": int((edges[1::2] - edges[::2]).max(initial=0)),
         "delay_quantiles": [float(each) for each in np.quantile(arrived, [0.5, 0.9, 0.99, 1.0])],
-        "delays": [replayed.delay, replayed.longest_delay],
         "kept": int(ages.max()),
-        "promised": None if promised is None else promised.max_age,
         "kept_by_halves": [first, second],
-        "contracts": broken_contracts(ages, np.random.default_rng(seed)),
+        "replay": _replay(log, dt),
+        "contracts": broken_contracts(ages, dt, asked),
     }
 
 
-def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
-    low, high = found["delays"]
-    runs = ", ".join(f"{count} of {length}" for length, count in found["runs_of_losses"].items()) or "none"
-    median, ninety, ninety_nine, longest = (1000.0 * each for each in found["delay_quantiles"])
+def _replay(log: PacketLog, dt: float) -> int | None:
+    """Returns the largest age of a replay; None if it is larger than a contract's or there is no replay."""
+    if len(log.ages(dt)) > log.send_period(dt) * MOST_PACKETS:
+        return None
+    promised = contract_of(log.channel(dt))
+    return None if promised is None else promised.max_age
+
+
+def _text(log: PacketLog, found: dict[str, Any]) -> str:
+    dt = found["sampling_period"]
+    empty = found["steps"] - found["steps_with_a_packet"]
+    median, ninety, ninety_nine, longest = map(_time, found["delay_quantiles"])
     first, second = found["kept_by_halves"]
-    late = f"{low} to {high} steps" if low < high else "1 step" if low == 1 else f"{low} steps"
-    together = "none" if found["promised"] is None else f"max_age = {found['promised']}"
+    again = "none" if found["replay"] is None else f"max_age = {found['replay']}"
+    too_old = f", more than the {MAX_AGE} of any contract" if found["kept"] > MAX_AGE else ""
     lines = [
-        f"{found['packets']:,} packets in {log.sent[-1] - log.sent[0]:.4g} s, control steps of {1000.0 * dt:.4g} ms, a "
-        f"packet every {'step' if found['send_period'] == 1 else str(found['send_period']) + ' steps'}.",
-        f"Lost: {found['lost']:,} ({100.0 * found['lost'] / found['packets']:.3g} %); runs of losses: {runs}.",
-        f"Delays: median {median:.3g} ms, 90 % {ninety:.3g} ms, 99 % {ninety_nine:.3g} ms, longest {longest:.3g} ms: "
-        f"{late}.",
-        f"Contract kept: max_age = {found['kept']} (first half {first}, second half {second}); by the longest run of "
-        f"losses and the longest delay together: {together}.",
+        log.read_as,
+        f"{found['packets']:,} packets in {_time(found['span'])}, {found['steps']:,} control steps of {_time(dt)}: "
+        f"{_placed(empty, found['left_out'])}.",
+        log.disagreement,
+        f"Lost: {found['lost']:,} packets ({100.0 * found['lost'] / found['packets']:.3g} %), at most "
+        f"{found['most_lost_in_a_row']:,} in a row.",
+        f"Delays: median {median}, 90 % {ninety}, 99 % {ninety_nine}, longest {longest}.",
+        f"Contract kept by the record: max_age = {found['kept']}{too_old} ({_time(found['kept'] * dt)}; first half "
+        f"{first}, second half {second}); by its replay around and around: {again}.",
     ]
-    header = [["max_age", "steps beyond", "[95 % CI]", "times", "first half", "second half"]]
+    header = ["max_age", "time", "broken", "per hour", "[95 % CI]", "longest", "half 1", "half 2"]
     cells = [
         [
             str(row["max_age"]),
-            f"{100.0 * row['broken']:.3g} %",
-            f"[{100.0 * row['broken_ci95'][0]:.3g}, {100.0 * row['broken_ci95'][1]:.3g}]",
+            _time(row["max_age"] * dt),
             f"{row['times']:,}",
-            *(f"{100.0 * half:.3g} %" for half in row["halves"]),
+            _rate(row["per_hour"]),
+            f"[{', '.join(map(_rate, row['per_hour_ci95']))}]",
+            _time(row["longest"] * dt) if row["longest"] else "-",
+            *map(_rate, row["halves"]),
         ]
-        for row in found["contracts"][:_MOST_ROWS]
+        for row in found["contracts"]
     ]
-    return "\n".join([*map(wrapped, lines), "", text_table([*header, *cells])])
+    note = (
+        "broken: stretches of steps whose newest sample is older, also per hour in each half; longest: the longest of "
+        "them. The intervals allow for their clusters, and take the record for typical."
+    )
+    return "\n".join([*map(wrapped, filter(None, lines)), "", text_table([header, *cells]), "", wrapped(note)])
+
+
+def _placed(empty: int, left_out: int) -> str:
+    if not empty and not left_out:
+        return "one in each"
+    return f"{empty:,} steps have no packet, {left_out:,} packets are not the first of their step and are left out"
+
+
+def _time(seconds: float) -> str:
+    if seconds < 0.9995:
+        return f"{1000.0 * seconds:.3g} ms"
+    return f"{seconds:.4g} s" if seconds < 3600.0 else f"{seconds / 3600.0:,.4g} h"
+
+
+def _rate(rate: float) -> str:
+    return f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"
 
 
 def _compared(contract: Any, found: dict[str, Any]) -> str:
     if contract is None:
         return "The environment's certificate needs no contract."
-    row = next((row for row in found["contracts"] if row["max_age"] == contract.max_age), None)
-    if row is None or row["broken"] == 0.0:
-        return f"The environment's contract, max_age = {contract.max_age}, was kept throughout."
-    broken = f"{100.0 * row['broken']:.3g} % of steps"
-    return f"The environment's contract, max_age = {contract.max_age}, was broken in {broken}."
-
-
-# A block is at least so many times as long as the largest age: what happens in one hardly depends on the one before.
-_AGES_PER_BLOCK, _MOST_BLOCKS = 10, 5000
-_RESAMPLES = 2000
-
-
-def broken_contracts(ages: np.ndarray, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Returns, for every largest age up to the recorded one that contracts can have, how often it was exceeded.
-
-    The interval is that of a circular block bootstrap of the steps (95 %), blocks being at least ten times as
-    long as the largest age. Where an age was never exceeded it ends at 3 / (number of blocks), what is excluded at that
-    level if blocks are independent. `halves` are the two halves of the record.
-
-    Args:
-        ages: Age of the newest sample at every step, shape (k,).
-        rng: Draws the blocks.
-
-    Returns:
-        Rows of JSON values, from the age that was kept (or `MAX_AGE`) down to 0.
-    """
-    largest, steps = int(ages.max()), len(ages)
-    block = min(max(_AGES_PER_BLOCK * (largest + 1), steps // _MOST_BLOCKS), steps)
-    blocks = -(-steps // block)
-    starts = rng.integers(steps, size=(_RESAMPLES, blocks))
-    halves = np.array_split(ages, 2)
-    rows = []
-    for age in range(min(largest, MAX_AGE), -1, -1):
-        broken = ages > age
-        sums = np.concatenate([[0], np.cumsum(np.concatenate([broken, broken[:block]]))])
-        resampled = (sums[starts + block] - sums[starts]).sum(axis=1) / (blocks * block)
-        low, high = np.quantile(resampled, [0.025, 0.975])
-        if not broken.any():
-            low, high = 0.0, min(3.0 / blocks, 1.0)
-        edges = np.diff(np.concatenate([[0], broken.astype(int)]))
-        rows.append(
-            {
-                "max_age": age,
-                "broken": float(broken.mean()),
-                "broken_ci95": [float(low), float(high)],
-                "times": int((edges > 0).sum()),
-                "halves": [float((half > age).mean()) for half in halves],
-            }
-        )
-    return rows
+    row = next(row for row in found["contracts"] if row["max_age"] == contract.max_age)
+    low, high = map(_rate, row["per_hour_ci95"])
+    said = f"The environment's contract, a newest sample of at most {in_steps(contract.max_age)}, was"
+    if row["times"] == 0:
+        return f"{said} kept throughout; a record of this length excludes more than {high} breaks per hour."
+    share = f"{100.0 * row['broken']:.3g} % of steps"
+    times = "once" if row["times"] == 1 else f"{row['times']:,} times"
+    return f"{said} broken {times}, {_rate(row['per_hour'])} per hour [{low}, {high}], in {share}."

@@ -264,16 +264,16 @@ class RequirementsSettings(BackendSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSettings:
-    """Reads recorded packets, and says which channel contract they kept and how often closer ones would have broken.
+    """Reads recorded packets, and says how often each channel contract would have been broken.
 
     Attributes:
-        file: A CSV file with a line per packet, when it was sent and when it was received in seconds, the second empty
-            for a lost packet; or the output of ping, whose delays are those of the whole way and back.
+        file: A table with the named columns sent and received (sent_ms, ...), the output of ping or fping, a list of
+            round trips, a log of `ncs loop`, or the JSON of irtt (docs/requirements.md).
         sampling_period: Duration of a control step [s]; by default that of --env, or the time between packets.
-        ping_period: Time between the packets of ping without stamps (ping -D prints them) [s]; 1 by default.
+        ping_period: Time between packets whose file does not say when they were sent, as of ping without -D [s]; by
+            default that of ping's summary, or 1.
         env: Id of an environment whose contract is compared with the record.
         out: File for the numbers (JSON).
-        seed: Seed of the bootstrap, >= 0.
     """
 
     file: tyro.conf.Positional[Path]
@@ -281,10 +281,8 @@ class ChannelSettings:
     ping_period: float | None = None
     env: str | None = None
     out: Path | None = None
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        require_limits(self, seed=0)
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")

@@ -3,7 +3,8 @@
 `channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_loss_and_delay`
 what happens to packets during an episode, `contract` what a channel guarantees about the age of samples,
 `packet_reception` which packets a receiver can use, and `gaussian_bound` says how likely Gaussian noise is to leave its
-bounds, given how many samples a channel takes. `packet_log` reads recorded packets, which a `TraceChannel` replays.
+bounds, given how many samples a channel takes. `packet_log` is a record of packets, whose ages a `TraceChannel`
+replays, and `log_formats` reads it from files.
 `downlink` is the way of the commands, with the inputs that are committed ahead.
 """
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import as_count, as_flag, as_number, shown
+from ncs_gym.validation import as_count, as_flag, as_number, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -128,6 +129,16 @@ class Channel:
         return self.delay + self.jitter
 
     @property
+    def oldest_age(self) -> int | None:
+        """The largest age of the newest sample that has arrived, h = (l+1) M + delay - 1 [steps]; None without a limit.
+
+        With a sample every M steps, at most l losses in a row and a longest delay of `delay` steps: among l+1
+        consecutive samples one arrives, so at every step a sample at most (l+1) M - 1 + delay steps old has arrived.
+        """
+        losses = self.most_consecutive_losses
+        return None if losses is None else (losses + 1) * self.send_period + self.longest_delay - 1
+
+    @property
     def description(self) -> str:
         """What the channel does to samples, in sentences."""
         every = "every step" if self.send_period == 1 else f"every {in_steps(self.send_period)}"
@@ -156,9 +167,8 @@ def widest(channels: Sequence[Channel]) -> Channel:
     """
 
     def oldest(channel: Channel) -> tuple[float, int]:
-        losses = channel.most_consecutive_losses
-        age = inf if losses is None else (losses + 1) * channel.send_period + channel.longest_delay
-        return age, channel.longest_delay
+        age = channel.oldest_age
+        return inf if age is None else age, channel.longest_delay
 
     coarsest = max(channel.quantization_step for channel in channels)
     return replace(max(channels, key=oldest), quantization_step=coarsest)
@@ -182,12 +192,15 @@ def _bursts(loss: dict[str, Any]) -> GilbertElliott:
 
 @dataclass(frozen=True)
 class TraceChannel(Channel):
-    """A channel that replays what happened to recorded packets, from a random one on and around again (`PacketLog`).
+    """A channel that replays what happened to the samples of a record, from a random one on and around again.
 
-    Its losses and delays are those of the trace, so that the contract of the recording is the contract of the channel.
+    `PacketLog.channel` makes one of recorded packets. Every `send_period` steps the next entry of the trace is what
+    happens to the sample of that step; an entry where nothing was sent is that of a lost packet. The contract of the
+    channel is the largest age of the replay (`oldest_age`). On request (`on_request`) the next entry is that of the
+    next sample that is asked for, so that an outage does not end before as many samples are lost as in the record.
 
     Attributes:
-        trace: After how many steps each packet arrived, one after the other; -1 for a lost one.
+        trace: After how many steps each sample arrived, one after the other; -1 for one that was lost, or never sent.
 
     Raises:
         ValueError: If the trace is empty, has other entries or more than two million of them, or a loss or delay is
@@ -219,10 +232,50 @@ class TraceChannel(Channel):
             object.__setattr__(self, name, value)
         super().__post_init__()
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What is computed once is left out: a copy's array would not be read-only.
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
+
+    @cached_property
+    def delays(self) -> np.ndarray:
+        """The trace as an array, shape (k,) [steps]."""
+        return read_only(np.array(self.trace))
+
+    @cached_property
+    def oldest_age(self) -> int | None:
+        """The largest age of the newest sample in a replay without end [steps]; None if nothing arrives.
+
+        On request the limit is that of the longest run of losses and the longest delay, as of every channel.
+        """
+        if self.on_request or self.max_consecutive_losses is None:
+            return super().oldest_age
+        around = len(self.trace) * self.send_period
+        return int(replayed_ages(self.delays, self.send_period, 2 * around + self.longest_delay).max())
+
     @property
     def description(self) -> str:
         """What the channel does to samples, in sentences."""
         return f"{super().description} It replays a record of {len(self.trace)} packets from a random one on."
+
+
+def replayed_ages(trace: np.ndarray, send_period: int, steps: int) -> np.ndarray:
+    """Returns the age of the newest sample that has arrived at every step of a replay, shape (steps,) [steps].
+
+    The replay begins with the first sample of the trace at step 0, where the first estimate counts as a sample, and
+    begins anew when the trace is over.
+
+    Args:
+        trace: After how many steps each sample arrives, -1 for a lost one, shape (k,).
+        send_period: Steps between samples.
+        steps: How many.
+    """
+    stamps = np.arange(0, steps, send_period)
+    delays = np.resize(trace, len(stamps))
+    arrivals = stamps + delays
+    counts = (delays >= 0) & (arrivals < steps)
+    newest = np.zeros(steps, np.int64)
+    np.maximum.at(newest, arrivals[counts], stamps[counts])
+    return np.arange(steps) - np.maximum.accumulate(newest)
 
 
 def _longest_run(trace: tuple[int, ...]) -> int:

@@ -49,18 +49,12 @@ class ChannelContract:
 
 
 def contract_of(channel: Channel) -> ChannelContract | None:
-    """Returns the contract a channel keeps by its settings: h = (l+1) M + delay - 1.
+    """Returns the contract a channel keeps by its settings, that of its `oldest_age`.
 
     None if it may lose for ever, or for so long that it is as good as that.
-
-    With a sample every M steps, at most l losses in a row and a longest delay of `delay` steps: among l+1 consecutive
-    samples one arrives, so at every step a sample at most (l+1) M - 1 + delay steps old has arrived.
     """
-    losses = channel.most_consecutive_losses
-    if losses is None:
-        return None
-    age = (losses + 1) * channel.send_period + channel.longest_delay - 1
-    return ChannelContract(age, channel.quantization_step) if age <= MAX_AGE else None
+    age = channel.oldest_age
+    return None if age is None or age > MAX_AGE else ChannelContract(age, channel.quantization_step)
 
 
 def warn_of_broken_contract(

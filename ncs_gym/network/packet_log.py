@@ -1,48 +1,59 @@
-"""Recorded packets: when each was sent and when it arrived, from a CSV file or the output of ping."""
+"""A record of packets: when each was sent and when it arrived, and how old a control loop's samples become by that."""
 
 from __future__ import annotations
 
-import csv
 import os
-import re
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel
-from ncs_gym.reading import LARGEST_LOG, MOST_PACKETS, MOST_STEPS, read_text
+from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel, replayed_ages
+from ncs_gym.network.log_formats import read_record
+from ncs_gym.reading import MOST_STEPS, require_packets
 from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, shown, warn_caller
 
-# A line of ping: the stamp that -D prints, the number of the packet, and the time until its answer.
-_PING = re.compile(r"^(?:\[(?P<stamp>\d+\.\d+)\] )?.*\bicmp_seq=(?P<number>\d+)\b(?:.*\btime=(?P<time>[\d.]+) ?ms)?")
-# Times that differ by less than this fraction of a step are the same.
-_SAME = 1e-6
+# Times that differ by less than this fraction of a step are the same; where the resolution of the times themselves is
+# coarser than the second fraction they cannot be placed.
+_SAME, _COARSE = 1e-6, 1e-2
+# A pause is longer than so many usual periods; span and number disagree by more than this fraction.
+_PAUSE, _DISAGREE = 2.0, 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class PacketLog(ReadOnlyArrays):
-    """Packets in the order in which they were sent.
+    """A list of times, in the order of sending: when each packet was sent and how long it was on its way.
+
+    A control loop of step dt is laid over the record by its clock. Step 0 is the time of the first packet, step k is
+    k dt later, and the last step is the last one that is no later than the last packet sent.
+
+    - The sample of step k is the *first* packet that is sent from step k until before step k + 1. Further packets
+      within the step are left out, since the loop samples once per step, whether the first one arrived or not.
+    - A sample that is sent between two steps counts as taken at the earlier one, and one that arrives between two steps
+      is there at the later one: it never looks fresher than it was.
+    - At a step without a packet nothing is sent, which is the same as a lost sample.
+    - A sample that takes longer than 1000 steps, which no channel and no contract allows, counts as lost.
 
     Attributes:
         sent: When each was sent, shape (k,), ascending [s].
         delays: How long each was on its way, shape (k,); NaN for a lost one [s].
+        read_as: How a file was read, in sentences; empty for a log that was not read from a file.
 
     Raises:
-        ValueError: If there are fewer than two packets or more than two million, they are not in order, or one arrived
-            before it was sent.
+        ValueError: If there are fewer than two packets or more than two million, they are not in order or all sent at
+            once, or one arrived before it was sent.
     """
 
     sent: np.ndarray
     delays: np.ndarray
+    read_as: str = ""
 
     def __post_init__(self) -> None:
         sent, delays = as_setting(self.sent), as_setting(self.delays)
         if sent is None or delays is None or sent.ndim != 1 or sent.shape != delays.shape or len(sent) < 2:
             raise ValueError("a log needs at least two packets, each with the time at which it was sent")
-        _require_moderate(len(sent))
-        if not np.isfinite(sent).all() or (np.diff(sent) <= 0.0).any():
+        require_packets(len(sent))
+        if not np.isfinite(sent).all() or (np.diff(sent) < 0.0).any() or sent[0] == sent[-1]:
             raise ValueError("packets must be sent one after the other, at finite times")
         if (delays < 0.0).any() or np.isinf(delays).any():
             raise ValueError(
@@ -54,176 +65,115 @@ class PacketLog(ReadOnlyArrays):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], period: float | None = None, step: float = 1.0) -> Self:
-        """Returns the packets in a file.
-
-        A CSV file has a line per packet: when it was sent and when it was received, in seconds, the second empty for a
-        lost packet. A first line of names that has "sent" and "received" among them says where they are; another one is
-        skipped. With "episode" besides it is a log of `ncs loop`, whose numbers are those of steps: episodes count as
-        one after the other, and steps without a packet as lost packets. Of the output of ping the delay is that of the
-        whole way and back, and numbers without an answer are lost packets.
+        """Returns the packets in a file; `read_as` says how it was read (docs/requirements.md has the formats).
 
         Args:
-            path: The file.
-            period: Time between the packets of ping without stamps (`ping -D` prints them) [s]; 1 by default.
+            path: A table with named columns, a log of `ncs loop`, the output of ping or fping, round trips one per
+                line, or the JSON of irtt.
+            period: Time between packets whose file does not say when they were sent [s]; by default that of ping's
+                summary, or 1.
             step: Duration of the steps of `ncs loop` [s].
 
         Raises:
-            ValueError: If the file cannot be read or holds neither, has more than 128 MiB, or more than two million
-                packets with those that were lost (`ncs_gym.reading`).
+            ValueError: If the file cannot be read, its columns or numbers are ambiguous, it has more than 256 MiB, or
+                more than two million packets with those that were lost (`ncs_gym.reading`).
         """
-        try:
-            lines = read_text(path, LARGEST_LOG).splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"cannot read packets from {shown(path)}: {error}") from error
-        if any("icmp_seq=" in line for line in lines):
-            return cls._of_ping(lines, 1.0 if period is None else as_number(period, "period", low=0.0, low_open=True))
-        names = [name.strip() for name in lines[0].split(",")] if lines else []
-        named = {"sent", "received"} <= {*names}
-        columns = [names.index(name) for name in ("sent", "received")] if named else [0, 1]
-        if named and "episode" in names:
-            dt = as_number(step, "step", low=0.0, low_open=True)
-            return cls._of_steps(lines[1:], names.index("episode"), columns, path, dt)
-        log = cls._of_csv(lines, columns, path)
-        if log.period >= 1.0 and np.nanmedian(np.append(log.delays, -np.inf)) >= 1.0:
+        period = None if period is None else as_number(period, "period", low=0.0, low_open=True)
+        record = read_record(path, period, as_number(step, "step", low=0.0, low_open=True))
+        if record.may_be_milliseconds:
             warn_caller(
-                f"the times in {shown(path)} look like milliseconds, but are taken for seconds: packets every "
-                f"{log.period:g} s, most of which take more than a second",
+                f"the times in {shown(path)} look like milliseconds, but are taken for seconds: most packets take "
+                "more than one; say the unit in the names of the columns, as in sent_ms and received_ms",
                 UserWarning,
             )
-        return log
-
-    @classmethod
-    def _of_steps(
-        cls, lines: Iterable[str], episode: int, columns: list[int], path: str | os.PathLike[str], dt: float
-    ) -> Self:
-        """Returns the packets of a log of `ncs loop`: the steps at which those that arrived were sent and received."""
-        arrivals: dict[str, dict[int, int]] = {}
-        for number, row in _rows(lines, 2, path):
-            try:
-                sent, received = (int(row[column]) for column in columns)
-                arrived = arrivals.setdefault(row[episode], {})
-            except (ValueError, IndexError):
-                raise ValueError(
-                    f"line {number} of {shown(path)} is not an episode, a step sent and one received"
-                ) from None
-            arrived[sent] = min(received, arrived.get(sent, received))  # a second one is a duplicate
-        _require_moderate(sum(max(*arrived, 0) for arrived in arrivals.values()))
-        delays = [
-            arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)
-        ]
-        return cls(dt * np.arange(len(delays)), dt * np.array(delays))
-
-    @classmethod
-    def _of_csv(cls, lines: Iterable[str], columns: list[int], path: str | os.PathLike[str]) -> Self:
-        packets = []
-        for number, row in _rows(lines, 1, path):
-            cells = [cell.strip() for cell in row]
-            if not any(cells):
-                continue
-            try:
-                sent, received = (cells[column] if column < len(cells) else "" for column in columns)
-                sent, received = float(sent), float(received) if received else np.nan
-            except ValueError:
-                if packets or number > 1:
-                    raise ValueError(f"line {number} of {shown(path)} is not a time sent and a time received") from None
-                continue  # the names of the columns
-            packets.append((sent, received - sent))
-        sent, delays = np.array(packets).reshape(-1, 2).T
-        order = np.argsort(sent, kind="stable")
-        return cls(sent[order], delays[order])
-
-    @classmethod
-    def _of_ping(cls, lines: Iterable[str], period: float) -> Self:
-        answers: dict[int, float] = {}
-        stamps: dict[int, float] = {}
-        last, wraps = 0, 0
-        for line in lines:
-            if (found := _PING.match(line)) is None:
-                continue
-            number = int(found["number"]) + 65536 * wraps
-            if number < last - 32768:  # numbers begin anew after 65535
-                wraps, number = wraps + 1, number + 65536
-            last = max(last, number)
-            if found["time"] is not None and number not in answers:  # a second answer is a duplicate
-                answers[number] = float(found["time"]) / 1000.0
-                if found["stamp"] is not None:
-                    stamps[number] = float(found["stamp"]) - answers[number]
-            else:
-                answers.setdefault(number, np.nan)
-        if not answers:
-            raise ValueError("no packet of ping has a number")
-        _require_moderate(max(answers) - min(answers) + 1)
-        numbers = np.arange(min(answers), max(answers) + 1)
-        delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
-        if len(stamps) > 1:
-            known = sorted(stamps)
-            sent = np.interp(numbers, known, np.maximum.accumulate([stamps[each] for each in known]))
-            slope = (stamps[known[-1]] - stamps[known[0]]) / (known[-1] - known[0])
-            sent[numbers > known[-1]] = stamps[known[-1]] + slope * (numbers[numbers > known[-1]] - known[-1])
-            sent[numbers < known[0]] = stamps[known[0]] - slope * (known[0] - numbers[numbers < known[0]])
-        else:
-            sent = period * numbers
-        return cls(sent, delays)
+        return cls(record.sent, record.delays, record.read_as)
 
     @property
     def period(self) -> float:
-        """Median time between packets [s]."""
-        return float(np.median(np.diff(self.sent)))
+        """Median time between packets that are not sent at once [s]."""
+        gaps = np.diff(self.sent)
+        return float(np.median(gaps[gaps > 0.0]))
+
+    @property
+    def disagreement(self) -> str:
+        """A sentence where the span of the record and its number of packets disagree; empty where they do not."""
+        gaps, period = np.diff(self.sent), self.period
+        span, packets = self.sent[-1] - self.sent[0], len(self.sent)
+        expected = span / period + 1.0
+        if abs(packets / expected - 1.0) <= _DISAGREE:
+            return ""
+        pauses = gaps[gaps > _PAUSE * period]
+        sentence = (
+            f"Span and number of packets disagree: a packet every {1000.0 * period:.4g} ms for {span:.4g} s would be "
+            f"{expected:,.0f} packets, the record has {packets:,}"
+        )
+        if not len(pauses):
+            return f"{sentence}."
+        many = "in one pause" if len(pauses) == 1 else f"in {len(pauses):,} pauses"
+        return f"{sentence}. Nothing was sent {many}, {pauses.max():.4g} s at the longest, which count as lost."
 
     def trace(self, dt: float) -> tuple[int, ...]:
-        """Returns after how many control steps of duration dt each packet arrived, rounded up; -1 for a lost one.
+        """Returns after how many control steps of duration dt the sample of each `send_period` arrived.
 
-        A packet that is later than a channel can delay it counts as lost.
-        """
-        dt = as_number(dt, "dt", low=0.0, low_open=True)
-        steps = np.ceil(self.delays / dt - _SAME)
-        usable = np.isfinite(steps) & (steps <= LONGEST_DELAY)
-        return tuple(np.where(usable, steps, -1.0).astype(int).tolist())
-
-    def send_period(self, dt: float) -> int:
-        """Returns the number of control steps between packets, at least one.
+        It is -1 where the sample was lost or no packet was sent.
 
         Raises:
-            ValueError: If there are more than ten million.
+            ValueError: If the record spans more than ten million steps.
         """
-        steps = self.period / as_number(dt, "dt", low=0.0, low_open=True)
-        if not steps <= MOST_STEPS:
-            raise ValueError(f"packets are {steps:,.3g} control steps of {dt:g} s apart, more than {MOST_STEPS:,}")
-        return max(round(steps), 1)
+        return tuple(self._trace(dt).tolist())
+
+    def send_period(self, dt: float) -> int:
+        """Returns the largest number of control steps of which all samples are taken at multiples.
+
+        Raises:
+            ValueError: If the record spans more than ten million steps.
+        """
+        return max(int(np.gcd.reduce(self._samples(dt)[0])), 1)
 
     def channel(self, dt: float, *, quantization_step: float = 0.0) -> TraceChannel:
-        """Returns the channel that replays the log in control steps of duration dt [s]."""
+        """Returns the channel that replays the record in control steps of duration dt [s], with the ages of `ages`.
+
+        Raises:
+            ValueError: If the record spans more than ten million steps, or the trace has more than two million entries.
+        """
         return TraceChannel(trace=self.trace(dt), send_period=self.send_period(dt), quantization_step=quantization_step)
 
     def ages(self, dt: float) -> np.ndarray:
-        """Returns the age of the newest sample at every step, shape (steps,), from the first arrival on [steps].
+        """Returns the age of the newest sample that has arrived at every control step, shape (steps,) [steps].
 
-        Sample i is taken at step i times `send_period`.
+        That is the time since it was sent, rounded up to steps. As in environments the first estimate counts as a
+        sample of step 0.
 
         Raises:
-            ValueError: If these are more than ten million steps.
+            ValueError: If the record spans more than ten million steps.
         """
+        stamps, _ = self._samples(dt)
+        return replayed_ages(self._trace(dt), self.send_period(dt), int(stamps[-1]) + 1)
+
+    def left_out(self, dt: float) -> int:
+        """Returns how many packets are sent within a step that has one already, so that they are no samples."""
+        return len(self.sent) - len(self._samples(dt)[0])
+
+    def _samples(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the steps with a sample, and after how many steps each arrives, -1 if never; shape (steps,) each."""
+        dt = as_number(dt, "dt", low=0.0, low_open=True)
+        since = self.sent - self.sent[0]
+        if not since[-1] / dt < MOST_STEPS:
+            raise ValueError(
+                f"the record spans {since[-1] / dt:,.3g} control steps of {dt:g} s, more than {MOST_STEPS:,}: take a "
+                "longer step, a part of the record, or, if its times are not in seconds, name their unit (sent_ms)"
+            )
+        same = _SAME + 4.0 * np.spacing(np.abs(self.sent).max()) / dt
+        if same > _COARSE:
+            raise ValueError(f"the times of the record are too large to place packets in control steps of {dt:g} s")
+        steps = np.floor(since / dt + same)
+        stamps, first = np.unique(steps.astype(np.int64), return_index=True)
+        delays = np.maximum(np.ceil((since + self.delays)[first] / dt - same) - stamps, 0.0)
+        return stamps, np.where(delays <= LONGEST_DELAY, delays, -1.0).astype(np.int64)
+
+    def _trace(self, dt: float) -> np.ndarray:
+        stamps, delays = self._samples(dt)
         period = self.send_period(dt)
-        steps = len(self.sent) * period
-        if steps > MOST_STEPS:
-            raise ValueError(f"the record spans {steps:,} control steps of {dt:g} s, more than {MOST_STEPS:,}")
-        trace = np.array(self.trace(dt))
-        newest = np.full(steps, -1)
-        for i in np.flatnonzero(trace >= 0).tolist():
-            if (arrival := i * period + trace[i]) < steps:
-                newest[arrival] = max(newest[arrival], i * period)
-        newest = np.maximum.accumulate(newest)
-        return (np.arange(steps) - newest)[newest >= 0]
-
-
-def _require_moderate(packets: int) -> None:
-    if packets > MOST_PACKETS:
-        raise ValueError(f"a log has at most {MOST_PACKETS:,} packets, with those that were lost; this one {packets:,}")
-
-
-def _rows(lines: Iterable[str], first: int, path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
-    """Yields the rows of a CSV file with their numbers; raises ValueError for what is no such file."""
-    try:
-        yield from enumerate(csv.reader(lines), first)
-    except csv.Error as error:
-        raise ValueError(f"{shown(path)} is no CSV file: {error}") from error
+        trace = np.full(stamps[-1] // period + 1, -1)
+        trace[stamps // period] = delays
+        return trace

@@ -17,7 +17,7 @@ class LossState(NamedTuple):
     """The loss process of one channel (numbers) or of N (arrays of shape (N,)).
 
     Attributes:
-        bad: Whether the Gilbert-Elliott chain is in its bad state; of a `TraceChannel` the number of the next packet.
+        bad: Whether the Gilbert-Elliott chain is in its bad state; of a `TraceChannel` the number of the next sample.
         consecutive: Number of packets that were lost in a row so far.
     """
 
@@ -105,7 +105,7 @@ def transmit(
     size = sends.shape if isinstance(sends, np.ndarray) else None
     bad, consecutive = state
     if isinstance(channel, TraceChannel):
-        delay = np.where(sends, np.take(channel.trace, bad), -1)
+        delay = np.where(sends, channel.delays[bad], -1)
         following = (bad + sends) % len(channel.trace)
         return LossState(following, consecutive), int(delay) if size is None else delay
     loss: Any = channel.loss

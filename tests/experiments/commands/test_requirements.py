@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant
 from shields import Certificate, verify
-from tests.command import ncs
+from tests.command import ROOT, environment, ncs
 
 
 @pytest.fixture
@@ -50,5 +52,41 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     assert numbers["lost"] == sum(line.endswith(",") for line in lines)
     assert f"max_age = {numbers['kept']}" in found.stdout
-    assert numbers["kept"] <= numbers["promised"]
-    assert "The environment's contract, max_age = 4" in found.stdout
+    assert numbers["kept"] <= numbers["replay"]
+    assert "Read as a table: 'sent' in s, 'received' in s." in found.stdout
+    assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
+    assert max(map(len, found.stdout.splitlines())) <= 100
+
+
+@pytest.mark.parametrize("page", ["contracts.md", "requirements.md"])
+def test_pages_show_what_the_command_prints_of_the_record_of_the_example(page, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    path = ROOT / "examples" / "wifi_record.py"
+    subprocess.run([sys.executable, path], cwd=tmp_path, env=environment(), check=True, capture_output=True)
+    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+    assert found.returncode == 0, found.stderr
+    block = (ROOT / "docs" / page).read_text().partition("    ncs channel packets.csv")[2].partition("\n\n    ")[2]
+    shown = [line.removeprefix("    ") for line in block.splitlines()]
+    shown = shown[: next(n for n, line in enumerate(shown) if "in 0.169 % of steps" in line) + 1]
+    assert [line for line in shown if line and line != "..." and line not in found.stdout.splitlines()] == []
+
+
+def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
+    sent = [0.1 * i for i in range(100)] + [75.0 + 0.1 * i for i in range(1000)]
+    lines = "".join(f"{each},{each + 0.25}\n" for each in sent)
+    (tmp_path / "packets.csv").write_text("sent,received\n" + lines)
+    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/Convoy-v0")
+    assert found.returncode == 0, found.stderr
+    said = " ".join(found.stdout.split())
+    assert "Contract kept by the record: max_age = 653 (65.3 s; first half 653, second half" in said
+    assert "Span and number of packets disagree" in said
+    assert "was broken once" in said
+    assert "kept throughout" not in said
+
+
+def test_channel_refuses_a_file_in_one_sentence(tmp_path):
+    (tmp_path / "packets.csv").write_text("0,1\n1,2\n")
+    found = ncs("channel", tmp_path / "packets.csv")
+    assert found.returncode != 0
+    assert len(found.stderr.strip().splitlines()) == 1
+    assert "no names" in found.stderr

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.commands.channel import broken_contracts
+from experiments.analysis.stalls import broken_contracts, count_interval, stalls
 from ncs_gym import ChannelContract, PacketLog, TraceChannel, contract_of
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 
@@ -67,13 +67,25 @@ def test_stamps_of_ping_give_the_time_between_packets(tmp_path):
 
 
 def ages_by_hand(trace, period, steps):
-    """Looks at every packet at every step."""
+    """Looks at every packet at every step; the first estimate is one."""
     ages = []
     for step in range(steps):
         stamps = [i * period for i, d in enumerate(trace) if d >= 0 and i * period + d <= step]
-        if stamps:
-            ages.append(step - max(stamps))
+        ages.append(step - max(stamps, default=0))
     return ages
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_contract_of_a_replay_is_the_oldest_age_of_three_rounds(seed):
+    rng = np.random.default_rng(seed)
+    trace = tuple(np.where(rng.random(12) < 0.4, -1, rng.integers(0, 30, 12)).tolist())
+    channel = TraceChannel(trace=trace, send_period=int(rng.integers(1, 4)))
+    promised = contract_of(channel)
+    assert promised is not None
+    steps = 5 * 12 * channel.send_period
+    assert promised.max_age == max(ages_by_hand(5 * trace, channel.send_period, steps))
+    losses, delay = channel.max_consecutive_losses, channel.longest_delay
+    assert promised.max_age <= (losses + 1) * channel.send_period + delay - 1
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -84,7 +96,7 @@ def test_ages_are_those_of_the_newest_sample_and_within_the_contract_of_the_repl
     delays = np.where(np.array(trace) < 0, np.nan, np.array(trace, float))
     log = PacketLog(period * np.arange(60.0), delays)
     ages = log.ages(1.0)
-    assert ages.tolist() == ages_by_hand(trace, period, 60 * period)
+    assert ages.tolist() == ages_by_hand(trace, period, 59 * period + 1)
     promised = contract_of(log.channel(1.0))
     assert promised is not None
     assert ages.max() <= promised.max_age
@@ -128,22 +140,56 @@ def test_record_is_replayed_in_an_environment_single_and_vectorized_within_its_c
     assert len({tuple(row) for row in ages.T[:, :7]}) > 1  # from different packets on
 
 
-def test_share_of_broken_steps_and_its_interval():
+def test_stalls_are_counted_once_with_their_length_and_rate():
     ages = np.tile([0, 1, 2, 3], 500)
-    rows = {row["max_age"]: row for row in broken_contracts(ages, np.random.default_rng(0))}
-    assert rows[3]["broken"] == 0.0
-    assert rows[3]["broken_ci95"][0] == 0.0
-    assert rows[3]["broken_ci95"][1] == pytest.approx(3.0 / 50)
+    starts, lengths = stalls(ages, 1)
+    assert starts.tolist() == list(range(2, 2000, 4))
+    assert set(lengths.tolist()) == {2}
+    rows = {row["max_age"]: row for row in broken_contracts(ages, 0.1)}
+    assert list(rows) == [3, 2, 1, 0]
+    assert (rows[3]["times"], rows[3]["per_hour"], rows[3]["longest"]) == (0, 0.0, 0)
     assert rows[1]["broken"] == pytest.approx(0.5)
     assert rows[1]["times"] == 500
-    assert rows[1]["broken_ci95"][0] <= 0.5 <= rows[1]["broken_ci95"][1]
+    assert rows[1]["per_hour"] == pytest.approx(500 / (200.0 / 3600.0))
+    assert rows[1]["halves"] == pytest.approx(2 * [rows[1]["per_hour"]])
+    assert rows[1]["per_hour_ci95"][0] <= rows[1]["per_hour"] <= rows[1]["per_hour_ci95"][1]
 
 
-def test_interval_is_wider_where_losses_come_in_bursts():
-    rng = np.random.default_rng(0)
-    alone = (rng.random(20_000) < 0.05).astype(int)
-    bursts = np.repeat(rng.random(200) < 0.05, 100).astype(int)
-    widths = [
-        np.diff(broken_contracts(ages, np.random.default_rng(1))[1]["broken_ci95"])[0] for ages in (alone, bursts)
+def test_table_has_few_rows_and_the_age_that_is_asked_for():
+    ages = np.arange(3000)
+    assert [row["max_age"] for row in broken_contracts(ages, 0.1, also=77)] == [
+        *(1000, 500, 200, 100, 77, 50, 20),
+        *range(10, -1, -1),
     ]
-    assert widths[1] > 2.0 * widths[0]
+    assert [row["max_age"] for row in broken_contracts(np.array([0, 1, 1]), 0.1, also=4)] == [4, 1, 0]
+
+
+def test_interval_of_independent_stalls_is_that_of_poisson():
+    assert count_interval(np.array([], dtype=int), 10_000) == (0.0, pytest.approx(3.689, abs=1e-3))
+    low, high = count_interval(np.arange(50, 10_000, 100), 10_000)
+    assert (low, high) == pytest.approx((81.36, 121.63), abs=0.01)  # Garwood's for 100
+
+
+def test_interval_counts_one_cluster_of_stalls_as_one():
+    starts = 5000 + np.arange(50)
+    low, high = count_interval(starts, 10_000)
+    assert low < 50 / 20
+    assert high > 50 * 5
+
+
+@pytest.mark.parametrize("tail", [None, 2.5])
+def test_interval_covers_the_rate_of_stalls_in_clusters(tail):
+    rng, steps = np.random.default_rng(0), 500_000
+
+    def record(length):
+        clusters = []
+        for begin in rng.integers(length, size=rng.poisson(length * 4e-5)):
+            size = 1 + (rng.poisson(10) if tail is None else min(int(10 * rng.pareto(tail)), 10_000))
+            clusters.append(begin + np.cumsum(rng.exponential(50.0, size)).astype(int))
+        starts = np.concatenate(clusters)
+        return np.sort(starts[starts < length])
+
+    expected = np.mean([len(record(steps)) for _ in range(1000)])
+    intervals = np.array([count_interval(record(steps), steps) for _ in range(200)])
+    covered = ((intervals[:, 0] <= expected) & (expected <= intervals[:, 1])).mean()
+    assert covered > 0.88  # of independent stalls it would be below a half

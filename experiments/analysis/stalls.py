@@ -1,0 +1,83 @@
+"""Stalls of a recorded network: stretches whose newest sample is older than a contract allows, and their rate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from ncs_gym.network.contract import MAX_AGE
+
+# The record is cut into so many parts, into twice as many, and so on, to see how unevenly stalls are spread.
+_FEWEST_PARTS, _MOST_PARTS = 4, 4096
+# Ages of a table: all up to the first, then these of every decade.
+_ALL_UP_TO, _OF_A_DECADE = 10, (2, 5, 10)
+
+
+def stalls(ages: np.ndarray, max_age: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where stretches of older samples begin, and how long each is, shape (stalls,) each [steps].
+
+    Args:
+        ages: Age of the newest sample at every step, shape (k,) [steps].
+        max_age: The oldest age that is no stall [steps].
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (ages > max_age).astype(np.int8), [0]])))
+    return edges[::2], edges[1::2] - edges[::2]
+
+
+def count_interval(starts: np.ndarray, steps: int) -> tuple[float, float]:
+    """Returns a 95 % interval for the expected number of stalls in a record as long as this one.
+
+    Stalls come in clusters, so they are not taken for independent. The record is cut into 4, 8, 16, ... equal parts,
+    and D is the largest ratio of variance to mean of the numbers of stalls in these parts, at least 1, as of
+    independent stalls. The n stalls then count as n / D independent clusters of D stalls (quasi-Poisson), for which the
+    interval is Garwood's: D times the quantiles of chi-square with 2 n / D and 2 n / D + 2 degrees of freedom, halved.
+    It assumes that the network goes on as in the record, that clusters are shorter than a quarter of it, and that the
+    record has some of the large ones: of heavy-tailed clusters it needs twenty or more.
+
+    Args:
+        starts: Steps at which stalls begin, shape (n,).
+        steps: Length of the record.
+    """
+    spread, parts = 1.0, _FEWEST_PARTS
+    while len(starts) and parts <= min(_MOST_PARTS, steps):
+        counts = np.bincount(starts * parts // steps, minlength=parts)
+        spread, parts = max(spread, float(counts.var(ddof=1) / counts.mean())), 2 * parts
+    clusters = len(starts) / spread
+    low = spread * chi2.ppf(0.025, 2.0 * clusters) / 2.0 if clusters else 0.0
+    return float(low), float(spread * chi2.ppf(0.975, 2.0 * clusters + 2.0) / 2.0)
+
+
+def broken_contracts(ages: np.ndarray, dt: float, also: int | None = None) -> list[dict[str, Any]]:
+    """Returns how often contracts would have been broken in a record, once for every stall.
+
+    Args:
+        ages: Age of the newest sample at every step, shape (k,) [steps].
+        dt: Duration of a step [s].
+        also: A `max_age` that is among them.
+
+    Returns:
+        Rows of JSON values, from the age that was kept, or the largest a contract can have, down to 0: all ages up to
+        10 and some larger ones. `halves` are the rates per hour of stalls that begin in either half of the record.
+    """
+    largest, steps = min(int(ages.max()), MAX_AGE), len(ages)
+    decades = (10**power * each for power in (1, 2) for each in _OF_A_DECADE)
+    chosen = {*range(_ALL_UP_TO + 1), *decades, largest} | ({also} if also is not None else set())
+    hours = steps * dt / 3600.0
+    rows = []
+    for age in sorted((each for each in chosen if each <= largest or each == also), reverse=True):
+        starts, lengths = stalls(ages, age)
+        first = int((starts < steps // 2).sum())
+        rows.append(
+            {
+                "max_age": age,
+                "times": len(starts),
+                "per_hour": len(starts) / hours,
+                "per_hour_ci95": [bound / hours for bound in count_interval(starts, steps)],
+                "longest": int(lengths.max(initial=0)),
+                "broken": float(lengths.sum() / steps),
+                "halves": [2.0 * first / hours, 2.0 * (len(starts) - first) / hours],
+            }
+        )
+    return rows

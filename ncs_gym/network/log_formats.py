@@ -1,0 +1,623 @@
+"""Formats of files with recorded packets: tables, ping, fping, logs of `ncs loop`, lists of round trips, irtt.
+
+Every reader returns the times that stand in the file and says how it took them. What is ambiguous is refused.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import os
+import re
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal, InvalidOperation
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+
+from ncs_gym.reading import LARGEST_LOG, MOST_LINES, json_values, read_file, require_packets
+from ncs_gym.validation import shown
+
+
+class Record(NamedTuple):
+    """What a file says.
+
+    Attributes:
+        sent: When each packet was sent, shape (k,), ascending [s].
+        delays: How long each was on its way, shape (k,); NaN for a lost one [s].
+        read_as: How the file was read, in sentences.
+        may_be_milliseconds: Whether times without a unit were taken for seconds, but most delays exceed one.
+    """
+
+    sent: np.ndarray
+    delays: np.ndarray
+    read_as: str
+    may_be_milliseconds: bool = False
+
+
+# Longer lines are not ping's, and longer cells are no numbers [characters].
+_LONGEST_LINE, _LONGEST_CELL = 1000, 64
+
+
+def read_record(path: str | os.PathLike[str], period: float | None, step: float) -> Record:
+    """Returns the record in a file.
+
+    Args:
+        path: The file.
+        period: Time between packets where the file does not say it; None if that is not known [s].
+        step: Duration of the steps of `ncs loop` [s].
+
+    Raises:
+        ValueError: If the file cannot be read, or is none of the formats, or ambiguous.
+    """
+    try:
+        text = _decoded(read_file(path, LARGEST_LOG))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read packets from {shown(path)}: {error}") from error
+    if text.count("\n") > MOST_LINES:
+        raise ValueError(f"{shown(path)} has more than {MOST_LINES:,} lines, a log of packets has at most so many")
+    try:
+        if any(each.search(text) for each in (_ANY_PING, _ANY_FPING, _ANY_WINDOWS)):
+            return _of_ping(text, period)
+        if text.lstrip()[:1] in ("{", "["):
+            return _of_json(text)
+        return _of_table(text.splitlines(), period, step)
+    except csv.Error as error:
+        raise ValueError(f"{shown(path)} is no CSV file: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{shown(path)}: {error}") from None
+
+
+def _many(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def _decoded(content: bytes) -> str:
+    """Returns the text of a file in UTF-8 or UTF-16, as PowerShell writes it, with or without a byte-order mark."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16")
+    if content[1:2] == b"\0":
+        return content.decode("utf-16-le")
+    if content[:1] == b"\0":
+        return content.decode("utf-16-be")
+    return content.decode("utf-8-sig")
+
+
+# ---------------------------------------------------------------- ping
+
+_MILLISECONDS = r"(?P<time>\d+(?:[.,]\d+)?) ?ms"
+# A line of ping: the stamp that -D prints, the number of the packet, and the time until its answer.
+_PING = re.compile(
+    rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?.*?\b(?:icmp_)?seq[= ](?P<number>\d+)\b(?:.*?[^\W\d]+[=<]{_MILLISECONDS})?"
+)
+_FPING = re.compile(
+    rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?(?P<host>\S+) +: \[(?P<number>\d+)\], (?:timed out|\d+ bytes, {_MILLISECONDS})"
+)
+_WINDOWS = re.compile(rf"Reply from \S+: (?:bytes=\d+ )?time[=<]{_MILLISECONDS}")
+_WINDOWS_LOST = re.compile(
+    r"(?P<timeout>Request timed out)|Reply from \S+: |General failure|PING: transmit failed|Hardware error"
+)
+_WINDOWS_FRAME = re.compile(r"Pinging |Ping statistics for |Packets: |Approximate round trip|Minimum = |Control-|\^C|$")
+# Whether a text is one of these.
+_ANY_PING = re.compile(r"\bicmp_seq[= ]\d|\bseq=\d+ (?:ttl|hlim)=|^PING ", re.MULTILINE)
+_ANY_FPING = re.compile(r"^(?:\[\d+\.\d+\] ?)?\S+ +: \[\d+\], ", re.MULTILINE)
+_ANY_WINDOWS = re.compile(r"^(?:Pinging \S+ |Reply from \S+: |Request timed out)|\d ?ms TTL=\d", re.MULTILINE)
+# How many packets were sent and answered, and how long ping ran; by Linux, BusyBox and macOS, Windows, and fping.
+_SUMMARIES = (
+    re.compile(r"\s*(\d+) [^\d,]+, (\d+) [^\d,%]+,.*?%(?:.*, [^\d,]+ (\d+) ?ms)?"),
+    re.compile(r"\s*Packets: Sent = (\d+), Received = (\d+)()"),
+    re.compile(r"\S+ +: xmt/rcv/%loss = (\d+)/(\d+)/()"),
+)
+# The first number is 0 where the header has "56 data bytes" behind a colon (BusyBox, macOS); Linux counts from 1.
+_FROM_ZERO = re.compile(r"PING6|PING .*: \d+ data bytes")
+# Numbers begin anew after 65535.
+_NUMBERS = 65536
+# Windows waits so long for an answer before it sends the next packet, unless told otherwise [s].
+_WINDOWS_TIMEOUT = 4.0
+_WAY_AND_BACK = "delays are those of the whole way and back"
+
+
+class _Summary(NamedTuple):
+    transmitted: int
+    received: int
+    duration: float | None
+
+
+def _of_ping(text: str, period: float | None) -> Record:
+    """Returns the packets of ping or fping, of Linux, BusyBox, macOS or Windows."""
+    lines = text.splitlines()
+    for number, line in enumerate(lines, 1):
+        if len(line) > _LONGEST_LINE:
+            raise ValueError(f"line {number} is longer than any of ping")
+    if sum(line.startswith(("PING", "Pinging ")) for line in lines) > 1:
+        raise ValueError("it holds several runs of ping: put each into a file of its own")
+    found = [match for line in lines for pattern in _SUMMARIES if (match := pattern.match(line))]
+    summary = None
+    if found:
+        transmitted, received, duration = found[-1].groups()
+        summary = _Summary(int(transmitted), int(received), int(duration) / 1000.0 if duration else None)
+        require_packets(summary.transmitted)
+    if _ANY_FPING.search(text):
+        return _of_numbers(lines, _FPING, "fping", summary, period)
+    if _ANY_PING.search(text):
+        return _of_numbers(lines, _PING, "ping", summary, period)
+    return _of_windows(lines, summary, period)
+
+
+def _of_numbers(
+    lines: Sequence[str], pattern: re.Pattern[str], program: str, summary: _Summary | None, period: float | None
+) -> Record:
+    """Returns the packets of a program that numbers them; a number without an answer is a lost packet."""
+    answers: dict[int, float] = {}
+    stamps: dict[int, float] = {}
+    hosts, last, turns, origin = set(), 0, 0, None
+    for line in lines:
+        if (found := pattern.match(line)) is None:
+            continue
+        hosts.add(found.groupdict().get("host"))
+        number = int(found["number"]) + _NUMBERS * turns
+        if number < last - _NUMBERS // 2:
+            turns, number = turns + 1, number + _NUMBERS
+        last = max(last, number)
+        known = answers.setdefault(number, np.nan)
+        if found["time"] is not None and np.isnan(known):  # a further answer is a duplicate
+            answers[number] = _milliseconds(found["time"])
+            if found["stamp"] is not None:
+                stamp = Decimal(found["stamp"])
+                origin = stamp if origin is None else origin
+                stamps[number] = float(stamp - origin) - answers[number]
+    if len(hosts) > 1:
+        raise ValueError("it has the answers of several hosts: put each into a file of its own")
+    if not answers:
+        raise ValueError("no packet of ping has a number")
+    first, last = min(answers), max(answers)
+    header = next((line for line in lines if line.startswith("PING")), None)
+    begins = 0 if first == 0 or program == "fping" or (header is not None and _FROM_ZERO.match(header)) else 1
+    if header is not None:
+        first = min(first, begins)
+    if summary is not None:
+        last = max(last, begins + summary.transmitted - 1)
+    require_packets(last - first + 1)
+    numbers = np.arange(first, last + 1)
+    delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
+    if len(stamps) > 1:
+        sent, how = _between_stamps(numbers, stamps), "sent when its stamps say"
+    else:
+        between, how = _period_of(summary, period)
+        sent = between * (numbers - first)
+    notes = _disagreements(summary, delays)
+    return Record(sent, delays, f"Read as the output of {program}: {_WAY_AND_BACK}, packets were {how}.{notes}")
+
+
+def _of_windows(lines: Sequence[str], summary: _Summary | None, period: float | None) -> Record:
+    """Returns the packets of Windows' ping, which has no numbers: a line that is not understood might be a lost packet.
+
+    The next packet is sent a period after an answer, but only after the timeout where there is none.
+    """
+    every = 1.0 if period is None else period
+    delays, gaps = [], []
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if found := _WINDOWS.match(line):
+            delays.append(_milliseconds(found["time"]))
+            gaps.append(max(every, delays[-1]))
+        elif found := _WINDOWS_LOST.match(line):
+            delays.append(np.nan)
+            gaps.append(max(every, _WINDOWS_TIMEOUT) if found["timeout"] else every)
+        elif not _WINDOWS_FRAME.match(line):
+            raise ValueError(f"line {number} is not understood: of Windows' ping only the English output is")
+    missing = 0 if summary is None else max(summary.transmitted - len(delays), 0)
+    require_packets(len(delays) + missing)
+    delays, gaps = np.array(delays + missing * [np.nan]), gaps + missing * [every]
+    return Record(
+        np.cumsum([0.0, *gaps])[:-1],
+        delays,
+        f"Read as the output of ping on Windows: {_WAY_AND_BACK}; a packet was sent {every:g} s after the one before, "
+        f"or {_WINDOWS_TIMEOUT:g} s after one that timed out, which is how long Windows waits unless told otherwise."
+        f"{_disagreements(summary, delays)}",
+    )
+
+
+def _milliseconds(text: str) -> float:
+    return float(text.replace(",", ".")) / 1000.0
+
+
+def _between_stamps(numbers: np.ndarray, stamps: dict[int, float]) -> np.ndarray:
+    """Returns when packets were sent, those without a stamp evenly between their neighbors, shape (k,) [s]."""
+    known = np.array(sorted(stamps))
+    times = np.maximum.accumulate([stamps[each] for each in known.tolist()])
+    slope = float(np.median(np.diff(times) / np.diff(known)))
+    sent = np.interp(numbers, known, times)
+    before, after = numbers < known[0], numbers > known[-1]
+    sent[before] = times[0] - slope * (known[0] - numbers[before])
+    sent[after] = times[-1] + slope * (numbers[after] - known[-1])
+    return sent
+
+
+def _period_of(summary: _Summary | None, period: float | None) -> tuple[float, str]:
+    """Returns the time between packets [s], and how that is known."""
+    measured = None
+    if summary is not None and summary.duration and summary.transmitted > 1:
+        measured = summary.duration / (summary.transmitted - 1)
+    if period is None and measured is not None:
+        return measured, f"sent every {1000.0 * measured:.4g} ms by the duration in its summary"
+    if period is None:
+        return 1.0, "sent every second, as is usual (ping -D prints when)"
+    disagrees = measured is not None and not 0.9 < period / measured < 1.1
+    but = f", although by its summary every {1000.0 * (measured or 0.0):.4g} ms" if disagrees else ""
+    return period, f"sent every {1000.0 * period:.4g} ms as asked for{but}"
+
+
+def _disagreements(summary: _Summary | None, delays: np.ndarray) -> str:
+    """Returns a sentence where the file has not as many packets and answers as its summary says."""
+    answers = int(np.isfinite(delays).sum())
+    if summary is None or (len(delays), answers) == summary[:2]:
+        return ""
+    return (
+        f" Its summary has {summary.transmitted:,} packets and {summary.received:,} answers, its lines {len(delays):,} "
+        f"and {answers:,}: lines are missing or are counted twice."
+    )
+
+
+# -------------------------------------------------------------- tables
+
+_ROLES = {
+    "sent": "sent send tx sent_time send_time time_sent time_send tx_time t_sent t_send t_tx sent_at send_at "
+    "sent_timestamp send_timestamp tx_timestamp timestamp_sent departure departure_time",
+    "received": "received recv receive rx received_time receive_time recv_time time_received time_recv rx_time "
+    "t_received t_recv t_rx received_at receive_at recv_at received_timestamp receive_timestamp recv_timestamp "
+    "rx_timestamp timestamp_received arrival arrival_time arrived",
+    "delay": "delay latency rtt owd one_way_delay round_trip round_trip_time roundtrip roundtrip_time",
+    "number": "seq seqno seq_no sequence sequence_number sequence_no number packet packet_number packet_id icmp_seq",
+    "episode": "episode",
+    "lost": "lost dropped",
+}
+_ROLE_OF = {name: role for role, names in _ROLES.items() for name in names.split()}
+# Units in the names of columns [s].
+_UNITS = {
+    unit: Decimal(scale)
+    for units, scale in (
+        ("s sec secs second seconds", "1"),
+        ("ms msec milliseconds", "1e-3"),
+        ("us usec microseconds", "1e-6"),
+        ("ns nsec nanoseconds", "1e-9"),
+    )
+    for unit in units.split()
+}
+_SUFFIX = re.compile(rf"_({'|'.join(_UNITS)})$")
+# Times since 1970 of these decades, by the number before the point: a column without a unit is in this one.
+_EPOCHS = ((Decimal(10) ** 11, "ms"), (Decimal(10) ** 14, "us"), (Decimal(10) ** 17, "ns"), (Decimal(10) ** 20, ""))
+# Numbers that mark what is lost, and a limit of all others.
+_MARKS = {Decimal(0), Decimal(-1)}
+_LARGEST_COUNT = 2**53
+_LARGEST = Decimal(10) ** 305
+_LOST = {"", "na", "n/a", "nan", "none", "null", "-", "--", "*", "lost", "timeout"}
+_YES, _NO = {"1", "1.0", "true", "yes", "y"}, {"0", "0.0", "false", "no", "n", ""}
+_SINCE = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class _Column(NamedTuple):
+    index: int
+    name: str
+    unit: str  # "" where the name has none
+
+
+def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record:
+    """Returns the packets of a table whose columns have names, or of one number per line."""
+    head = next(((n, line) for n, line in enumerate(lines) if line.strip().lstrip("#").strip()), None)
+    if head is None:
+        raise ValueError("a log needs at least two packets")
+    number, line = head
+    rest = lines[number + 1 :]
+    if "#" in line and (found := next(((n, each) for n, each in enumerate(lines) if _is_data(each)), None)):
+        # Of lines of comment in front of the numbers the last one may have the names.
+        number, rest = found[0], lines[found[0] :]
+        line = next((each for each in reversed(lines[: found[0]]) if each.strip()), line)
+    line = line.strip().lstrip("#").strip()
+    separator = next((each for each in ",;\t|" if each in line), " ")
+    if separator == " ":
+        line = re.sub(r"\s+(?=[(\[])", "", line)  # a unit in brackets belongs to the name before it
+    names = next(iter(_rows([line], separator, 1)))[1]
+    if all(_is_number(name) for name in names):
+        if len(names) == 1:
+            return _of_list(_rows(lines[head[0] :], separator, head[0] + 1), period)
+        raise ValueError(
+            "its columns have no names, and neither their order nor their unit can be guessed safely: write them into "
+            "the first line, as in sent_ms,received_ms"
+        )
+    columns = _columns(names)
+    first = len(lines) - len(rest) + 1
+    rows = _rows(rest, separator, first, len(names))
+    if {"episode", "sent", "received"} <= columns.keys():
+        return _of_steps(rows, columns, step)
+    if "sent" in columns and ("received" in columns or "delay" in columns):
+        return _of_times(rows, columns, names)
+    if set(columns) - {"number", "lost"} == {"delay"}:
+        if not columns["delay"].unit:
+            raise ValueError(f"the column {shown(names[columns['delay'].index])} has no unit: name it rtt_ms or rtt_s")
+        return _of_list(rows, period, columns)
+    raise ValueError(
+        f"it has the columns {', '.join(map(shown, names))}; a log needs sent and received, or sent and delay, or one "
+        "column of round trips, rtt_ms, with the units in their names (_s, _ms, _us, _ns)"
+    )
+
+
+def _is_data(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _rows(
+    lines: Sequence[str], separator: str, first: int, width: int | None = None
+) -> Iterator[tuple[int, list[str]]]:
+    """Yields the cells of the rows with their numbers, without empty lines and comments."""
+    # A stretch of white space separates, or any other separator with white space around it.
+    texts = (" ".join(line.split()) if separator == " " else line for line in lines)
+    for number, cells in enumerate(csv.reader(texts, delimiter=separator, skipinitialspace=True), first):
+        cells = [cell.strip() for cell in cells]
+        if not any(cells) or cells[0].startswith("#"):
+            continue
+        if width is not None and separator == " " and len(cells) != width:
+            raise ValueError(
+                f"line {number} has {len(cells)} columns instead of {width}: mark what is missing, as by NA"
+            )
+        if width is not None and any(cells[width:]):
+            raise ValueError(f"line {number} has more columns than the names in the first line")
+        yield number, cells
+
+
+def _columns(names: Sequence[str]) -> dict[str, _Column]:
+    """Returns the columns that are understood, by what they hold."""
+    columns: dict[str, _Column] = {}
+    for index, name in enumerate(names):
+        spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).replace("µ", "u").replace("μ", "u")
+        plain = re.sub(r"[^a-z0-9]+", "_", spaced.lower()).strip("_")
+        suffix = _SUFFIX.search(plain)
+        role = _ROLE_OF.get(plain) or _ROLE_OF.get(_SUFFIX.sub("", plain))
+        if role in columns:
+            raise ValueError(f"the columns {shown(columns[role].name)} and {shown(name)} may both be what was {role}")
+        if role is not None:
+            columns[role] = _Column(index, name, suffix[1] if suffix and plain not in _ROLE_OF else "")
+    return columns
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return _number(cell) is None or True
+    except ValueError:
+        return False
+
+
+def _number(cell: str) -> Decimal | None:
+    """Returns the number or the time of day in a cell, None for a mark of what is lost; raises ValueError otherwise."""
+    if len(cell) > _LONGEST_CELL:
+        raise ValueError("too long")
+    try:
+        value = Decimal(cell)
+    except InvalidOperation:
+        return _no_plain_number(cell)
+    if value.is_nan():
+        return None
+    if not -_LARGEST < value < _LARGEST:
+        raise ValueError("too large")
+    return value
+
+
+def _no_plain_number(cell: str) -> Decimal | None:
+    if cell.lower() in _LOST:
+        return None
+    if re.fullmatch(r"[+-]?\d+,\d+", cell):  # a decimal comma, where commas do not separate
+        return Decimal(cell.replace(",", "."))
+    moment = datetime.fromisoformat(cell)
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return Decimal((moment - _SINCE) // timedelta(microseconds=1)) / 10**6
+
+
+def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column], names: Sequence[str]) -> Record:
+    """Returns the packets of a table with the time at which each was sent, and that of its arrival or its delay."""
+    sent_at, by = columns["sent"], "received" if "received" in columns else "delay"
+    until = columns[by]
+    sent, delays, marked, at_zero, numbers, flagged = [], [], [], [], [], []
+    origin, unit, until_unit, scale, until_scale = Decimal(0), "", "", Decimal(1), Decimal(1)
+    for line, cells in rows:
+        cells += (len(names) - len(cells)) * [""]
+        try:
+            start, end = _number(cells[sent_at.index]), _number(cells[until.index])
+            if "number" in columns:
+                numbers.append(_count(cells[columns["number"].index]))
+            if "lost" in columns:
+                flagged.append(_flag(cells[columns["lost"].index]))
+        except ValueError:
+            _refuse_line(line, by)
+        if start is None:
+            _refuse_line(line, by)
+        if not sent:
+            unit, until_unit = _units(sent_at, until, by, start)
+            scale, until_scale = _UNITS[unit], _UNITS[until_unit]
+            origin = start * scale
+        start *= scale
+        sent.append(float(start - origin))
+        if end is None:
+            delays.append(np.nan)
+            continue
+        if end in _MARKS and (by == "delay" or start > end):  # a lost packet, marked by a number
+            marked.append(len(delays))
+        elif end == start == 0:  # as in the other lines, if zeros are marks there
+            at_zero.append(len(delays))
+        delays.append(float(end * until_scale - start if by == "received" else end * until_scale))
+    if len(sent) < 2:
+        raise ValueError("a log needs at least two packets, each with the time at which it was sent")
+    require_packets(len(sent))
+    moments, delays = np.array(sent), np.array(delays)
+    marked += at_zero if marked else []
+    delays[marked] = np.nan
+    if flagged:
+        delays[flagged] = np.nan
+    order = np.argsort(moments, kind="stable")
+    moments, delays = moments[order], delays[order]
+    missing = 0
+    if "number" in columns:
+        before = len(moments)
+        moments, delays = _with_missing(moments, delays, np.array(numbers)[order])
+        missing = len(moments) - before
+    epoch = "" if origin < 10**8 else ", times since 1970"
+    used = {each.index for each in columns.values()}
+    unused = [shown(name) for index, name in enumerate(names) if index not in used]
+    read_as = f"Read as a table: {shown(sent_at.name)} in {unit}, {shown(until.name)} in {until_unit}{epoch}."
+    if marked:
+        read_as += f" A {shown(until.name)} of 0 or -1 stands for a lost packet ({_many(len(marked), 'line')})."
+    if missing:
+        read_as += f" A number without a line stands for a lost packet ({_many(missing, 'number')})."
+    if unused:
+        read_as += f" Not used: {', '.join(unused)}."
+    guessed = not sent_at.unit and unit == "s" and not until.unit
+    return Record(moments, delays, read_as, guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0)
+
+
+def _units(sent: _Column, until: _Column, by: str, first: Decimal) -> tuple[str, str]:
+    """Returns the units of two columns: those of their names, or of times since 1970, or seconds.
+
+    Where one of two times has a unit the other one has it, too.
+    """
+    magnitude = next((unit for above, unit in reversed(_EPOCHS) if abs(first) >= above), "")
+    own = sent.unit or (until.unit if by == "received" else "") or magnitude or "s"
+    return own, until.unit or (own if by == "received" else "s")
+
+
+def _count(cell: str) -> int:
+    value = int(cell)
+    if abs(value) > _LARGEST_COUNT:
+        raise ValueError("too large")
+    return value
+
+
+def _flag(cell: str) -> bool:
+    if cell.lower() in _YES:
+        return True
+    if cell.lower() in _NO:
+        return False
+    raise ValueError("not a flag")
+
+
+def _refuse_line(number: int, by: str) -> NoReturn:
+    second = "a time received" if by == "received" else "a delay"
+    raise ValueError(f"line {number} is not a time sent and {second}")
+
+
+def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the packets with those whose numbers are missing, evenly between their neighbors, and without duplicates.
+
+    What comes twice arrived when it came first. Numbers that go back begin anew, and nothing is missing there.
+    """
+    order = np.lexsort((np.where(np.isnan(delays), np.inf, delays), numbers, sent))
+    sent, delays, numbers = sent[order], delays[order], numbers[order]
+    once = np.append(True, (np.diff(numbers) != 0) | (np.diff(sent) > 0.0))
+    sent, delays, numbers = sent[once], delays[once], numbers[once]
+    steps = np.diff(numbers)
+    gaps = np.where(steps > 1, steps - 1, 0)
+    require_packets(len(sent) + int(np.minimum(gaps, 10**9).sum()))
+    before = np.repeat(np.arange(len(gaps)), gaps)
+    place = np.arange(len(before)) - np.repeat(np.cumsum(gaps) - gaps, gaps) + 1
+    added = sent[before] + (sent[before + 1] - sent[before]) * place / (gaps[before] + 1)
+    sent, delays = np.append(sent, added), np.append(delays, np.full(len(added), np.nan))
+    order = np.argsort(sent, kind="stable")
+    return sent[order], delays[order]
+
+
+def _of_steps(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column], dt: float) -> Record:
+    """Returns the packets of a log of `ncs loop`: the steps at which those that arrived were sent and received."""
+    arrivals: dict[str, dict[int, int]] = {}
+    for number, row in rows:
+        try:
+            sent, received = (_count(row[columns[role].index]) for role in ("sent", "received"))
+            arrived = arrivals.setdefault(row[columns["episode"].index], {})
+        except (ValueError, IndexError):
+            raise ValueError(f"line {number} is not an episode, a step sent and one received") from None
+        arrived[sent] = min(received, arrived.get(sent, received))  # a second one is a duplicate
+    require_packets(sum(max(*arrived, 0) for arrived in arrivals.values()))
+    delays = [arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)]
+    episodes = "one episode" if len(arrivals) == 1 else f"{len(arrivals):,} episodes, one after the other"
+    read_as = f"Read as a log of ncs loop: {episodes}, in steps of {dt:g} s; a step without a packet lost it."
+    return Record(dt * np.arange(len(delays)), dt * np.array(delays), read_as)
+
+
+def _of_list(
+    rows: Iterator[tuple[int, list[str]]], period: float | None, columns: dict[str, _Column] | None = None
+) -> Record:
+    """Returns the packets of a list of delays, one per line; without a name they are milliseconds, as ping's are."""
+    known = {"delay": _Column(0, "", "ms")} if columns is None else columns
+    column = known["delay"]
+    delays, numbers, marked, before = [], [], 0, None
+    for line, cells in rows:
+        if len(known) == 1:  # then an empty line between two others stands for a packet
+            empty = 0 if before is None else line - before - 1
+            require_packets(len(delays) + empty)
+            delays, marked, before = delays + empty * [np.nan], marked + empty, line
+        try:
+            value = _number(cells[column.index] if column.index < len(cells) else "")
+            if "number" in known:
+                numbers.append(_count(cells[known["number"].index]))
+            lost = "lost" in known and _flag(cells[known["lost"].index])
+        except (ValueError, IndexError):
+            raise ValueError(f"line {line} is not a delay") from None
+        marked += value in _MARKS
+        delays.append(np.nan if value is None or value in _MARKS or lost else float(value * _UNITS[column.unit]))
+    if len(delays) < 2:
+        raise ValueError("a log needs at least two packets")
+    require_packets(len(delays))
+    median = float(np.nanmedian(np.append(delays, -np.inf)))
+    if columns is None and median < 1e-3:
+        raise ValueError("numbers below 1 without a name may be seconds or milliseconds: write rtt_s or rtt_ms above")
+    every = 1.0 if period is None else period
+    sent, arrived = every * np.arange(len(delays)), np.array(delays)
+    if numbers:
+        if (np.diff(numbers) <= 0).any():
+            raise ValueError("the numbers of its packets do not ascend")
+        sent, arrived = _with_missing(every * (np.array(numbers) - numbers[0]), arrived, np.array(numbers))
+    name = "one number per line" if columns is None else shown(column.name)
+    read_as = f"Read as a list of delays: {name}, in {column.unit}, packets sent every {1000.0 * every:.4g} ms"
+    read_as += " (the file does not say)." if period is None else "."
+    if marked:
+        read_as += f" 0, -1 or an empty line stands for a lost packet ({_many(marked, 'line')})."
+    return Record(sent, arrived, read_as)
+
+
+# ---------------------------------------------------------------- JSON
+
+
+def _of_json(text: str) -> Record:
+    """Returns the round trips of irtt; that of iperf3 has counts of packets, but no times."""
+    try:
+        document = json_values(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"it is no JSON document that can be read: {error}") from None
+    trips = document.get("round_trips") if isinstance(document, dict) else None
+    if isinstance(trips, list):
+        return _of_irtt(trips)
+    if isinstance(document, dict) and {"intervals", "start"} <= document.keys():
+        raise ValueError(
+            "iperf3 counts packets per interval and records no times, from which no age follows: record with irtt, or "
+            "with ping -D"
+        )
+    keys = ", ".join(map(shown, document)) if isinstance(document, dict) else "no names"
+    raise ValueError(f"it is JSON with {keys}; of JSON documents only those of irtt are read (round_trips)")
+
+
+def _of_irtt(trips: list[Any]) -> Record:
+    """Returns the packets of irtt, by its monotonic clock if it has one [ns]."""
+    sent, delays = [], []
+    for number, trip in enumerate(trips):
+        try:
+            moments = trip["timestamps"]["client"]["send"]
+            moment = moments.get("monotonic", moments.get("wall"))
+            lost = trip["lost"] not in ("false", False)
+            delay = np.nan if lost else trip["delay"]["rtt"] / 1e9
+            sent.append(int(moment))
+            delays.append(float(delay))
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+            raise ValueError(f"round trip {number} of irtt has no time sent, or neither a delay nor a loss") from None
+    if len(sent) < 2:
+        raise ValueError("a log needs at least two packets, each with the time at which it was sent")
+    require_packets(len(sent))
+    order = np.argsort(sent, kind="stable")
+    moments = np.array([(each - sent[0]) / 1e9 for each in sent])[order]
+    return Record(moments, np.array(delays)[order], f"Read as the JSON of irtt: {_WAY_AND_BACK}.")

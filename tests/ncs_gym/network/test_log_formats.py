@@ -1,0 +1,364 @@
+"""Files with recorded packets: each kind gives the ages that follow from the times in it, and says how it was read."""
+
+from __future__ import annotations
+
+import codecs
+import copy
+import json
+import math
+import pickle
+import re
+from decimal import Decimal
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ncs_gym import NCSEnv, PacketLog, contract_of, truck_trailer
+
+
+def ages_by_clock(packets, dt):
+    """Looks at every packet at every step; packets are pairs of when sent and when received, None if never [s]."""
+    packets = [(Fraction(sent), None if received is None else Fraction(received)) for sent, received in packets]
+    dt, begins = Fraction(dt), min(Fraction(sent) for sent, _ in packets)
+    ends = max(sent for sent, _ in packets)
+    ages, now = [], begins
+    while now <= ends:
+        age = (now - begins) / dt  # of the first estimate
+        step = begins
+        while step <= now:
+            sample = next((packet for packet in packets if step <= packet[0] < step + dt), None)
+            if sample is not None and sample[1] is not None and sample[1] <= now:
+                age = min(age, math.ceil((now - sample[0]) / dt))
+            step += dt
+        ages.append(int(age))
+        now += dt
+    return ages
+
+
+class Kind(NamedTuple):
+    text: str | bytes
+    packets: list
+    dt: str
+    said: str  # words of how it was read
+    period: float | None = None
+
+
+def times(every, delays, begins="0"):
+    """Packets sent at equal distances, by their delays."""
+    sent = [Fraction(begins) + i * Fraction(every) for i in range(len(delays))]
+    return [(s, None if d is None else s + Fraction(d)) for s, d in zip(sent, delays, strict=True)]
+
+
+def ping(answers):
+    return "".join(f"64 bytes from 192.0.2.1: icmp_seq={i} ttl=64 time={time} ms\n" for i, time in answers)
+
+
+LINUX = "PING host (192.0.2.1) 56(84) bytes of data.\n"
+MACOS = "PING host (192.0.2.1): 56 data bytes\n"
+STAMPED = {1: "0.00", 2: "0.05", 3: "0.10", 4: "7.40", 5: "7.45", 7: "7.55"}
+IRTT = [(0, 0.017), (20, None), (40, 0.05), (95, 0.001), (100, 0.001), (120, 0.002)]
+
+KINDS = {
+    "ping with packets that are lost after the last answer": Kind(
+        f"{LINUX}{ping([(1, 12.3), (2, 80), (4, 12)])}\n--- host ping statistics ---\n"
+        "9 packets transmitted, 3 received, 66.6667% packet loss, time 400ms\nrtt min/avg/max/mdev = 1/2/3/4 ms\n",
+        times("0.05", ["0.0123", "0.08", None, "0.012", *5 * [None]]),
+        "0.05",
+        "sent every 50 ms by the duration in its summary",
+    ),
+    "ping with an answer after no answer yet": Kind(
+        f"{LINUX}{ping([(1, 12)])}no answer yet for icmp_seq=2\n{ping([(3, 11), (2, 1015), (3, 9)])}"
+        f"From 192.0.2.9 icmp_seq=4 Destination Host Unreachable\n{ping([(5, 11)])}",
+        times("1", ["0.012", "1.015", "0.011", None, "0.011"]),
+        "0.5",
+        "sent every second",
+    ),
+    "ping -D with a pause, and no packet on a multiple of the step": Kind(
+        "".join(f"[{Decimal('1700000010.012') + Decimal(sent)}] " + ping([(i, "12.0")]) for i, sent in STAMPED.items()),
+        [(sent, Fraction(sent) + Fraction("0.012")) for sent in STAMPED.values()] + [("7.50", None)],
+        "0.07",
+        "sent when its stamps say",
+    ),
+    "ping in another language": Kind(
+        f"{LINUX}{ping([(1, '12,3'), (3, '70,1')]).replace('time', 'Zeit')}\n--- host ping-Statistik ---\n"
+        "4 Pakete übertragen, 2 empfangen, 50% Paketverlust, Zeit 300ms\n",
+        times("0.1", ["0.0123", None, "0.0701", None]),
+        "0.05",
+        "sent every 100 ms",
+    ),
+    "ping of BusyBox": Kind(
+        f"{MACOS}{ping([(1, 1.234), (3, 2.1)]).replace('icmp_', '')}\n--- host ping statistics ---\n"
+        "6 packets transmitted, 2 packets received, 66% packet loss\nround-trip min/avg/max = 1/2/3 ms\n",
+        times("0.2", [None, "0.001234", None, "0.0021", None, None]),
+        "0.1",
+        "sent every 200 ms as asked for",
+        0.2,
+    ),
+    "ping of macOS": Kind(
+        f"{MACOS}Request timeout for icmp_seq 0\n{ping([(1, 11)])}Request timeout for icmp_seq 2\n{ping([(2, 1203)])}"
+        "Request timeout for icmp_seq 3\n\n--- host ping statistics ---\n"
+        "6 packets transmitted, 2 packets received, 66.7% packet loss\n",
+        times("1", [None, "0.011", "1.203", None, None, None]),
+        "0.5",
+        "sent every second",
+    ),
+    "ping of Windows in UTF-16": Kind(
+        codecs.BOM_UTF16_LE
+        + (
+            "\r\nPinging 192.0.2.1 with 32 bytes of data:\r\nReply from 192.0.2.1: bytes=32 time=12ms TTL=57\r\n"
+            "Request timed out.\r\nReply from 192.0.2.1: bytes=32 time<1ms TTL=57\r\n"
+            "Reply from 192.0.2.9: Destination host unreachable.\r\n\r\nPing statistics for 192.0.2.1:\r\n"
+            "    Packets: Sent = 5, Received = 2, Lost = 3 (60% loss),\r\n"
+        ).encode("utf-16-le"),
+        [("0", "0.012"), ("1", None), ("5", "5.001"), ("6", None), ("7", None)],
+        "0.5",
+        "4 s after one that timed out",
+    ),
+    "fping with stamps": Kind(
+        "[1700000000.10000] h : [0], 64 bytes, 100 ms (100 avg, 0% loss)\n"
+        "[1700000001.50000] h : [1], timed out (100 avg, 50% loss)\n"
+        "[1700000002.05000] h : [2], 64 bytes, 50.0 ms (75 avg, 33% loss)\n\nh : xmt/rcv/%loss = 4/2/50%, min/avg/max"
+        " = 50.0/75.0/100\n",
+        times("1", ["0.1", None, "0.05", None]),
+        "0.04",
+        "output of fping",
+    ),
+    "table in milliseconds since 1970 with missing numbers": Kind(
+        "\ufeffseq,size,send_time_ms,recv_time_ms\r\n7,60,1700000000000,1700000000012\r\n8,60,1700000000020,\r\n"
+        "11,60,1700000000080,1700000000095\r\n10,60,1700000000060,1700000000061\r\n",
+        times("0.02", ["0.012", None, None, "0.001", "0.015"]),
+        "0.02",
+        "times since 1970. A number without a line stands for a lost packet (1 number). Not used: 'size'",
+    ),
+    "table with semicolons, quotes and decimal commas": Kind(
+        '"sent";"received"\n"0,00";"0,011"\n"0,02";"NA"\n"0,04";"0,09"\n"0,06";"0,065"\n',
+        times("0.02", ["0.011", None, "0.05", "0.005"]),
+        "0.02",
+        "'sent' in s, 'received' in s",
+    ),
+    "table in microseconds with several packets in a step": Kind(
+        "tx_us\trx_us\n0\t30000\n7000\t8000\n14000\tnan\n21000\t\n28000\t29000\n49000\t60000\n56000\t57000\n"
+        "77000\t78000\n98000\t99000\n",
+        [
+            ("0", "0.03"),
+            ("0.007", "0.008"),
+            ("0.014", None),
+            ("0.021", None),
+            ("0.028", "0.029"),
+            ("0.049", "0.06"),
+            ("0.056", "0.057"),
+            ("0.077", "0.078"),
+            ("0.098", "0.099"),
+        ],
+        "0.02",
+        "'tx_us' in us",
+    ),
+    "table with a hole and packets between the steps": Kind(
+        "sent,received\n0,.01\n.1,.12\n.2,.21\n6.33,6.34\n6.43,6.44\n6.53,6.54\n",
+        [("0", ".01"), (".1", ".12"), (".2", ".21"), ("6.33", "6.34"), ("6.43", "6.44"), ("6.53", "6.54")],
+        "0.1",
+        "'sent' in s",
+    ),
+    "table in nanoseconds since 1970 whose lost packets have 0": Kind(
+        "sent,received\n1700000000000000000,0\n1700000000020000000,0\n1700000000040000000,1700000000059999000\n"
+        "1700000000060000000,1700000000061000000\n1700000000080000000,0\n1700000000100000000,0\n",
+        times("0.02", [None, None, "0.019999", "0.001", None, None]),
+        "0.02",
+        "in ns, times since 1970. A 'received' of 0 or -1 stands for a lost packet (4 lines)",
+    ),
+    "table with white space, a comment and delays": Kind(
+        "# recorded today\n# seq   sent[s]   rtt[ms]\n"
+        "  1   0      1.1\n  2   0.02   -\n\n  3   0.04   55\n  4   0.06   2\n",
+        times("0.02", ["0.0011", None, "0.055", "0.002"]),
+        "0.02",
+        "'rtt[ms]' in ms",
+    ),
+    "table with times of day and a flag": Kind(
+        "sent,received,lost\n2026-01-02T23:59:59.990Z,2026-01-03T00:00:00.001Z,false\n"
+        "2026-01-03T00:00:00.010Z,2026-01-03T00:00:00.011Z,true\n2026-01-03T00:00:00.030Z,2026-01-03T00:00:00.031Z,0\n",
+        [("0", "0.011"), ("0.02", None), ("0.04", "0.041")],
+        "0.02",
+        "times since 1970",
+    ),
+    "list of round trips": Kind(
+        "12.3\n\n0\n15\ntimeout\n55\n7\n8\n",
+        times("0.05", ["0.0123", None, None, "0.015", None, "0.055", "0.007", "0.008"]),
+        "0.05",
+        "one number per line, in ms, packets sent every 50 ms",
+        0.05,
+    ),
+    "named list of round trips": Kind(
+        "RTT (µs)\n12300\n-1\n15000\n",
+        times("1", ["0.0123", None, "0.015"]),
+        "0.5",
+        "in us, packets sent every 1000 ms (the file does not say)",
+    ),
+    "irtt": Kind(
+        json.dumps(
+            {
+                "round_trips": [
+                    {
+                        "seqno": i,
+                        "lost": "true_down" if rtt is None else "false",
+                        "timestamps": {"client": {"send": {"wall": 17 * 10**17, "monotonic": 10**6 * ms + 22211105}}},
+                        "delay": {} if rtt is None else {"rtt": round(rtt * 1e9)},
+                    }
+                    for i, (ms, rtt) in enumerate(IRTT)
+                ]
+            }
+        ),
+        [(Fraction(ms, 1000), rtt and Fraction(ms, 1000) + Fraction(str(rtt))) for ms, rtt in IRTT],
+        "0.02",
+        "JSON of irtt",
+    ),
+}
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(content):
+        (tmp_path / "record").write_bytes(content if isinstance(content, bytes) else content.encode())
+        return tmp_path / "record"
+
+    return write
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_ages_are_those_of_the_times_in_the_file(name, written):
+    kind = KINDS[name]
+    log = PacketLog.load(written(kind.text), kind.period)
+    expected = ages_by_clock(kind.packets, kind.dt)
+    assert log.ages(float(kind.dt)).tolist() == expected
+    assert len(log.sent) == len(kind.packets)
+    assert np.isnan(log.delays).sum() == sum(received is None for _, received in kind.packets)
+    assert kind.said in log.read_as
+    promised = contract_of(log.channel(float(kind.dt)))
+    assert promised is not None
+    assert promised.max_age >= max(expected)
+
+
+def test_first_packet_that_both_times_say_0_is_lost_where_zeros_mark_what_is_lost(written):
+    assert np.isnan(PacketLog.load(written("sent,received\n0,0\n1,0\n2,2.1\n")).delays[:2]).all()
+    assert PacketLog.load(written("sent,received\n0,0\n1,1.1\n2,2.1\n")).delays[0] == 0.0
+
+
+def test_sample_that_is_later_than_any_channel_allows_counts_as_lost():
+    log = PacketLog(np.arange(1500.0), np.array([*2 * [np.nan], 1000.0, 1001.0, *1496 * [np.nan]]))
+    assert log.trace(1.0)[:4] == (-1, -1, 1000, -1)
+    assert log.ages(1.0)[[1001, 1002, 1499]].tolist() == [1001, 1000, 1497]
+
+
+def test_share_of_lost_packets_counts_those_of_the_summary(written):
+    text = f"{LINUX}{ping([(i, 12) for i in range(1, 701)])}\n1000 packets transmitted, 700 received, 30% packet loss\n"
+    log = PacketLog.load(written(text))
+    assert (len(log.sent), np.isnan(log.delays).sum()) == (1000, 300)
+
+
+def test_summary_that_disagrees_is_named(written):
+    text = f"{LINUX}{ping([(1, 12), (2, 12)])}\n4 packets transmitted, 3 received, 25% packet loss, time 3000ms\n"
+    log = PacketLog.load(written(text), period=0.1)
+    assert "although by its summary every 1000 ms" in log.read_as
+    assert "4 packets and 3 answers, its lines 4 and 2" in log.read_as
+
+
+def test_span_and_number_of_packets_that_disagree_are_named(written):
+    rows = "".join(
+        f"{sent},{sent + 0.01}\n" for sent in [0.1 * i for i in range(100)] + [75.0 + 0.1 * i for i in range(9)]
+    )
+    log = PacketLog.load(written("sent,received\n" + rows))
+    assert "would be 759 packets, the record has 109" in log.disagreement
+    assert "in one pause, 65.1 s at the longest" in log.disagreement
+    assert log.ages(0.1).max() == 651  # one sent at 9.9 s is the newest until 75.1 s
+    promised = contract_of(log.channel(0.1))
+    assert promised is not None
+    assert promised.max_age == 651
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("0.0,0.1\n0.2,0.3\n", "no names"),
+        ("1 2\n3 4\n", "no names"),
+        ("time,value\n0,1\n1,2\n", "columns 'time', 'value'; a log needs sent and received"),
+        ("sent,arrives\n0,1\n1,2\n", "columns 'sent', 'arrives'"),
+        ("sent,tx_time,received\n0,0,1\n", "both be what was sent"),
+        ("sent,received\n0,02,0,03\n", "line 2 has more columns"),
+        ("sent received size\n0 60\n1 2 60\n", "line 2 has 2 columns instead of 3"),
+        ("sent,received,lost\n0,1,perhaps\n1,2,no\n", "line 2"),
+        ("rtt\n1\n2\n", "'rtt' has no unit"),
+        ("0.3\n0.4\n", "seconds or milliseconds"),
+        ("rtt_ms\n12\nslow\n", "line 3 is not a delay"),
+        (f"{LINUX}{ping([(1, 2)])}{LINUX}{ping([(1, 2)])}", "several runs"),
+        ("a : [0], 64 bytes, 1 ms (1 avg, 0% loss)\nb : [0], 64 bytes, 1 ms (1 avg, 0% loss)\n", "several hosts"),
+        ("Antwort von 192.0.2.1: Bytes=32 Zeit=12ms TTL=57\nZeitüberschreitung.\n", "only the English output"),
+        (f"{LINUX}\n3 packets transmitted, 0 received, 100% packet loss, time 3ms\n", "no packet of ping"),
+        ('{"start": {}, "intervals": []}', "iperf3 counts packets per interval and records no times"),
+        ('{"pings": []}', "JSON with 'pings'"),
+        ('{"round_trips": [{}]}', "round trip 0 of irtt"),
+        ("{", "no JSON"),
+        (b"\x1f\x8b\x08", "cannot read packets"),
+        ("sent,received\n0,1\n" + 70 * "1" + ",2\n", "line 3"),
+        (f"{LINUX}{2000 * 'x'} icmp_seq=1\n", "line 2 is longer"),
+        ("\n\n", "at least two packets"),
+    ],
+)
+def test_file_that_is_not_understood_is_refused_in_one_sentence(content, words, written):
+    with pytest.raises(ValueError, match=re.escape(words)) as refusal:
+        PacketLog.load(written(content))
+    assert "\n" not in str(refusal.value)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    name=st.sampled_from(sorted(KINDS)),
+    edits=st.lists(st.tuples(st.integers(0, 10**6), st.binary(max_size=4)), min_size=1, max_size=6),
+)
+@pytest.mark.filterwarnings("ignore:the times in")
+def test_damaged_file_is_read_or_refused_in_one_sentence(name, edits, written):
+    content = KINDS[name].text
+    content = bytearray(content if isinstance(content, bytes) else content.encode())
+    for place, new in edits:
+        place %= len(content)
+        content[place : place + max(len(new), 1)] = new
+    try:
+        assert PacketLog.load(written(bytes(content))).read_as
+    except ValueError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+
+
+PLANT = truck_trailer()
+RECORDS = st.lists(
+    st.tuples(st.integers(0, 9), st.one_of(st.none(), st.integers(0, 20))), min_size=2, max_size=9
+).filter(lambda record: any(gap for gap, _ in record[1:]))
+
+
+@settings(max_examples=25, deadline=None)
+@given(record=RECORDS)
+def test_replay_in_an_environment_has_the_ages_of_the_record(record):
+    sent = np.cumsum([0, *(gap for gap, _ in record[1:])]) / 4  # in quarters of a step
+    received = [None if delay is None else start + delay / 4 for start, (_, delay) in zip(sent, record, strict=True)]
+    log = PacketLog(sent, np.array([np.nan if r is None else r - s for s, r in zip(sent, received, strict=True)]))
+    ages, trace = log.ages(1.0), log.trace(1.0)
+    assert ages.tolist() == ages_by_clock(list(zip(sent, received, strict=True)), "1")
+    env = NCSEnv(PLANT, channel=log.channel(1.0), terminate_on_violation=False)
+    replayed = set()
+    for seed in range(200):  # the replay begins with a random sample
+        env.reset(seed=seed)
+        replayed.add(tuple(env.step(np.zeros(1))[4]["measurement_age"] for _ in range(len(ages) - 1)))
+        if tuple(ages[1:].tolist()) in replayed:
+            break
+    assert tuple(ages[1:].tolist()) in replayed
+    assert len(replayed) <= len(trace)
+
+
+def test_equal_channels_of_a_record_stay_equal_and_read_only_when_copied():
+    log = PacketLog(np.arange(4.0), np.array([0.5, np.nan, 2.5, 0.0]))
+    channel = log.channel(1.0)
+    assert channel.oldest_age == 2  # the longest run of losses and the longest delay together would be 4
+    for other in (copy.deepcopy(channel), pickle.loads(pickle.dumps(channel))):
+        assert other == channel
+        assert not other.delays.flags.writeable
