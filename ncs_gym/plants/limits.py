@@ -139,7 +139,7 @@ def _require_equilibrium(
     terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)
     if (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
         return
-    remedy = "give the constant c of x+ = A x + B u + c as offset"
+    remedy = "leave out offset if the model is one of deviations from the operating point"
     rest = np.eye(len(A)) - A
     if np.linalg.cond(rest) < 1e9:
         equilibrium = np.linalg.solve(rest, B @ applied + offset).tolist()
@@ -155,7 +155,8 @@ def arguments_around(
     """Returns the arguments of `LinearPlant` of `LinearPlant.around`.
 
     Raises:
-        ValueError: If the point is no equilibrium between the limits, or an argument does not fit.
+        ValueError: If the point is not between the limits, or no equilibrium of a model with `offset`, or an argument
+            does not fit.
     """
     twice = sorted({"box", "u_max"} & set(settings))
     if twice:
@@ -166,9 +167,8 @@ def arguments_around(
     state = as_operating_point(point[0], len(A), "operating_state")
     applied = as_operating_point(point[1], B.shape[1], "operating_input")
     rest = {name: value for name, value in settings.items() if name != "offset"}
-    offset = settings.get("offset")
-    offset = np.zeros(len(A)) if offset is None else as_vector(offset, len(A), "offset")
-    _require_equilibrium(A, B, offset, state, applied)
+    if (offset := settings.get("offset")) is not None:
+        _require_equilibrium(A, B, as_vector(offset, len(A), "offset"), state, applied)
     box = _symmetric_limits(limits[0], state, "state_limits")
     u_max = _symmetric_limits(limits[1], applied, "input_limits")
     return rest | {

@@ -299,20 +299,24 @@ class LinearPlant(ReadOnlyArrays):
         operating_input: ArrayLike | None = None,
         **settings: Any,
     ) -> Self:
-        """Returns the plant in deviations from an equilibrium, with the largest symmetric limits inside those given.
+        """Returns the plant in deviations from an operating point, with symmetric limits inside those given.
+
+        A and B are a model of deviations, as linearization at the operating point gives; limits are absolute. Of a
+        model in absolute coordinates, x+ = A x + B u + c, give c as `offset`: then the operating point has to be an
+        equilibrium.
 
         Args:
-            A: State matrix of x+ = A x + B u + c, shape (n, n).
+            A: State matrix, shape (n, n).
             B: Input matrix, shape (n, m).
             state_limits: Pair (low, high) around x0, each a number or shape (n,); infinite where there is no limit.
             input_limits: Pair (low, high) around u0, each a number or shape (m,).
-            operating_state: x0 with A x0 + B u0 + c = x0, shape (n,); zero by default.
+            operating_state: x0, shape (n,); zero by default.
             operating_input: u0, shape (m,); zero by default.
-            settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, zero by default. Of a model that
-                is linearized at (x0, u0), c is x0 - A x0 - B u0.
+            settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, shape (n,).
 
         Raises:
-            ValueError: If (x0, u0) is no equilibrium or not strictly between the limits, or an argument is wrong.
+            ValueError: If (x0, u0) is not strictly between the limits, or not an equilibrium of a model with `offset`,
+                or an argument is wrong.
         """
         point = operating_state, operating_input
         return cls(**limits.arguments_around(A, B, point, (state_limits, input_limits), settings))

@@ -402,8 +402,11 @@ PLANTS = [
     ),
     *changed(
         LinearPlant.around,
-        ({"operating_state": [19.0]}, r"no equilibrium: .* not zero; with this input the equilibrium is \[20.0"),
-        ({"A": [[1.0]]}, "no equilibrium: .* give the constant c of x. = A x . B u . c as offset"),
+        (
+            {"operating_state": [19.0], "offset": [0.0]},
+            r"no equilibrium: .* not zero; with this input the equilibrium is \[20.0",
+        ),
+        ({"A": [[1.0]], "offset": [0.0]}, "no equilibrium: .* leave out offset if the model is one of deviations"),
         ({"offset": [1.0]}, r"the equilibrium is \[30"),
         ({"state_limits": (20.0, 25.0)}, r"state_limits must have the operating point \[20.0\] strictly between"),
         ({"input_limits": (0.0, 9.0)}, "input_limits must have the operating point"),

@@ -89,6 +89,13 @@ def test_constant_of_the_model_makes_a_point_an_equilibrium():
     np.testing.assert_allclose(plant.u_max, [4.0])
 
 
+def test_model_of_deviations_has_its_operating_point_wherever_it_was_linearized():
+    settings = ROOM | {"operating_state": [21.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
+    plant = LinearPlant.around(**settings)
+    np.testing.assert_allclose(1.0 / plant.box_rows, [[3.0]])
+    np.testing.assert_allclose(plant.to_deviation([22.0]), [1.0])
+
+
 def test_operating_point_belongs_to_the_fingerprint_and_zero_is_none():
     plant = LinearPlant(**MODEL, box=1.0)
     assert replace(plant, operating_state=[0.0, 0.0]).fingerprint == plant.fingerprint
