@@ -16,8 +16,8 @@ import time
 import numpy as np
 from lookahead import CASES, CVXPY, ENVS, WARM, PlainProgram, shielded, timed
 
-from shields.runtime.one_step import PredictedErrors
 from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.set_test import PredictedErrors
 
 # Environments of every step whose decisions are timed one by one.
 ALONE = 4
@@ -45,8 +45,8 @@ def row(name: str, safe_set: str, horizon: int, steps: int) -> str:
     together = np.array([step[0] for step in met])
     shield = SafetyFilter(env.filter.certificate, env.filter.plant, "lookahead", horizon)
     cases = [case for _, *step in met for case in singles(*step)]
-    alone = timed(shield.decide_knowing, cases)
-    failed = np.array([shield.decide_knowing(*case).reason != "safe" for case in cases])
+    alone = timed(shield.decide, cases)
+    failed = np.array([shield.decide(*case).reason != "safe" for case in cases])
     searched = [case for case, fails in zip(cases, failed, strict=True) if fails]
     plain = PlainProgram(shield)
     programs = [(x_hat, errors.shape, u) for x_hat, errors, u, _ in (searched or cases)[:CVXPY]]

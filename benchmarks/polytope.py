@@ -43,7 +43,7 @@ def per_decision(shields: list[SafetyFilter], count: int) -> list[float]:
             errors, begin = shield.errors_of(shape), time.perf_counter()
             if count == 1:
                 for _ in range(REPEATS):
-                    shield.decide_knowing(estimates[:, 0], errors, proposals[:, 0])
+                    shield.decide(estimates[:, 0], errors, proposals[:, 0])
             else:
                 batch = errors.batch().of(np.zeros(count, np.int64))
                 begin = time.perf_counter()

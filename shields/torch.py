@@ -12,8 +12,6 @@ from torch import nn
 from ncs_gym import LinearPlant
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
-from shields.runtime.one_step import ReachableSets
-from shields.runtime.polytope_step import PolytopeSets, SetsOnGrid
 from shields.runtime.safety_filter import SafetyFilter
 
 # A constraint counts as attained by the closest input within this much, relative to what it bounds.
@@ -145,21 +143,19 @@ def projection_jacobians(
     sets = shield.test.reachable(np.array(estimates.T, order="C"), errors)
     wanted = np.array(proposals.T, order="C")
     closest = sets.closest(wanted, shield.projection_margin)
-    ball_of = sets.first if isinstance(sets, SetsOnGrid) else sets if isinstance(sets, ReachableSets) else None
-    rows_of = sets.grid if isinstance(sets, SetsOnGrid) else sets if isinstance(sets, PolytopeSets) else None
+    test, cone = shield.test, shield.test.cone
+    offset = test.state_rows @ sets.estimates
+    effect, row_limits = test.input_rows, sets.row_limits - sets.rounding - shield.projection_margin
     for e in range(count):
         u, held = closest[:, e], np.abs(closest[:, e]) >= (1.0 - ATTAINED) * limits
         active, ball = np.eye(len(limits))[held], None
-        if ball_of is not None:
-            test, weighting = ball_of.test, ball_of.weighting[..., e]
-            effect, center = weighting @ test.effect, weighting @ (ball_of.offset[:, e] + test.effect @ u)
-            radius = float(ball_of.radius[e]) - shield.projection_margin
-            if np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
-                ball = effect, effect.T @ center
-        if rows_of is not None:
-            test, limit = rows_of.test, rows_of.row_limits[:, e] - rows_of.rounding[e] - shield.projection_margin
-            center = np.abs(test.moved @ estimates[e] + test.effect @ u)
-            active = np.vstack([active, test.effect[center >= limit - ATTAINED * np.maximum(limit, 1e-3)]])
+        reached, weighting = offset[:, e] + effect @ u, sets.weighting[..., e]
+        center, radius = weighting @ reached[:cone], float(sets.radius[e]) - shield.projection_margin
+        if cone and np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
+            pushed = weighting @ effect[:cone]
+            ball = pushed, pushed.T @ center
+        attained = np.abs(reached[cone:]) >= row_limits[:, e] - ATTAINED * np.maximum(row_limits[:, e], 1e-3)
+        active = np.vstack([active, effect[cone:][attained]])
         free = np.eye(len(limits))
         if len(active):
             free = null_space(active / np.linalg.norm(active, axis=1, keepdims=True), rcond=1e-9)

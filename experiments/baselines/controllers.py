@@ -21,7 +21,7 @@ from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
 from ncs_gym.plants.lqr import lqr_gain
-from shields.runtime.polytope_step import grid_test
+from shields.runtime.set_test import rows_between
 
 # Its types are not declared.
 _clarabel: Any = clarabel
@@ -163,11 +163,11 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
     moved[:n, :n] = plant.A
     pushed = np.vstack([plant.B, np.eye(plant.m)[: own.shape[1] - n]])
     loop, drive = moved + pushed @ own, pushed @ of_target
-    (k, grid), beyond = (len(plant.box_rows), grid_test(plant)), ((0, 0), (0, own.shape[1] - n))
-    between = np.pad(grid.moved, beyond) + grid.effect @ own
+    (k, grid), beyond = (len(plant.box_rows), rows_between(plant)), ((0, 0), (0, own.shape[1] - n))
+    between = np.pad(grid.state, beyond) + grid.input @ own
     limits = np.vstack([np.pad(plant.box_rows, beyond), between, own / plant.u_max[:, None]])
-    direct = np.concatenate([np.zeros((k, 1)), grid.effect @ of_target, of_target / plant.u_max[:, None]])
-    allowed = np.concatenate([np.full(k + len(grid.moved), 1.0 - margin), np.ones(plant.m)])
+    direct = np.concatenate([np.zeros((k, 1)), grid.input @ of_target, of_target / plant.u_max[:, None]])
+    allowed = np.concatenate([np.full(k + len(grid.state), 1.0 - margin), np.ones(plant.m)])
     rows, slopes = [limits[k:]], [direct[k:]]
     power, response = loop, drive
     for _ in range(GOVERNED_STEPS):
@@ -201,13 +201,13 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     plant, problem, steps = env.plant, regulator_problem(env, weights), PREDICTED_STEPS
     A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
     to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
-    beyond, grid = ((0, 0), (0, len(A) - plant.n)), grid_test(plant)
-    rows, between = np.pad(plant.box_rows, beyond), np.pad(grid.moved, beyond)
+    beyond, grid = ((0, 0), (0, len(A) - plant.n)), rows_between(plant)
+    rows, between = np.pad(plant.box_rows, beyond), np.pad(grid.state, beyond)
     free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
     for k in range(steps):  # z_k = free z_0 + forced u
         now = np.eye(steps * m)[k * m : (k + 1) * m]
         costs.append((E @ free, E @ forced + D @ now))
-        limits.append((between @ free, between @ forced + grid.effect @ now))
+        limits.append((between @ free, between @ forced + grid.input @ now))
         free, forced = A @ free, A @ forced + B @ now
         limits.append((rows @ free, rows @ forced))
     costs.append((to_go @ free, to_go @ forced))

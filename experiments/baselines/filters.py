@@ -14,9 +14,8 @@ from ncs_gym import LinearPlant, NCSVectorEnv
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
-from shields.runtime.one_step import OneStepTest
-from shields.runtime.polytope_step import PolytopeTest, grid_test
 from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.set_test import certificate_test, rows_between
 from shields.verification import require_valid
 
 # Margins that filters and governors are given, of the safe set and the box, in percent.
@@ -117,10 +116,9 @@ class PredictiveFilter:
         self._plant, self._K, self._horizon = plant, certificate.K, horizon
         self._plans = np.empty((0, horizon - 1, plant.m))
         polytope = certificate.polytope
-        test = OneStepTest(certificate.L, plant) if polytope is None else PolytopeTest(polytope, plant)
         self._root = np.linalg.cholesky(certificate.M).T if polytope is None else polytope.rows
         self._ends_in_ellipsoid = polytope is None
-        self._prediction = Prediction(test, horizon)
+        self._prediction = Prediction(certificate_test(certificate, plant), horizon)
         self._program = PlanProgram(self._prediction)
         at_samples = np.full((horizon + 1, len(plant.box_rows)), 1.0 - margin)
         self._end_limits = np.full(1 if polytope is None else len(polytope.rows), 1.0 - margin)
@@ -136,8 +134,8 @@ class PredictiveFilter:
         self._all_limits[:-1, : self._limits.shape[1]] = self._limits * longer
         self._all_limits[-1, : len(self._end_limits)] = self._end_limits
         self._weighting = self._root if polytope is None else self._root[:0]
-        self._grid = grid_test(plant)
-        times = len(self._grid.moved) // len(plant.box_rows)
+        self._grid = rows_between(plant)
+        times = len(self._grid.state) // len(plant.box_rows)
         self._between = np.tile(np.minimum(at_samples[:-1], at_samples[1:]), times)
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:

@@ -12,8 +12,8 @@ from ncs_gym.plants.linear_plant import SIMULATED_REACH, inputs_under_way
 from ncs_gym.validation import shown, warn_caller
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
-from shields.runtime.one_step import FARTHEST, PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
+from shields.runtime.set_test import FARTHEST, PredictedErrors
 
 ALARM = "a measurement contradicts the assumed bounds"
 NOT_FINITE = "a sample held NaN or infinity: where a sensor has no reading, no packet may be sent"

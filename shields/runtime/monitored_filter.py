@@ -87,7 +87,7 @@ class MonitoredFilter:
 
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the estimate reported last; never raises."""
-        self._decision = self.filter.decide_knowing(self.report.estimate, self.report.errors, proposed, self._stored)
+        self._decision = self.filter.decide(self.report.estimate, self.report.errors, proposed, self._stored)
         self._stored = self._decision.plan.copy() if len(self._decision.plan) else self._decision.plan
         self.decided = self._decision.input.tolist()  # the caller may write into the array
         return self._decision

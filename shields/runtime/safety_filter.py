@@ -13,14 +13,14 @@ from ncs_gym.envs.spaces import expressible
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, own_error_state, read_only, shown, warn_caller
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
-from shields.runtime.one_step import (
+from shields.runtime.set_test import (
     MOST_INPUTS_WITH_VERTICES,
-    OneStepTest,
     PredictedErrors,
     ReachableSets,
+    SetTest,
+    certificate_test,
     require_computable,
 )
-from shields.runtime.polytope_step import EllipsoidOnGrid, PolytopeTest
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
@@ -41,9 +41,8 @@ class SafetyFilter(ReadOnlyArrays):
     """A certificate made ready to judge inputs (docs/shield.md).
 
     An input passes if everything that one step can reach with it, for every error in E(Sigma_k) and disturbance in
-    E(D), lies in S (`OneStepTest`), or in the certificate's polytope if it has one (`PolytopeTest`). K x_hat needs no
-    test: its safety follows from x in S by (I) and (U) of docs/shield_proof.md, or from x in the polytope by (P)
-    and (PU) of docs/shield_proof.md.
+    E(D), lies in S, or in the certificate's polytope if it has one (`SetTest`). K x_hat needs no test: its safety
+    follows from x in S by (I) and (U) of docs/shield_proof.md, or from x in the polytope by (P) and (PU).
 
     Args:
         certificate: Verified exactly here.
@@ -57,7 +56,7 @@ class SafetyFilter(ReadOnlyArrays):
         horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
 
     Attributes:
-        test: The one-step test, for the polytope if there is one.
+        test: The test of an input.
         lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
 
     Raises:
@@ -70,7 +69,7 @@ class SafetyFilter(ReadOnlyArrays):
     plant: LinearPlant
     mode: str = "project"
     horizon: int | None = None
-    test: OneStepTest | PolytopeTest = field(init=False, repr=False)
+    test: SetTest = field(init=False, repr=False)
     lookahead: Lookahead | None = field(init=False, repr=False, default=None)
     _no_plan: np.ndarray = field(init=False, repr=False)
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
@@ -85,10 +84,7 @@ class SafetyFilter(ReadOnlyArrays):
             raise ValueError(f'mode "boundary" takes at most {MOST_INPUTS_WITH_VERTICES} inputs, got {self.plant.m}')
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
-        polytope = self.certificate.polytope
-        kind = OneStepTest if self.plant.grid_rows is None else EllipsoidOnGrid
-        test = kind(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
-        object.__setattr__(self, "test", test)
+        object.__setattr__(self, "test", certificate_test(self.certificate, self.plant))
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         object.__setattr__(self, "_remembered", {})
         if self.mode == "lookahead":
@@ -112,50 +108,46 @@ class SafetyFilter(ReadOnlyArrays):
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
 
     def decide(
-        self, estimate: np.ndarray, error_shape: np.ndarray, input_proposed: np.ndarray, stored: Any = ()
+        self, estimate: np.ndarray, errors: np.ndarray | PredictedErrors, input_proposed: np.ndarray, stored: Any = ()
     ) -> Decision:
         """Returns the input to apply; never raises.
 
         Args:
             estimate: x_hat, shape (n,), float64.
-            error_shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k).
+            errors: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k). Or what `errors_of` says of it.
             input_proposed: Shape (m,) [physical units]; the very float64 value that would be applied.
             stored: In mode "lookahead" the `plan` of the last decision, shape (k, m), if its input was applied and one
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
+        known = errors if isinstance(errors, PredictedErrors) else self.errors_of(errors)
         if (x_hat.shape, proposed.shape) != self._single:
             self._tell_of_shapes(estimate, input_proposed)
-        return self.decide_knowing(x_hat, self.errors_of(error_shape), proposed, stored)
-
-    def decide_knowing(
-        self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any = ()
-    ) -> Decision:
-        """Returns what `decide` does, given what `errors_of` returns for the error shape."""
-        if (estimate.shape, proposed.shape) == self._single and self.mode != "boundary":
+        elif self.mode != "boundary":
             try:
-                decision = self._decide_single(estimate, errors, proposed)
+                decision = self._decide_alone(x_hat, known, proposed)
             except FloatingPointError:  # underflow, where numpy is told to raise
                 decision = None
             if decision is not None:
                 return decision
         n, m = self.plant.n, self.plant.m
         plans = None if self.lookahead is None else self.lookahead.as_stored(stored)[..., None]
-        decided = self.decide_columns(_as_column(estimate, n), errors.batch(), _as_column(proposed, m), plans)
+        decided = self.decide_columns(_as_column(x_hat, n), known.batch(), _as_column(proposed, m), plans)
         one = Decision(*(array[..., 0].tolist() for array in decided))
         plan = decided.plan[..., 0]
         plan = plan[~np.isnan(plan[:, 0])] if len(plan) else self._no_plan
         return one._replace(input=np.array(one.input), reason=REASONS[one.reason], plan=plan)
 
-    def _decide_single(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
+    def _decide_alone(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
         """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected."""
-        alone = self.test.reachable_alone(estimate, errors)
-        pairs = zip(proposed.tolist(), self.test.limits, strict=True)
-        if alone is None or not all([-limit <= u <= limit for u, limit in pairs]):
-            return None
-        test_margin, margin = alone.margins(proposed)
+        test_margin, margin = self.test.margins_alone(estimate, errors, proposed)
+        for u, limit in zip(proposed.tolist(), self.test.limits, strict=True):
+            if not -limit <= u <= limit:
+                return None
         if test_margin >= MARGIN:
-            return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
+            return Decision(proposed, False, True, False, margin, REASONS[SAFE], self._no_plan)
+        if test_margin != test_margin:  # NaN
+            return None
         if self.lookahead is not None:
             plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
             if plan is None:
@@ -163,8 +155,9 @@ class SafetyFilter(ReadOnlyArrays):
             return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
         if self.mode != "project" or self.plant.m > 1:
             return None
-        closest = self._expressible(np.array([alone.closest(proposed.item(), self.projection_margin)]))
-        test_margin, margin = alone.margins(closest)
+        closest = self.test.closest_alone(estimate, errors, proposed.item(), self.projection_margin)
+        closest = self._expressible(np.array([closest]))
+        test_margin, margin = self.test.margins_alone(estimate, errors, closest)
         if not test_margin >= MARGIN:  # neither NaN
             return None
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
@@ -260,7 +253,7 @@ class SafetyFilter(ReadOnlyArrays):
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
         if self.lookahead is None:
             return self._no_plan
-        first = self.decide_knowing(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
+        first = self.decide(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
         return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:

@@ -15,9 +15,8 @@ from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
-from shields.runtime.one_step import PredictedErrors
-from shields.runtime.polytope_step import grid_test
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
+from shields.runtime.set_test import PredictedErrors, rows_between
 from shields.verification.rational_matrix import (
     is_positive_semidefinite,
     multiply,
@@ -67,7 +66,7 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
     E(P) does exactly if c_i P c_i' <= 1 for all rows. Where the box counts between samples, they have to lie in a
     smaller one, in which disturbances cannot leave it.
     """
-    return _between(grid_test(plant).at_samples, initial)
+    return _between(rows_between(plant).at_samples, initial)
 
 
 def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:

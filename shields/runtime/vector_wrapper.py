@@ -25,7 +25,7 @@ from shields.runtime.guarantee import (
     LoopObservation,
     MonitorState,
 )
-from shields.runtime.one_step import PredictedErrors, norms
+from shields.runtime.set_test import PredictedErrors, norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 from shields.runtime.wrapper import BaseShield
 

@@ -16,8 +16,7 @@ from shields import Certificate, Infeasible, SafeLoop, SafetyFilter, synthesize,
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
-from shields.runtime.one_step import OneStepTest
-from shields.runtime.polytope_step import grid_test
+from shields.runtime.set_test import ellipsoid_test, rows_between
 from shields.runtime.starts import starts_known
 from shields.synthesis.network_requirements import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
@@ -183,8 +182,8 @@ def test_quick_search_for_feasible_bounds_knows_the_times_between_samples():
 @pytest.mark.parametrize("horizon", [1, 4])
 def test_plans_are_certified_only_if_every_time_between_samples_is_inside(horizon):
     plant, plain, _ = found("TruckTrailerCruise", 8)
-    prediction = Prediction(OneStepTest(plain.L, plant), horizon)
-    without = Prediction(OneStepTest(plain.L, found("TruckTrailerCruise")[0]), horizon)
+    prediction = Prediction(ellipsoid_test(plain.L, plant), horizon)
+    without = Prediction(ellipsoid_test(plain.L, found("TruckTrailerCruise")[0]), horizon)
     rng, shape = np.random.default_rng(0), 0.5 * plain.error_shapes[0]
     estimates = rng.uniform(-2.0, 2.0, (2000, 2))
     plans = rng.uniform(-4.0, 4.0, (2000, 1, horizon, 1))
@@ -230,8 +229,8 @@ def test_before_the_first_decision_behind_a_downlink_times_between_samples_count
 
 def test_plants_without_a_grid_have_no_rows_of_one():
     plant = found("TruckTrailerCruise")[0]
-    test = grid_test(plant)
-    assert not len(test.moved)
+    test = rows_between(plant)
+    assert not len(test.state)
     assert test.at_samples is plant.box_rows
 
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import own_error_state, read_only
-from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
-from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test, supports
+from shields.runtime.set_test import SMALLEST_RADIUS, RowsBetween, SetTest, ball, judged_shapes, rows_between, supports
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -131,22 +130,22 @@ class Prediction:
         plant: The plant.
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
-            its others. Those of the box are closer where it counts between samples, too (`GridTest`).
+            its others. Those of the box are closer where it counts between samples, too (`RowsBetween`).
         grid: What is asked between samples.
         powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
-        ends: N tests, of section "One step", whether c_j + E(Sigma_pred,j) lies in S; none where plans end in P, whose
-            rows decide.
+        cone: The root of S, shape (n, n); of shape (0, n) where plans end in P.
+        ends: Whether c_j + E(Sigma_pred,j) lies in S, for N lengths of a plan; none where plans end in P, whose rows
+            decide.
     """
 
-    def __init__(self, first: OneStepTest | PolytopeTest, steps: int) -> None:
+    def __init__(self, first: SetTest, steps: int) -> None:
         plant, n, m = first.plant, first.plant.n, first.plant.m
-        self.plant, self.steps, test = plant, steps, grid_test(plant)
-        self.rows = test.at_samples
-        if isinstance(first, PolytopeTest):
-            self.rows = np.concatenate([self.rows, first.root[len(self.rows) :]])
+        self.plant, self.steps, between = plant, steps, rows_between(plant)
+        self.cone, ends_in = first.root[: first.cone], first.root[first.cone :]
+        self.rows = np.concatenate([between.at_samples, ends_in[len(between.at_samples) :]])
         powers, sizes = [np.eye(n)], [np.eye(n)]
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
@@ -160,8 +159,8 @@ class Prediction:
         pushes = np.array([size @ np.abs(plant.B) @ plant.u_max for size in sizes[:-1]])
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
-        self.ends = () if isinstance(first, PolytopeTest) else tuple(EndTest(first, self, j) for j in range(steps))
-        self.grid = PlanGrid(self, test)
+        self.ends = tuple(End.after(j + 1, self) for j in range(steps)) if first.cone else ()
+        self.grid = PlanGrid(self, between)
         self._free = self.powers[1:].reshape(steps * n, n)
         self._forced = self.forced.reshape(steps * n, steps * m)
 
@@ -187,17 +186,17 @@ class PlanGrid:
         forced: Rows on a plan, shape (N, g, N m).
     """
 
-    def __init__(self, prediction: Prediction, test: GridTest) -> None:
+    def __init__(self, prediction: Prediction, test: RowsBetween) -> None:
         steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
-        size, self._rounding = np.abs(test.moved), prediction.rounding
-        self.free = read_only(test.moved @ prediction.powers[:-1])
+        size, self._rounding = np.abs(test.state), prediction.rounding
+        self.free = read_only(test.state @ prediction.powers[:-1])
         self._size = read_only(size @ prediction.sizes[:-1])
-        forced = test.moved @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
+        forced = test.state @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
         for i in range(steps):
-            forced[i, :, i * m : (i + 1) * m] += test.effect
+            forced[i, :, i * m : (i + 1) * m] += test.input
         self.forced = read_only(forced)
         pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
-        self._pushed = read_only(pushed + np.abs(test.effect) @ prediction.plant.u_max)
+        self._pushed = read_only(pushed + np.abs(test.input) @ prediction.plant.u_max)
         D = prediction.plant.disturbance.shape_matrix
         own = _supports(self.free, self._size, D[None], self._rounding[:, None])[0]
         self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
@@ -224,40 +223,55 @@ class PlanGrid:
         return np.logical_and.accumulate(inside.all(axis=1), axis=0)
 
 
-class EndTest(OneStepTest):
-    """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
+class End(NamedTuple):
+    """The cone of the one-step test for the plant that takes j steps at once: A^j, and what disturbances add up to.
 
-    Of its methods `predicted` alone is asked; what the others need is left out.
-
-    E(Q_0) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to sqrt(tr Q_i)
-    makes the trace smallest, also together with the estimation error that `predicted` adds.
-
-    Args:
-        first: The one-step test.
-        prediction: Matrices of all steps.
-        index: j.
+    Attributes:
+        moved: G A^j, shape (n, n).
+        D: What disturbances add up to, in the coordinates of G, shape (n, n).
+        columns: Norms of the columns of |G| |A|^j, shape (n,).
+        pushed: Bound of the norm of |G| times what the inputs of these steps do.
+        rounding: Relative to the products of absolute values.
     """
 
-    def __init__(self, first: OneStepTest, prediction: Prediction, index: int) -> None:
-        plant, steps = first.plant, index + 1
-        n, m = plant.n, plant.m
-        self.plant, self.root, self.own_columns = plant, first.root, first.own_columns
-        size = np.abs(self.root)
-        self.rounding = float((16.0 * (n + m) * (steps + 2) + 4.0 * n * n) * np.finfo(float).eps)
-        self.moved = read_only(self.root @ prediction.powers[steps])
-        self.columns = read_only(np.linalg.norm(size @ prediction.sizes[steps], axis=0))
-        self.pushed = float(np.linalg.norm(size @ prediction.size_forced[index]))
+    moved: np.ndarray
+    D: np.ndarray
+    columns: np.ndarray
+    pushed: float
+    rounding: float
+
+    @classmethod
+    def after(cls, steps: int, prediction: Prediction) -> End:
+        """Returns the cone after j steps.
+
+        E(Q_1) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to
+        sqrt(tr Q_i) makes the trace smallest, also together with the estimation error that `ball` adds.
+        """
+        plant, cone = prediction.plant, prediction.cone
+        n, m, size = plant.n, plant.m, np.abs(prediction.cone)
+        rounding = float((16.0 * (n + m) * (steps + 2) + 4.0 * n * n) * np.finfo(float).eps)
         extents = np.sqrt(np.diag(plant.disturbance.shape_matrix))
         parts = []
-        for i in range(steps):
-            root, reach = self.root @ prediction.powers[i], size @ prediction.sizes[i]
-            rounding = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
-            parts.append(root @ plant.disturbance.shape_matrix @ root.T + rounding * np.eye(n))
+        for power, reach in zip(prediction.powers[:steps], prediction.sizes[:steps], strict=True):
+            root = cone @ power
+            own = rounding * float(np.linalg.norm(size @ reach, axis=0) @ extents) ** 2
+            parts.append(root @ plant.disturbance.shape_matrix @ root.T + own * np.eye(n))
         widths = np.sqrt([np.trace(part) for part in parts])
         widths = np.maximum(widths, SMALLEST_MULTIPLIER * widths.max())
         D = sum(part * (widths.sum() / width) for part, width in zip(parts, widths, strict=True))
-        D = (1.0 + self.rounding) * np.asarray(D)
-        self.D = read_only(0.5 * (D + D.T))
+        D = (1.0 + rounding) * np.asarray(D)
+        return cls(
+            moved=read_only(cone @ prediction.powers[steps]),
+            D=read_only(0.5 * (D + D.T)),
+            columns=read_only(np.linalg.norm(size @ prediction.sizes[steps], axis=0)),
+            pushed=float(np.linalg.norm(size @ prediction.size_forced[steps - 1])),
+            rounding=rounding,
+        )
+
+    def ball(self, symmetric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns T and the radius of `ball` for error shapes, (k, n, n)."""
+        spread = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2)) @ self.columns
+        return ball(self.moved, self.D, symmetric, spread, self.pushed, self.rounding)
 
 
 class Tightening(NamedTuple):
@@ -297,17 +311,21 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     reach = (_supports(rows[1:], sizes[1:], symmetric, rounding) + np.cumsum(added, axis=0)) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
     between = prediction.grid.row_limits(symmetric)
-    nothing = np.empty((0, *shapes.shape[1:]))
-    if not prediction.ends:
-        usable = judged_shapes(shapes, nothing)[1] & np.isfinite(reach).all(axis=(1, 2))
-        ones = np.where(usable, 1.0, np.nan)[:, None] * np.ones(prediction.steps)
-        none = np.empty((len(shapes), prediction.steps, 0, plant.n))
-        return Tightening(ones[..., None] - reach - pushed, none, ones, between)
-    errors = [end.predicted(shapes, nothing) for end in prediction.ends]
-    radius = np.stack([each.radius for each in errors], axis=1)
-    unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
-    weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
-    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius, between)
+    judged, usable, _ = judged_shapes(shapes, shapes[:0])
+    if prediction.ends:
+        found = [end.ball(judged) for end in prediction.ends]
+        radius = np.stack([each[1] for each in found], axis=1)
+        weightings = np.stack([each[0] for each in found], axis=1) @ prediction.cone
+    else:
+        radius, usable = np.ones((len(shapes), prediction.steps)), usable & np.isfinite(reach).all(axis=(1, 2))
+        weightings = np.empty((*radius.shape, 0, plant.n))
+    radius = radius + np.where(usable, 0.0, np.nan)[:, None]
+    return Tightening(
+        row_limits=1.0 - reach - pushed + np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)[:, None, None],
+        weighting=np.where(np.isnan(radius)[..., None, None], 0.0, weightings),
+        radius=radius,
+        between=between,
+    )
 
 
 def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding: np.ndarray) -> np.ndarray:

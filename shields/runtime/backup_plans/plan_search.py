@@ -17,8 +17,7 @@ from ncs_gym.envs.spaces import expressible
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.validation import own_error_state, read_only
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
-from shields.runtime.one_step import OneStepTest
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.set_test import SetTest
 from shields.verification import ACTION_ROUNDING
 
 # Its types are not declared.
@@ -75,7 +74,7 @@ class Planner:
         horizon: N.
     """
 
-    def __init__(self, first: OneStepTest | PolytopeTest, gain: np.ndarray, horizon: int, margin: float) -> None:
+    def __init__(self, first: SetTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant = first.plant
         braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
@@ -203,7 +202,7 @@ class PlanProgram:
         rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end, between])
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
-        root = prediction.ends[-1].root if prediction.ends else np.empty((0, plant.n))
+        root = prediction.cone
         self._cone = len(root) + 1 if len(root) else 0
         pushed = float(np.linalg.norm(root @ self._end, axis=0).sum())
         self._end_margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * pushed

@@ -9,8 +9,7 @@ import numpy as np
 from ncs_gym.validation import as_numbers
 from shields.runtime.backup_plans.plan_search import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
-from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.set_test import PredictedErrors, ReachableSets, SetTest, norms
 
 
 class Lookahead:
@@ -36,7 +35,7 @@ class Lookahead:
         planner: Finds the plans.
     """
 
-    def __init__(self, test: OneStepTest | PolytopeTest, gain: np.ndarray, horizon: int, margin: float) -> None:
+    def __init__(self, test: SetTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self._test, self._margin = test, margin
         self.planner = Planner(test, gain, horizon, margin)
 

@@ -10,9 +10,8 @@ from ncs_gym import Ellipsoid, LinearPlant
 from shields import SafetyFilter
 from shields.runtime.backup_plans import PlanTest, Prediction, plan_check
 from shields.runtime.backup_plans.plan_check import Tightening
-from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest
-from shields.runtime.polytope_step import PolytopeTest
 from shields.runtime.safety_filter import MARGIN
+from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
 from tests.certificates import certificate_of
 from tests.shields.attacks.adversary import farthest
@@ -29,7 +28,7 @@ NAMES = (
 def case(request):
     known = attacked_case(request.param)
     first = SafetyFilter(known.certificate, known.plant).test
-    assert isinstance(first, PolytopeTest) == ("polytope" in request.param)
+    assert (not first.cone) == ("polytope" in request.param)
     return known.plant, known.certificate, PlanTest(Prediction(first, STEPS), MARGIN)
 
 
@@ -211,7 +210,7 @@ def test_certified_is_true_in_rational_arithmetic_however_far_out_the_estimate_i
         initial_bound=0.0,
     )
     certificate, rng = certificate_of(plant), np.random.default_rng(0)
-    test = PlanTest(Prediction(OneStepTest(certificate.L, plant), 2), 0.0)
+    test = PlanTest(Prediction(ellipsoid_test(certificate.L, plant), 2), 0.0)
     known = test.tightenings_of(np.zeros((1, 2, 2)))
     *_, axes = np.linalg.svd(plant.A)
     support = plant.disturbance.support(np.eye(2))
@@ -275,7 +274,7 @@ QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}
 def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(where, step, margin):
     plant = LinearPlant(A=[[1e-4]], B=[[1e6, -1e6]], box=[1.0], disturbance_bound=0.0, **QUIET)
     L, steps = (np.array([[1e4]]), step + 1) if where == "box" else (np.eye(1), step)  # one of them is far away
-    test, rng = PlanTest(Prediction(OneStepTest(L, plant), steps), margin), np.random.default_rng(0)
+    test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), steps), margin), np.random.default_rng(0)
     nothing, levels = np.zeros((1, 1)), []
     known = test.tightenings_of(nothing[None])
     for _ in range(40):
@@ -297,7 +296,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, s
     A = 3001.7 * np.array([[0.3, -0.1], [0.9, -0.3]]) + 0.5 * np.eye(2)
     plant = LinearPlant(A=A, B=[[0.3], [0.9]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
     L, steps = (1e4 * np.eye(2), step + 1) if where == "box" else (np.diag([1e16, 1.0]), step)
-    test, rng = PlanTest(Prediction(OneStepTest(L, plant), steps), 0.0), np.random.default_rng(0)
+    test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), steps), 0.0), np.random.default_rng(0)
     nothing, levels = np.zeros((2, 2)), []
     known = test.tightenings_of(nothing[None])
     for _ in range(60):
@@ -315,7 +314,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, s
 @pytest.mark.parametrize("scale", [0.5, 1.0])
 def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case, scale):
     plant, certificate, _ = case
-    test = PlanTest(Prediction(OneStepTest(certificate.L, plant), 1), 0.0)
+    test = PlanTest(Prediction(ellipsoid_test(certificate.L, plant), 1), 0.0)
     nothing, plan = np.zeros((1, plant.n)), np.zeros((1, 1, 1, plant.m))
     shape = scale * certificate.L[None]
     size = edge_of(lambda s: test.certified(nothing, test.tightenings_of(s * shape), plan)[0, 0, 0], 1e3)
@@ -327,7 +326,7 @@ def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case
 @pytest.mark.parametrize(("steps", "margin"), [(1, 0.0), (2, 0.0), (2, 0.05)])
 def test_end_is_certified_in_rational_arithmetic_however_far_out_the_estimate_is(steps, margin, size):
     plant = LinearPlant(A=[[0.5, -0.3], [0.0, 0.0]], B=[[1.0], [0.0]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
-    test, rng = PlanTest(Prediction(OneStepTest(np.eye(2), plant), steps), margin), np.random.default_rng(0)
+    test, rng = PlanTest(Prediction(ellipsoid_test(np.eye(2), plant), steps), margin), np.random.default_rng(0)
     nothing, inwards, levels = np.zeros((2, 2)), np.array([1.0, 0.0]), []
     known = test.tightenings_of(nothing[None])
     plan = np.array([[0.0], [0.9]])[2 - steps :]
@@ -354,7 +353,7 @@ ROWS = np.array([[1.0, 0.0], [-TILT, 1.0]])
 
 def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thin():
     plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=0.0, **QUIET)
-    test, rng = PlanTest(Prediction(OneStepTest(1e4 * TILTED @ TILTED.T, plant), 2), 0.0), np.random.default_rng(0)
+    test, rng = PlanTest(Prediction(ellipsoid_test(1e4 * TILTED @ TILTED.T, plant), 2), 0.0), np.random.default_rng(0)
     nothing, plan, levels = np.zeros((1, 2)), np.zeros((1, 1, 2, 1)), []
     for _ in range(20):
         factor = TILTED @ rng.standard_normal((2, 2)) * [1.0, 0.1]
@@ -370,7 +369,8 @@ def test_a_state_is_known_to_be_in_the_box_in_rational_arithmetic(far, margin):
     """With an error that is long and thin, or with an estimate so far along the box that it cancels in its row."""
     wide = np.diag([1e-9, 0.9]) @ ROWS
     plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=wide, disturbance_bound=0.0, **QUIET)
-    test, rng = PlanTest(Prediction(OneStepTest(1e4 * TILTED @ TILTED.T, plant), 1), margin), np.random.default_rng(0)
+    test = PlanTest(Prediction(ellipsoid_test(1e4 * TILTED @ TILTED.T, plant), 1), margin)
+    rng = np.random.default_rng(0)
     levels = []
     for _ in range(60):
         x_hat = far * rng.uniform(0.5, 1.0) * np.array([1.0, TILT])
@@ -390,7 +390,7 @@ def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and
     for _ in range(40):
         bound = TILTED @ np.diag([1e-3, 1e-2] * rng.uniform(0.5, 1.0, 2)) @ TILTED.T
         plant = LinearPlant(A=np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=Ellipsoid(bound), **QUIET)
-        test = PlanTest(Prediction(OneStepTest(TILTED @ TILTED.T, plant), steps), 0.0)
+        test = PlanTest(Prediction(ellipsoid_test(TILTED @ TILTED.T, plant), steps), 0.0)
         known, plan = test.tightenings_of(error[None]), np.zeros((1, 1, steps, 1))
         x = edge_of(lambda x, t=test, k=known, p=plan: t.certified(np.array([[0.0, x]]), k, p)[0, 0, -1], 16.0)
         levels.append(exact_reach(plant, ROWS[1], np.array([0.0, x]), error, plan[0, 0]))

@@ -173,14 +173,12 @@ def test_boundary_mode_lets_pass_what_every_vertex_passes():
 def test_sums_in_another_order_stay_within_the_room_for_rounding():
     certificate, plant = wide_certificate("CartPole")
     shield = SafetyFilter(certificate, plant)
-    estimates, shape, proposals = situations(shield, 200)
+    estimates, _, proposals = situations(shield, 200)
     order = np.random.default_rng(1).permutation(plant.n)
     test = shield.test
-    errors = shield.errors_of(shape)
     for estimate, u in zip(estimates, proposals, strict=True):
-        alone = test.reachable_alone(estimate, errors)
-        again = (test.moved[:, order] * estimate[order]).cumsum(axis=1)[:, -1] + test.effect @ u
-        moved = np.abs(again - (alone.offset + test.effect.dot(u))).max()
+        again = (test.state_rows[:, order] * estimate[order]).cumsum(axis=1)[:, -1] + test.input_rows @ u
+        moved = np.abs(again - (test.state_rows.dot(estimate) + test.input_rows.dot(u))).max()
         assert moved <= test.rounding * (test.columns @ np.abs(estimate) + test.pushed)
         assert moved < MARGIN
 
@@ -281,8 +279,8 @@ def test_a_wrong_row_lets_the_attack_through():
     test = shield.filter.test
     loose = np.zeros_like(test.disturbed)
     test.disturbed = loose
-    test.moved = (1.0 - 1e-3) * test.moved
-    test.joint = np.hstack([test.moved, test.effect])
+    test.state_rows = (1.0 - 1e-3) * test.state_rows
+    test.joint = np.hstack([test.state_rows, test.input_rows])
     _, info = shield.reset(seed=1, options={"state": starts})
     level = 0.0
     for _ in range(60):

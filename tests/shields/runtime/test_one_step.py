@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import SafetyFilter
-from shields.runtime.one_step import OneStepTest
+from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -65,7 +65,7 @@ def cases(certificate, plant, rng, count):
 
 def test_margin_is_that_of_the_formula(case):
     plant, certificate = case
-    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
+    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 100):
         root, P, h = predicted(certificate, plant, shape)
         c = root @ (plant.A @ estimate + plant.B @ u)
@@ -79,7 +79,7 @@ def test_margin_is_that_of_the_formula(case):
 
 def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
     plant, certificate = case
-    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(1)
+    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(1)
     sharper = agree = exactly = 0
     for estimate, shape, u in cases(certificate, plant, rng, 160):
         root, P, h = predicted(certificate, plant, shape)
@@ -111,7 +111,7 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
 def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
     # By another route: ascent over the errors and disturbances themselves, not over an ellipsoid around them.
     plant, certificate = case
-    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(2)
+    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(2)
     tight = 0.0
     for estimate, shape, u in cases(certificate, plant, rng, 24):
         with np.errstate(all="ignore"):
@@ -132,7 +132,7 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
 
 def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
     plant, certificate = case
-    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(3)
+    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(3)
     for estimate, shape, _ in cases(certificate, plant, rng, 30):
         sets = reachable(test, estimate, shape)
         inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.u_max
@@ -140,7 +140,7 @@ def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
         smallest = sets.smallest_test_margin().item()
         assert (sets.margins(inputs.T)[0] >= smallest - 1e-12).all()
         assert sets.margins(corners.T)[0].min() == pytest.approx(smallest, abs=1e-12)
-        monkeypatch.setattr("shields.runtime.one_step.LARGEST_BLOCK", 1)
+        monkeypatch.setattr("shields.runtime.set_test.LARGEST_BLOCK", 1)
         assert sets.smallest_test_margin().item() == pytest.approx(smallest, abs=1e-12)
         monkeypatch.undo()
 
@@ -149,7 +149,7 @@ def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 def test_nothing_is_said_about_indefinite_shapes_of_any_size(key, size):
     plant = PLANTS[key]
-    test, shape = OneStepTest(np.eye(plant.n), plant), 1e-3 * size * np.eye(plant.n)
+    test, shape = ellipsoid_test(np.eye(plant.n), plant), 1e-3 * size * np.eye(plant.n)
     assert not nothing_is_known(test, np.zeros(plant.n), shape)
     shape[0, 1] = shape[1, 0] = 1.001 * shape[0, 0]
     assert nothing_is_known(test, np.zeros(plant.n), shape)
@@ -158,7 +158,7 @@ def test_nothing_is_said_about_indefinite_shapes_of_any_size(key, size):
 @pytest.mark.parametrize("size", [1e-12, 1e-3])
 def test_nothing_is_said_about_shapes_that_are_indefinite_only_as_a_whole(size):
     # Each pair of states could be correlated like this; all three cannot.
-    test = OneStepTest(np.eye(3), PLANTS["3, 2"])
+    test = ellipsoid_test(np.eye(3), PLANTS["3, 2"])
     units = np.diag([1.0, 1e-3, 10.0])
     for correlation, known in ((-0.4999, True), (-0.5 - 1e-8, False), (-0.9, False)):
         shape = size * units @ (np.eye(3) + correlation * (1.0 - np.eye(3))) @ units
@@ -169,7 +169,7 @@ def test_nothing_is_said_about_shapes_that_are_indefinite_only_as_a_whole(size):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_nothing_is_said_about_what_is_not_finite(key, bad):
     plant = PLANTS[key]
-    test = OneStepTest(np.eye(plant.n), plant)
+    test = ellipsoid_test(np.eye(plant.n), plant)
     shape, estimate = 0.01 * np.eye(plant.n), np.zeros(plant.n)
     assert not nothing_is_known(test, estimate, shape)
     for i in range(plant.n):
@@ -202,7 +202,7 @@ def test_nothing_is_said_about_wrong_shapes_or_negative_ones(key):
 
 def test_decomposition_that_fails_says_nothing(monkeypatch):
     plant = PLANTS["3, 2"]
-    test = OneStepTest(np.eye(3), plant)
+    test = ellipsoid_test(np.eye(3), plant)
 
     def fail(matrices):
         raise np.linalg.LinAlgError
@@ -214,13 +214,13 @@ def test_decomposition_that_fails_says_nothing(monkeypatch):
 def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
     plant = PLANTS["3, 2"]
     certificate = certificate_of(plant)
-    test, good = OneStepTest(certificate.L, plant), 0.5 * certificate.Sigma
+    test, good = ellipsoid_test(certificate.L, plant), 0.5 * certificate.Sigma
     swap = good + np.eye(3)[[1, 0, 2]]
     bad = [np.full((3, 3), np.nan), np.full((3, 3), np.inf), -good, 1e308 * np.eye(3), swap]
     errors = test.predicted(np.array([good, *bad, good]), certificate.error_shapes)
     np.testing.assert_array_equal(np.isfinite(errors.radius), [True, *[False] * 5, True])
     np.testing.assert_array_equal(errors.certified, [True, *[False] * 5, True])
-    assert np.isnan(errors.own[0, 1:-1]).all()
+    assert np.isnan(errors.error_reach[0, 1:-1]).all()
     assert np.isnan(errors.half_widths[:, 1:-1]).all()
     alone = test.predicted(good[None], certificate.error_shapes)
     for array, one in zip(errors, alone, strict=True):
@@ -231,7 +231,7 @@ def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
 def test_one_state_leaves_nothing_to_be_sharper_about():
     plant = random_plant(3, 1, 1)
     certificate = certificate_of(plant)
-    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
+    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 50):
         *_, h = predicted(certificate, plant, shape)
         test_margin, margin = margins(reachable(test, estimate, shape), u)
@@ -245,7 +245,7 @@ def test_bounds_on_rounding_hold_column_by_column():
     A = np.array([[0.5, 40.0, 0.0], [0.0, 0.4, -300.0], [0.0, 0.0, 0.3]])
     plant = replace(random_plant(3, 3, 2), A=A)
     L = np.diag([4.0, 9.0, 1.0]) + 0.5
-    test = OneStepTest(L, plant)
+    test = ellipsoid_test(L, plant)
     G, D = np.abs(test.root), plant.disturbance.shape_matrix
     columns = G @ np.abs(A)
     for i in range(3):
@@ -270,11 +270,11 @@ def test_bounds_on_rounding_hold_column_by_column():
 
 def test_error_shapes_are_enlarged_by_the_rounding_of_moving_them():
     plant = PLANTS["3, 2"]
-    test = OneStepTest(np.eye(3), plant)
+    test = ellipsoid_test(np.eye(3), plant)
     test.D, test.pushed, test.rounding = 1e-12 * np.eye(3), 0.0, 1e-3
     shape = np.diag([1e-2, 1e-8, 1e-8])
     spread = test.columns @ np.sqrt(np.diag(shape))
-    h = np.sqrt(np.linalg.eigvalsh(test.moved @ shape @ test.moved.T)[-1] + test.rounding * spread**2)
+    h = np.sqrt(np.linalg.eigvalsh(test.state_rows @ shape @ test.state_rows.T)[-1] + test.rounding * spread**2)
     assert errors_of(test, shape).radius.item() == pytest.approx(1.0 - h - test.rounding * spread, abs=1e-4 * h)
 
 

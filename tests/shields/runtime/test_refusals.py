@@ -48,8 +48,8 @@ from shields import (
 )
 from shields.nodes import StepClock
 from shields.paper import synthesize as paper_synthesis
-from shields.runtime.one_step import certified_root
 from shields.runtime.safe_loop import NOT_STARTED
+from shields.runtime.set_test import certified_root
 from shields.torch import SafeLayer
 from tests import arrays
 from tests.certificates import certificate_of

@@ -10,8 +10,8 @@ import pytest
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
-from shields.runtime.one_step import OneStepTest, certified_root
 from shields.runtime.safety_filter import require_computable
+from shields.runtime.set_test import certified_root, ellipsoid_test
 from shields.verification.rational_matrix import (
     congruence,
     is_positive_semidefinite,
@@ -137,7 +137,7 @@ def test_root_grows_no_more_than_it_must_for_thin_sets(seed, n, span):
 def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
     # The root of this L is exact; only products with it round, by terms of size `tilt` that cancel.
     factor = np.array([[1.0, 0.0], [tilt, 1.0]])
-    test, rng = OneStepTest(factor @ factor.T, slanted(10.0)), np.random.default_rng(0)
+    test, rng = ellipsoid_test(factor @ factor.T, slanted(10.0)), np.random.default_rng(0)
     errors = test.predicted(np.zeros((1, 2, 2)), np.zeros((0, 2, 2))).single()
     for _ in range(60):
         x = factor @ rng.standard_normal(2)
@@ -156,7 +156,7 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
 def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_margin(tilt, count):
     factor = np.array([[1.0, 0.0], [tilt, 1.0]])
     L, rng, nothing, closest = factor @ factor.T, np.random.default_rng(0), np.zeros((0, 2, 2)), 0.0
-    test = OneStepTest(L, slanted(10.0))
+    test = ellipsoid_test(L, slanted(10.0))
     for _ in range(count):
         root = factor @ rng.standard_normal((2, 2))
         shape = 0.5 * (root @ root.T + (root @ root.T).T)

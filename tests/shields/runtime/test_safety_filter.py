@@ -236,7 +236,7 @@ def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch
     shield = SafetyFilter(certificate, loaded)
     case = np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0])
     assert shield.decide(*case).reason == "projected"
-    for rule in ("one_step.closest_on_line", "projection.closest_on_lines"):
+    for rule in ("set_test.closest_on_line", "projection.closest_on_lines"):
         monkeypatch.setattr(f"shields.runtime.{rule}", lambda wanted, *rest: wanted)
     assert shield.decide(*case).reason == "fallback"
     assert many(shield, *(np.array([each]) for each in case)).reason.tolist() == [REASONS.index("fallback")]

@@ -22,7 +22,7 @@ from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.certificates import certificate_for
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
-from shields.runtime.one_step import OneStepTest
+from shields.runtime.set_test import ellipsoid_test
 from shields.torch import SafeLayer
 from tests.certificates import certificate_of
 
@@ -103,7 +103,7 @@ def test_what_is_remembered_cannot_be_written_into():
 
 def test_solutions_of_a_program_are_those_of_a_fresh_one():
     certificate, plant = reactor()
-    prediction = Prediction(OneStepTest(certificate.L, plant), 3)
+    prediction = Prediction(ellipsoid_test(certificate.L, plant), 3)
     test, shared, fresh = PlanTest(prediction, 1e-9), PlanProgram(prediction), PlanProgram(prediction)
     rng, count = np.random.default_rng(0), 40
     problems = []

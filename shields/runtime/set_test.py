@@ -1,0 +1,556 @@
+"""The test of an input: whether everything that one step can reach with it lies in the set that a certificate keeps.
+
+A set is rows, a cone, or both: an ellipsoid has no rows, a polytope no cone, and where the box counts between samples,
+too, its rows at the times of a grid stand below (docs/shield_proof.md).
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from math import nan
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from ncs_gym import LinearPlant
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
+from ncs_gym.validation import frozen, own_error_state, read_only
+from shields.certificate import Certificate, CertificateError
+from shields.runtime.projection import closest_admissible, closest_between, closest_on_line
+from shields.verification import ACTION_ROUNDING
+from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
+
+# The test of all inputs looks at the 2^m vertices of the input box.
+MOST_INPUTS_WITH_VERTICES = 12
+# As many pairs of vertex and environment are looked at in one array.
+LARGEST_BLOCK = 100_000
+# Entries of an array that are worked on together: as many as a processor keeps near.
+BLOCK = 131_072
+# Projections onto either of two sets of inputs, in turn.
+ALTERNATIONS = 8
+# Growths of the root that are tried until it provably does not understate the norm of S.
+ROOT_GROWTHS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
+# Outward rounding of rows that are divided by what is left of the box.
+_OUTWARD = 1.0 + 1e-12
+# An estimate this far out, in units of S, is not worth a test (and its square overflows at 1e154).
+FARTHEST = 1e100
+# With a smaller radius 1 - h, rounding of the weights would no longer be small against it.
+SMALLEST_RADIUS = 1e-5
+# An error shape may be indefinite by this fraction of its diagonal: rounding of flat ones.
+INDEFINITE = 1e-9
+
+
+class SetTest:
+    """Whether everything that one step can reach lies in a set (docs/shield_proof.md).
+
+    x+ = A x_hat + B u - A e + d with e in E(Sigma_k) and d in E(D). An input u passes if c = A x_hat + B u meets both:
+
+    - Cone, for S = {x : x'Mx <= 1} = E(L) ("One step"): x+ lies in {c} + E(Sigma_pred). In coordinates where M = I,
+      with p_i the eigenvalues of Sigma_pred, c_i the coordinates of c along their axes and h = sqrt(max p) < 1, that
+      set is inside S if
+
+          sum_i (1-h) h / (h - p_i) c_i^2 <= (1-h)^2,
+
+      the exact containment test at the multiplier that is best if all p_i are equal. It admits more than |c|_M <= 1 -
+      h, since every weight is at most 1, and is as cheap: the inputs that pass form an ellipsoid in both.
+    - Rows, for P = {x : |G x| <= 1} ("Polytopes"). For all rows g
+
+          |g c| + sqrt(g A Sigma_k A' g') + sqrt(g D g') <= 1,
+
+      which is exact for what is known: the supports of errors and disturbances add up. Where the box counts between
+      samples, too, its rows on x_hat and u at these times (`rows_between`) follow, for either set.
+
+    Radius and row limits are reduced, and Sigma_pred enlarged, by a bound on the rounding of all products and of
+    simulating the step; where a set has both, by the larger of their bounds.
+
+    Args:
+        plant: Gives A, B, D, the limits and the rows between samples.
+        cone: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n); (0, n) for P.
+        rows: Those of P, shape (r, n); (0, n) for S.
+
+    Attributes:
+        cone: k, the number of rows at the top of the arrays below that are coordinates of the cone.
+        root: Of the cone and of P, shape (k + r, n).
+        state_rows, input_rows: These times A and B, and then the rows between samples, shapes (.., n) and (.., m).
+        joint: Both beside each other, without the cone.
+        D: G D G' of the cone with the rounding of computing it, shape (k, k).
+        disturbed: sqrt(g D g') of the rows with the rounding of computing it, and what stands for it between samples.
+        rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
+        columns, own_columns: Norms of the columns of |G| |A| and of |G|, of rows their largest entries, shape (n,).
+        pushed: Largest norm of |G| |B| |u| within the limits, or its largest entry.
+        shift: Largest norm of G B u within the limits, or its largest entry, to which the rounding of an action is
+            relative.
+        limits: Entries of u_max.
+    """
+
+    @own_error_state  # what is not finite passes no test
+    def __init__(self, plant: LinearPlant, cone: np.ndarray, rows: np.ndarray) -> None:
+        self.plant, self.cone, self.limits = plant, len(cone), plant.u_max.tolist()
+        between, self.root = rows_between(plant), read_only(np.concatenate([cone, rows]))
+        self.state_rows = read_only(np.concatenate([self.root @ plant.A, between.state]))
+        self.input_rows = read_only(np.concatenate([self.root @ plant.B, between.input]))
+        self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
+        self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
+        size = np.abs(self.root)
+        sizes = np.concatenate([size @ np.abs(plant.A), np.abs(between.state)])
+        pushes = np.concatenate([size @ np.abs(plant.B), np.abs(between.input)])
+        self.columns, self.own_columns = read_only(self._norms(sizes)), read_only(self._norms(size))
+        self.pushed, self.shift = self._largest(pushes), self._largest(np.abs(self.input_rows))
+        D = plant.disturbance.shape_matrix
+        rounding = self.rounding * float(self.own_columns @ np.sqrt(np.diag(D))) ** 2
+        spread = cone @ D @ cone.T + rounding * np.eye(self.cone)
+        self.D = read_only(0.5 * (spread + spread.T))
+        self.disturbed = read_only(np.concatenate([supports(rows, D, rounding), between.disturbed]))
+
+    def _norms(self, sizes: np.ndarray) -> np.ndarray:
+        """Returns the norms of the columns in the cone, or their largest entries in the rows if they are larger."""
+        cone, rows = sizes[: self.cone], sizes[self.cone :]
+        return np.maximum(np.linalg.norm(cone, axis=0), rows.max(axis=0, initial=0.0))
+
+    def _largest(self, pushes: np.ndarray) -> float:
+        """Returns the same of the products with inputs within the limits."""
+        cone, rows = pushes[: self.cone], pushes[self.cone :]
+        limits = self.plant.u_max
+        return max(float(np.linalg.norm(cone, axis=0) @ limits), float((rows @ limits).max(initial=0.0)))
+
+    @own_error_state  # what overflows passes no test, what underflows does not count
+    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
+        """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
+
+        Args:
+            shapes: Sigma_k, shape (k, n, n).
+            certified_shapes: Shapes of the certified error sets, shape (l, n, n).
+        """
+        symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
+        half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
+        spread, own_rounding = half_widths @ self.columns, self.rounding * (half_widths @ self.own_columns) ** 2
+        center, rows = self.state_rows[: self.cone], self.state_rows[self.cone :]
+        reach = supports(rows, symmetric, self.rounding * spread[:, None] ** 2).T + self.disturbed[:, None]
+        row_limits = 1.0 - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
+        if self.cone:
+            weighting, radius = ball(center, self.D, symmetric, spread, self.pushed, self.rounding)
+            own = _eigh(self.root @ symmetric @ self.root.T)[0][:, -1] + own_rounding
+            error_reach = np.sqrt(np.maximum(own, 0.0))[None]
+        else:
+            weighting, radius = np.empty((len(shapes), 0, 0)), row_limits.min(axis=0)
+            error_reach = supports(self.root, symmetric, own_rounding[:, None]).T
+        usable &= np.isfinite(radius) & np.isfinite(row_limits).all(axis=0) & np.isfinite(error_reach).all(axis=0)
+        unusable = np.where(usable, 0.0, np.nan)
+        return PredictedErrors(
+            weighting=np.ascontiguousarray(np.where(usable[:, None, None], weighting, 0.0).transpose(1, 2, 0)),
+            row_limits=np.ascontiguousarray(row_limits + unusable),
+            radius=radius + unusable,
+            half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
+            error_reach=np.ascontiguousarray(error_reach + unusable),
+            certified=inside & usable,
+            shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
+        )
+
+    def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> ReachableSets:
+        """Returns the sets of next states that N estimates allow, shape (n, N)."""
+        reach = self.columns @ np.abs(estimates)
+        rounding = self.rounding * reach
+        near = reach < FARTHEST
+        if np.count_nonzero(near) < len(near):  # what is too far out or not finite has no radius
+            rounding[~near] = np.nan
+        radius = errors.radius - rounding
+        small = radius < SMALLEST_RADIUS
+        if np.count_nonzero(small):  # too small for the weights: nothing passes
+            radius[small] = np.minimum(radius[small], 0.0)
+        center = self.state_rows[: self.cone] @ estimates
+        return ReachableSets(self, estimates, center, errors.weighting, errors.row_limits, rounding, radius)
+
+    def margins_alone(self, estimate: np.ndarray, errors: PredictedErrors, u: np.ndarray) -> tuple[float, float]:
+        """Returns `ReachableSets.margins` of one estimate, shape (n,), one error shape and one input, shape (m,).
+
+        By the same formulas without the axis of environments, in a fifth of the time. Both are NaN where nothing is
+        known and where no input passes.
+        """
+        rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
+        radius = errors.radius - rounding
+        if not radius >= SMALLEST_RADIUS:  # neither NaN
+            return nan, nan
+        center = self.state_rows.dot(estimate) + self.input_rows.dot(u)
+        least = np.inf
+        if len(self.disturbed):
+            least = float(np.minimum.reduce(errors.row_limits - rounding - np.abs(center[self.cone :])))
+        if not self.cone:
+            return least, least
+        center = center[: self.cone]
+        weighted = errors.weighting.dot(center)
+        margins = radius - float(weighted.dot(weighted)) ** 0.5, radius - float(center.dot(center)) ** 0.5
+        return min(margins[0], least), min(margins[1], least)
+
+    def closest_alone(self, estimate: np.ndarray, errors: PredictedErrors, u: float, margin: float) -> float:
+        """Returns `ReachableSets.closest` of one estimate, shape (n,), and error shape, for plants with one input."""
+        rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
+        center, effect = self.state_rows.dot(estimate), self.input_rows
+        if self.cone:
+            pushed, offset = (errors.weighting.dot(each[: self.cone]) for each in (effect[:, 0], center))
+            form = (float(pushed.dot(pushed)), float(pushed.dot(offset)), float(offset.dot(offset)))
+            u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0])
+        if len(self.disturbed):
+            limits = (errors.row_limits - rounding)[:, None] - margin
+            u = self.closest_on_rows(np.array([[u]]), center[self.cone :, None], limits).item()
+        return u
+
+    def closest_on_rows(self, inputs: np.ndarray, offset: np.ndarray, row_limits: np.ndarray) -> np.ndarray:
+        """Returns the inputs within the limits closest to given ones, (m, N), with |offset + rows u| <= row_limits."""
+        limits = self.plant.u_max[:, None]
+        rows = np.concatenate([self.input_rows[self.cone :], np.eye(len(limits))])
+        offset = np.concatenate([offset, np.zeros(inputs.shape)])
+        bounds = np.concatenate([row_limits, np.broadcast_to(limits, inputs.shape)])
+        return closest_between(inputs, offset, rows[..., None], bounds)
+
+    @own_error_state
+    def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
+        """Returns whether estimates of shape (n, N), or a single one, (n,), prove that x is in the set.
+
+        With a cone |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin proves it, else |g x_hat| + sqrt(g Sigma_k g')
+        <= 1 - margin for all rows.
+        """
+        levels = self.root.dot(estimates)
+        levels = norms(levels)[None] if self.cone else np.abs(levels)
+        level = (levels + errors.error_reach).max(axis=0)
+        return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
+
+    @own_error_state
+    def keeps_between(
+        self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
+    ) -> bool:
+        """Returns whether the box is kept between this sample and the next, if that counts, with input u or none."""
+        first = len(self.root)
+        rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
+        values = self.state_rows[first:].dot(estimate)
+        values = values if u is None else values + self.input_rows[first:].dot(u)
+        return bool((np.abs(values) <= errors.row_limits[first - self.cone :] - rounding - margin).all())
+
+
+class ReachableSets(NamedTuple):
+    """Where next states lie, for each of N environments.
+
+    Errors, disturbance and rounding are taken off the limits first. What is left for A x_hat + B u is the `radius`, of
+    rows the `row_limits`; what an input leaves of that is its margin, which is negative where it asks for more. The
+    test margin, the least of radius - |T G (A x_hat + B u)| and of row limit - |g (A x_hat + B u)|, decides: x+ is in
+    the set unless it is negative. The reported margin (`Decision.margin`) has no T, and is at most that.
+
+    Attributes:
+        test: What holds for all of them.
+        estimates: x_hat, shape (n, N).
+        center: G A x_hat of the cone, shape (k, N).
+        weighting: T of `PredictedErrors`, shape (k, k, N).
+        row_limits: Largest |g (A x_hat + B u)| that passes, shape (r, N), before
+        rounding: what they lose by rounding, shape (N,); NaN if nothing is known.
+        radius: That of the cone, else the least row limit, less rounding, shape (N,); no input passes if it is not
+            positive. NaN if nothing is known.
+    """
+
+    test: SetTest
+    estimates: np.ndarray
+    center: np.ndarray
+    weighting: np.ndarray
+    row_limits: np.ndarray
+    rounding: np.ndarray
+    radius: np.ndarray
+
+    def some(self, chosen: np.ndarray) -> ReachableSets:
+        """Returns the sets of some environments, given by their indices."""
+        return ReachableSets(self.test, *(array.take(chosen, axis=-1) for array in self[1:]))
+
+    def margins(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns test and reported margins of inputs u, shape (m, N); shape (N,), NaN where nothing is known."""
+        test = self.test
+        if not test.cone:
+            least = self._least_of_rows(inputs)
+            return least, least.copy()
+        effect = test.input_rows[: test.cone]  # with a single input, products without the sums are the same and faster
+        center = self.center + (effect * inputs if len(inputs) == 1 else effect @ inputs)
+        margins = self.radius - norms((self.weighting * center).sum(axis=1)), self.radius - norms(center)
+        if not len(test.joint):
+            return margins
+        least = self._least_of_rows(inputs)
+        return np.minimum(margins[0], least), np.minimum(margins[1], least)
+
+    def _least_of_rows(self, inputs: np.ndarray) -> np.ndarray:
+        """Returns the least that inputs u, shape (m, N), leave of a row limit, shape (N,)."""
+        joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
+        block = max(1, BLOCK // len(self.test.joint))
+        for start in range(0, len(least), block):
+            part = slice(start, start + block)
+            center = self.test.joint @ joint[:, part]
+            np.abs(center, out=center)
+            np.subtract(self.row_limits[:, part], center, out=center)
+            least[part] = center.min(axis=0)
+        least -= self.rounding
+        return least
+
+    def smallest_test_margin(self) -> np.ndarray:
+        """Returns that of the worst input within the limits, shape (N,); in the cone a vertex: the norm is convex."""
+        test, cone = self.test, self.test.cone
+        center = np.abs(test.state_rows[cone:] @ self.estimates)
+        pushed = np.abs(test.input_rows[cone:]) @ test.plant.u_max
+        worst = (self.row_limits - center - pushed[:, None]).min(axis=0, initial=np.inf) - self.rounding
+        if not cone:
+            return worst
+        vertices = np.array(list(product(*((-limit, limit) for limit in test.limits)))).T
+        pieces = max(1, vertices.shape[1] * len(self.radius) // LARGEST_BLOCK)
+        for some in np.array_split(vertices, pieces, axis=1):
+            centers = self.center[:, None] + (test.input_rows[:cone] @ some)[:, :, None]
+            farthest = norms((self.weighting[:, :, None] * centers).sum(axis=1)).max(axis=0)
+            worst = np.minimum(worst, self.radius - farthest)
+        return worst
+
+    def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
+        """Returns the inputs within the limits, (m, N), closest to given ones with this test margin, else NaN.
+
+        With cone and rows a single input is in two intervals, and the closest point of one to the closest of the other
+        is that of both. Of several inputs projections alternate: the result need not be the closest, nor pass, and the
+        caller tests it.
+        """
+        cone, rows = self.test.cone, len(self.test.joint)
+        for _ in range(ALTERNATIONS if cone and rows and len(inputs) > 1 else 1):
+            inputs = self._closest_in_cone(inputs, margin) if cone else inputs
+            inputs = self._closest_on_rows(inputs, margin) if rows else inputs
+        return inputs
+
+    def _closest_in_cone(self, inputs: np.ndarray, margin: float) -> np.ndarray:
+        effect = self.test.input_rows[: self.test.cone]
+        effect = (self.weighting[:, :, None] * effect[:, :, None]).sum(axis=1)
+        offset = (self.weighting * self.center).sum(axis=1)
+        return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
+
+    def _closest_on_rows(self, inputs: np.ndarray, margin: float) -> np.ndarray:
+        (m, count), cone = inputs.shape, self.test.cone
+        block = max(1, BLOCK // (len(self.test.joint) * m))
+        if m > 1 and count > block:
+            parts = [np.arange(start, min(start + block, count)) for start in range(0, count, block)]
+            return np.hstack([self.some(part)._closest_on_rows(inputs[:, part], margin) for part in parts])
+        offset, limits = self.test.state_rows[cone:] @ self.estimates, self.row_limits - self.rounding - margin
+        return self.test.closest_on_rows(inputs, offset, limits)
+
+
+class PredictedErrors(NamedTuple):
+    """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
+
+    The norm of S is weighted, rows are judged one by one; what a test does not need has no entries. Radius,
+    half_widths, error_reach and row_limits are NaN for an unusable shape.
+
+    Attributes:
+        weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
+        row_limits: 1 - sqrt(g A Sigma_k A' g') - sqrt(g D g') less the rounding that does not depend on the estimate,
+            for rows g, shape (r, k).
+        radius: 1 - h less that rounding; without a cone the least row limit, shape (k,).
+        half_widths: Largest error of each state, shape (n, k).
+        error_reach: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope
+            sqrt(g Sigma_k g'), shape (r, k).
+        certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
+        shape: Sigma_k itself, shape (n, n, k); the filter keeps it in mode "lookahead" alone, else (0, n, k).
+    """
+
+    weighting: np.ndarray
+    row_limits: np.ndarray
+    radius: Any
+    half_widths: np.ndarray
+    error_reach: np.ndarray
+    certified: Any
+    shape: np.ndarray
+
+    def of(self, numbers: np.ndarray) -> Self:
+        """Returns those of environments that have the shapes with these numbers, shape (N,)."""
+        return self._make(array.take(numbers, axis=-1) for array in self)
+
+    def single(self, number: int = 0) -> Self:
+        """Returns one of them without a last axis."""
+        return self._make(array.item(number) if array.ndim == 1 else array[..., number].copy() for array in self)
+
+    def read_only(self) -> Self:
+        """Returns the same, read-only."""
+        return self._make(frozen(each) if isinstance(each, np.ndarray) else each for each in self)
+
+    def batch(self) -> Self:
+        """Returns a single one as a batch of one."""
+        return self._make(np.asarray(each)[..., None] for each in self)
+
+    def followed_by(self, other: Self) -> Self:
+        """Returns these shapes and then the others."""
+        return self._make(np.concatenate(pair, axis=-1) for pair in zip(self, other, strict=True))
+
+
+def judged_shapes(shapes: np.ndarray, certified_shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns error shapes made symmetric, which are usable, and which lie inside a certified error set.
+
+    Shapes are (k, n, n), (k,) and (k,). The identity stands for an unusable one.
+    """
+    symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
+    usable = _are_shapes(symmetric)
+    inside = [
+        bool(fine) and any(is_inside(S, Sigma) for Sigma in certified_shapes)
+        for S, fine in zip(shapes, usable, strict=True)
+    ]
+    return np.where(usable[:, None, None], symmetric, np.eye(shapes.shape[-1])), usable, np.array(inside, np.bool_)
+
+
+def _are_shapes(matrices: np.ndarray) -> np.ndarray:
+    """Returns whether symmetric matrices (k, n, n) are finite and positive semidefinite up to rounding, shape (k,).
+
+    Judged by the correlations S_ij / sqrt(S_ii S_jj), which do not depend on units.
+    """
+    widths = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    products = widths[:, :, None] * widths[:, None, :]
+    possible = np.all(np.abs(matrices) <= (1.0 + INDEFINITE) * products, axis=(1, 2)) & np.all(widths < np.inf, axis=1)
+    correlations = np.where(products > 0.0, matrices / products, 0.0)
+    correlations = np.where(possible[:, None, None], correlations, 0.0)
+    return possible & (_eigh(correlations)[0][:, 0] >= -INDEFINITE)
+
+
+def _eigh(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns ascending eigenvalues (k, n) and eigenvectors (k, n, n); NaN where they cannot be computed."""
+    finite = np.all(np.isfinite(matrices), axis=(1, 2))
+    try:
+        values, axes = np.linalg.eigh(np.where(finite[:, None, None], matrices, 0.0))
+    except np.linalg.LinAlgError:
+        return np.full(matrices.shape[:2], np.nan), np.full(matrices.shape, np.nan)
+    return np.where(finite[:, None], values, np.nan), axes
+
+
+def ball(
+    moved: np.ndarray, D: np.ndarray, shapes: np.ndarray, spread: np.ndarray, pushed: float, rounding: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where the center of {c} + E(Sigma_pred) may be: T, shape (k, n, n), and the radius, (k,), of |T G c|.
+
+    Sigma_pred is the trace-smallest G (A Sigma_k A'/nu + D/(1-nu)) G', enlarged by the rounding of computing it. The
+    radius is NaN where nothing is known.
+
+    Args:
+        moved: G A, shape (n, n); of several steps that of all of them.
+        D: What disturbances add up to, in the coordinates of G, shape (n, n).
+        shapes: Sigma_k, symmetric, shape (k, n, n).
+        spread: Bounds of |G| |A| |e|, shape (k,).
+        pushed: Bound of |G| |B| |u|.
+        rounding: Relative to the products of absolute values.
+    """
+    reached = moved @ shapes @ moved.T + (spread**2)[:, None, None] * (rounding * np.eye(len(moved)))
+    second = np.trace(D) ** 0.5
+    first = np.abs(np.trace(reached, axis1=1, axis2=2)) ** 0.5
+    first = np.maximum(first, SMALLEST_MULTIPLIER * second)[:, None, None]
+    squares, axes = _eigh(reached * (1.0 + second / first) + D * (1.0 + first / second))
+    h = np.sqrt(squares[:, -1])
+    radius = 1.0 - h - rounding * (spread + pushed)
+    weights = np.where(radius[:, None] >= SMALLEST_RADIUS, (h * (1.0 - h))[:, None] / (h[:, None] - squares), 1.0)
+    weighting = np.sqrt(weights)[:, :, None] * axes.swapaxes(1, 2)
+    usable = np.all(np.isfinite(weighting), axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
+    return weighting, np.where(usable, radius, np.nan)
+
+
+def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
+    """Returns upper bounds of sqrt(g S g'), shape (..., r), for rows g, (..., r, n), and shapes S, (..., n, n).
+
+    Computing g S g' is off by at most the rounding.
+    """
+    squares = ((rows @ shapes) * rows).sum(axis=-1)
+    return np.sqrt(np.maximum(squares, 0.0) + rounding)
+
+
+class RowsBetween(NamedTuple):
+    """|row (A_tau x_hat + B_tau u)| + support of A_tau e + disturbed <= 1 at the times tau_i, i = 1..N-1.
+
+    Rows are those of the box, divided by what eta leaves of it; no rows for a plant that counts at samples alone.
+
+    Attributes:
+        state: Rows on x_hat, shape (g, n).
+        input: Rows on u, shape (g, m).
+        disturbed: Support of the disturbances, shape (g,).
+        at_samples: Rows on the state at a sampling instant, shape (k, n), from which the box is kept until the first of
+            these times: those of the box divided by what eta and the disturbances leave, or the box's own.
+    """
+
+    state: np.ndarray
+    input: np.ndarray
+    disturbed: np.ndarray
+    at_samples: np.ndarray
+
+    def values(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Returns the rows at states x_hat, shape (N, n), and inputs, (N, m): shape (N, g), without any disturbance."""
+        return states @ self.state.T + inputs @ self.input.T
+
+
+@own_error_state  # what is not finite passes no test
+def rows_between(plant: LinearPlant) -> RowsBetween:
+    """Returns the rows of a plant's box between two samples."""
+    rows, grid = plant.box_rows, plant.grid_rows
+    if grid is None:
+        return RowsBetween(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0), rows)
+    D, rounding = plant.disturbance.shape_matrix, 8.0 * plant.n * float(np.finfo(float).eps)
+    left = (1.0 - grid.remainder) / _OUTWARD
+    rho = supports(rows, D, rounding * (np.abs(rows) @ np.sqrt(np.diag(D))) ** 2)
+    at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
+    count = len(grid.state) - 1
+    return RowsBetween(
+        state=read_only((grid.state[1:] / left[:, None]).reshape(-1, plant.n)),
+        input=read_only((grid.input[1:] / left[:, None]).reshape(-1, plant.m)),
+        disturbed=read_only(np.tile(np.where(left > 0.0, rho / left, np.inf), count)),
+        at_samples=read_only(rows / at_samples[:, None]),
+    )
+
+
+def norms(vectors: np.ndarray) -> np.ndarray:
+    """Returns the Euclidean norms of the columns of an array (n, N), shape (N,)."""
+    if len(vectors) == 1:
+        return np.abs(vectors[0])
+    return np.sqrt((vectors * vectors).sum(axis=0))
+
+
+def certificate_test(certificate: Certificate, plant: LinearPlant) -> SetTest:
+    """Returns the test of the set that a certificate keeps: of its polytope, or of its ellipsoid if it has none.
+
+    Raises:
+        CertificateError: If the ellipsoid is so thin that no norm computed in float64 provably describes it.
+    """
+    if certificate.polytope is not None:
+        return SetTest(plant, np.empty((0, plant.n)), certificate.polytope.rows)
+    return ellipsoid_test(certificate.L, plant)
+
+
+def ellipsoid_test(L: np.ndarray, plant: LinearPlant) -> SetTest:
+    """Returns the test of S = E(L).
+
+    Raises:
+        CertificateError: If S is so thin that no norm computed in float64 provably describes it.
+    """
+    return SetTest(plant, certified_root(L), np.empty((0, plant.n)))
+
+
+def certified_root(L: np.ndarray) -> np.ndarray:
+    """Returns G, shape (n, n), such that |z|_M <= |G z| for all z: G L G' >= I, decided in exact arithmetic.
+
+    Raises:
+        CertificateError: If no such G within 1e-9 of the best was found.
+    """
+    identity = rational(np.eye(len(L)))
+    try:
+        root = solve_triangular(np.linalg.cholesky(L), np.eye(len(L)), lower=True)
+    except np.linalg.LinAlgError:
+        root = np.zeros_like(L)
+    for growth in ROOT_GROWTHS:
+        grown = (1.0 + growth) * root
+        if is_positive_semidefinite(subtract(congruence(rational(grown), rational(L)), identity)):
+            return grown
+    raise CertificateError("the safe set is too thin to decide in float64 what lies in it")
+
+
+def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless float64 computes K x_hat on S, or the polytope, more accurately than the conditions allow for.
+
+    D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
+
+    Raises:
+        CertificateError: If it does not.
+    """
+    extent = np.sqrt(np.diag(certificate.L))
+    if certificate.polytope is not None:  # anywhere in the box: x'C'Cx is at most the number of its rows there
+        extent = np.maximum(extent, len(plant.box_rows) ** 0.5 * plant.half_widths)
+    extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
+    error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
+    if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
+        raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")
