@@ -48,6 +48,16 @@ class Polytope(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     @cached_property
+    def low(self) -> np.ndarray:
+        """The lower ends of the rows, shape (r,): -1, since P is symmetric."""
+        return read_only(np.full(len(self.rows), -1.0))
+
+    @cached_property
+    def high(self) -> np.ndarray:
+        """The upper ends of the rows, shape (r,): 1."""
+        return read_only(np.ones(len(self.rows)))
+
+    @cached_property
     def F(self) -> np.ndarray:
         """All faces: P = {x : F x <= 1}, shape (2 r, n); the rows, and then the negative ones."""
         return read_only(np.concatenate([self.rows, -self.rows]))
