@@ -145,7 +145,7 @@ def projection_jacobians(
     closest = sets.closest(wanted, shield.projection_margin)
     test, cone = shield.test, shield.test.cone
     offset = test.state_rows @ sets.estimates
-    effect, taken = test.input_rows, sets.reach + (sets.rounding + shield.projection_margin)
+    effect, row_limits = test.input_rows, sets.row_limits - sets.rounding - shield.projection_margin
     for e in range(count):
         u, held = closest[:, e], np.abs(closest[:, e]) >= (1.0 - ATTAINED) * limits
         active, ball = np.eye(len(limits))[held], None
@@ -154,8 +154,8 @@ def projection_jacobians(
         if cone and np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
             pushed = weighting @ effect[:cone]
             ball = pushed, pushed.T @ center
-        low, high = test.low + taken[:, e], test.high - taken[:, e]
-        attained = test.left(reached[cone:]) - taken[:, e] <= ATTAINED * np.maximum(0.5 * (high - low), 1e-3)
+        taken = np.abs(reached[cone:] - test.middle)
+        attained = taken >= row_limits[:, e] - ATTAINED * np.maximum(row_limits[:, e], 1e-3)
         active = np.vstack([active, effect[cone:][attained]])
         free = np.eye(len(limits))
         if len(active):

@@ -166,10 +166,8 @@ def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @own_error_state  # what is not finite is not admissible
-def closest_between(
-    wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Returns argmin |u - wanted| over low <= offset + effect u <= high, row by row; NaN where there is none.
+def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns argmin |u - wanted| over |offset + effect u| <= limits, row by row; NaN where there is none.
 
     One input is an interval. Otherwise the closest point of a polytope lies on a face that the wanted one is beyond:
     on the plane of each of these the problem is the same with one input less.
@@ -177,32 +175,31 @@ def closest_between(
     Args:
         wanted: Shape (m, N).
         offset: Shape (r, N).
-        effect: Shape (r, m, N), or (r, m, 1) for the same in all; every direction has some row with two finite ends.
-        low: Shape (r, N).
-        high: Likewise; nothing is admissible where one of both is NaN, or where low > high.
+        effect: Shape (r, m, N), or (r, m, 1) for the same in all; every direction has some row.
+        limits: Shape (r, N); nothing is admissible where one is negative or NaN.
 
     Returns:
         Shape (m, N).
     """
     if len(wanted) == 1:
         inverse = 1.0 / effect[:, 0]
-        flat, rises = np.isinf(inverse), inverse > 0.0
-        first, second = (low - offset) * inverse, (high - offset) * inverse
-        least, most = np.where(rises, first, second), np.where(rises, second, first)
+        flat = np.isinf(inverse)
+        middle, half = offset * -inverse, limits * np.abs(inverse)
+        low, high = middle - half, middle + half
         if np.count_nonzero(flat):  # rows that no input moves
-            least = np.where(flat, np.where((low <= offset) & (offset <= high), -np.inf, np.inf), least)
-            most = np.where(flat, np.inf, most)
-        least, most = least.max(axis=0), most.min(axis=0)
-        return np.where(least <= most, np.minimum(np.maximum(wanted, least), most), np.nan)
+            low = np.where(flat, np.where(np.abs(offset) <= limits, -np.inf, np.inf), low)
+            high = np.where(flat, np.inf, high)
+        low, high = low.max(axis=0), high.min(axis=0)
+        return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
     values = offset + _changes(effect, wanted)
-    beyond = ~((low <= values) & (values <= high))
+    beyond = ~(np.abs(values) <= limits)
     closest = np.where(beyond.any(axis=0), np.nan, wanted)
-    row, problem = np.nonzero(beyond & (low <= high))
+    row, problem = np.nonzero(beyond & (limits >= 0.0))
     if not row.size:
         return closest
     shared = effect.shape[2] == 1
     normals, start = effect[row, :, 0 if shared else problem].T, wanted[:, problem]
-    face = np.where(values > high, high, low)[row, problem]
+    face = np.sign(values[row, problem]) * limits[row, problem]
     foot = start + normals * ((face - values[row, problem]) / (normals * normals).sum(axis=0))
     usable = np.isfinite(foot).all(axis=0)
     row, problem = row[usable], problem[usable]
@@ -212,17 +209,15 @@ def closest_between(
         plane = (np.stack([-normals[1], normals[0]]) / np.hypot(*normals))[:, None]
     else:
         plane = np.linalg.svd(normals.T[:, None])[2][:, 1:].transpose(2, 1, 0)
+    left = limits[:, problem]
+    left[row, np.arange(len(row))] = np.inf  # the face itself
     here = effect if shared else effect[:, :, problem]
     within = np.stack([_changes(here, direction) for direction in plane.swapaxes(0, 1)], axis=1)
     # A row that is parallel to the face does not change in its plane: rounding must not decide whether it holds there.
     parallel = (within * within).sum(axis=1) <= PARALLEL**2 * (here * here).sum(axis=1)
     within = np.where(parallel[:, None], 0.0, within)
-    offset = offset[:, problem]
-    below, above = low[:, problem], high[:, problem]
-    below = np.where(parallel, below - PARALLEL * (np.abs(below) + np.abs(offset)), below)
-    above = np.where(parallel, above + PARALLEL * (np.abs(above) + np.abs(offset)), above)
-    below[row, np.arange(len(row))], above[row, np.arange(len(row))] = -np.inf, np.inf  # the face itself
-    moves = closest_between(np.zeros(plane.shape[1:]), offset + _changes(here, foot), within, below, above)
+    left = np.where(parallel, left * (1.0 + PARALLEL) + PARALLEL * np.abs(offset[:, problem]), left)
+    moves = closest_between(np.zeros(plane.shape[1:]), offset[:, problem] + _changes(here, foot), within, left)
     found = foot + (plane * moves).sum(axis=1)
     distance = np.sqrt(((found - start) ** 2).sum(axis=0))
     least = np.full(wanted.shape[1], np.inf)

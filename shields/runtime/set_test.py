@@ -58,25 +58,26 @@ class SetTest:
 
           low + reach <= g c <= high - reach,    reach = sqrt(g A Sigma_k A' g') + sqrt(g D g'),
 
-      which is exact for what is known: the supports of errors and disturbances add up. Either end may be infinite.
-      Where the box counts between samples, too, its rows on x_hat and u at these times (`rows_between`) follow, for
-      either set.
+      which is exact for what is known: the supports of errors and disturbances add up. Where the box counts between
+      samples, too, its rows on x_hat and u at these times (`rows_between`) follow, for either set.
 
-    The radius 1 - h is reduced, and the reach and Sigma_pred are enlarged, by a bound on the rounding of all products
-    and of simulating the step; where a set has both, by the larger of their bounds.
+    Radius and row limits are reduced, and Sigma_pred enlarged, by a bound on the rounding of all products and of
+    simulating the step; where a set has both, by the larger of their bounds.
 
     Args:
         plant: Gives A, B, D, the limits and the rows between samples.
         cone: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n); (0, n) for P.
         rows: Those of P, shape (r, n); (0, n) for S.
-        low, high: Their ends, shape (r,).
+        low: Their lower ends, shape (r,). Where a limit is open, any number that nothing in P is beyond will do.
+        high: Their upper ends.
 
     Attributes:
         cone: k, the number of rows at the top of the arrays below that are coordinates of the cone.
         root: Of the cone and of P, shape (k + r, n).
         state_rows, input_rows: These times A and B, and then the rows between samples, shapes (.., n) and (.., m).
         joint: Both beside each other, without the cone.
-        low, high: Ends of the rows, of which those between samples are the last.
+        middle, half: Of the ends of the rows, those between samples included: low <= v <= high is |v - middle| <= half,
+            which is as fast as one end. The half is less by the rounding of both.
         D: G D G' of the cone with the rounding of computing it, shape (k, k).
         disturbed: sqrt(g D g') of the rows with the rounding of computing it, and what stands for it between samples.
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
@@ -95,9 +96,11 @@ class SetTest:
         between, self.root = rows_between(plant), read_only(np.concatenate([cone, rows]))
         self.state_rows = read_only(np.concatenate([self.root @ plant.A, between.state]))
         self.input_rows = read_only(np.concatenate([self.root @ plant.B, between.input]))
-        self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
-        self.low, self.high = (read_only(np.concatenate(ends)) for ends in ((low, between.low), (high, between.high)))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
+        low, high = np.concatenate([low, between.low]), np.concatenate([high, between.high])
+        self.middle = read_only(0.5 * (low + high))
+        self.half = read_only(0.5 * (high - low) - self.rounding * np.abs(self.middle))
+        self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
         size = np.abs(self.root)
         sizes = np.concatenate([size @ np.abs(plant.A), np.abs(between.state)])
         pushes = np.concatenate([size @ np.abs(plant.B), np.abs(between.input)])
@@ -132,21 +135,20 @@ class SetTest:
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
         spread, own_rounding = half_widths @ self.columns, self.rounding * (half_widths @ self.own_columns) ** 2
         center, rows = self.state_rows[: self.cone], self.state_rows[self.cone :]
-        supported = supports(rows, symmetric, self.rounding * spread[:, None] ** 2).T + self.disturbed[:, None]
-        reach = supported * (1.0 + self.rounding) + self.rounding * (spread + self.pushed)
+        reach = supports(rows, symmetric, self.rounding * spread[:, None] ** 2).T + self.disturbed[:, None]
+        row_limits = self.half[:, None] - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
         if self.cone:
             weighting, radius = ball(center, self.D, symmetric, spread, self.pushed, self.rounding)
             own = _eigh(self.root @ symmetric @ self.root.T)[0][:, -1] + own_rounding
             error_reach = np.sqrt(np.maximum(own, 0.0))[None]
         else:
-            half_range = 0.5 * (self.high - self.low)[:, None]
-            weighting, radius = np.empty((len(shapes), 0, 0)), (half_range - reach).min(axis=0)
+            weighting, radius = np.empty((len(shapes), 0, 0)), row_limits.min(axis=0)
             error_reach = supports(self.root, symmetric, own_rounding[:, None]).T
-        usable &= ~np.isnan(radius) & np.isfinite(reach).all(axis=0) & np.isfinite(error_reach).all(axis=0)
+        usable &= np.isfinite(radius) & np.isfinite(row_limits).all(axis=0) & np.isfinite(error_reach).all(axis=0)
         unusable = np.where(usable, 0.0, np.nan)
         return PredictedErrors(
             weighting=np.ascontiguousarray(np.where(usable[:, None, None], weighting, 0.0).transpose(1, 2, 0)),
-            reach=np.ascontiguousarray(reach + unusable),
+            row_limits=np.ascontiguousarray(row_limits + unusable),
             radius=radius + unusable,
             half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
             error_reach=np.ascontiguousarray(error_reach + unusable),
@@ -166,7 +168,7 @@ class SetTest:
         if np.count_nonzero(small):  # too small for the weights: nothing passes
             radius[small] = np.minimum(radius[small], 0.0)
         center = self.state_rows[: self.cone] @ estimates
-        return ReachableSets(self, estimates, center, errors.weighting, errors.reach, rounding, radius)
+        return ReachableSets(self, estimates, center, errors.weighting, errors.row_limits, rounding, radius)
 
     def margins_alone(self, estimate: np.ndarray, errors: PredictedErrors, u: np.ndarray) -> tuple[float, float]:
         """Returns `ReachableSets.margins` of one estimate, shape (n,), one error shape and one input, shape (m,).
@@ -180,8 +182,9 @@ class SetTest:
             return nan, nan
         center = self.state_rows.dot(estimate) + self.input_rows.dot(u)
         least = np.inf
-        if len(self.joint):
-            least = float(np.minimum.reduce(self.left(center[self.cone :]) - errors.reach)) - rounding
+        if len(self.disturbed):
+            left = errors.row_limits - rounding - np.abs(center[self.cone :] - self.middle)
+            least = float(np.minimum.reduce(left))
         if not self.cone:
             return least, least
         center = center[: self.cone]
@@ -197,26 +200,22 @@ class SetTest:
             pushed, offset = (errors.weighting.dot(each[: self.cone]) for each in (effect[:, 0], center))
             form = (float(pushed.dot(pushed)), float(pushed.dot(offset)), float(offset.dot(offset)))
             u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0])
-        if len(self.joint):
-            taken = errors.reach[:, None] + (rounding + margin)
-            u = self.closest_on_rows(np.array([[u]]), center[self.cone :, None], taken).item()
+        if len(self.disturbed):
+            limits = (errors.row_limits - rounding)[:, None] - margin
+            offset = (center[self.cone :] - self.middle)[:, None]
+            u = self.closest_on_rows(np.array([[u]]), offset, limits).item()
         return u
 
-    def left(self, values: np.ndarray) -> np.ndarray:
-        """Returns how far values of the rows, shape (r,), are from the nearer end of each."""
-        return np.minimum(self.high - values, values - self.low)
+    def closest_on_rows(self, inputs: np.ndarray, offset: np.ndarray, row_limits: np.ndarray) -> np.ndarray:
+        """Returns the inputs within the limits closest to given ones, (m, N), with |offset + rows u| <= row_limits.
 
-    def closest_on_rows(self, inputs: np.ndarray, offset: np.ndarray, taken: np.ndarray) -> np.ndarray:
-        """Returns the inputs within the limits closest to given ones, shape (m, N).
-
-        The rows have values offset + rows u, shape (r, N), that keep a distance `taken` from either end.
+        The offset is that from the middle.
         """
-        limits = np.broadcast_to(self.plant.u_max[:, None], inputs.shape)
+        limits = self.plant.u_max[:, None]
         rows = np.concatenate([self.input_rows[self.cone :], np.eye(len(limits))])
         offset = np.concatenate([offset, np.zeros(inputs.shape)])
-        low = np.concatenate([self.low[:, None] + taken, -limits])
-        high = np.concatenate([self.high[:, None] - taken, limits])
-        return closest_between(inputs, offset, rows[..., None], low, high)
+        bounds = np.concatenate([row_limits, np.broadcast_to(limits, inputs.shape)])
+        return closest_between(inputs, offset, rows[..., None], bounds)
 
     @own_error_state
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
@@ -225,12 +224,13 @@ class SetTest:
         With a cone |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin does, else low + margin <= g x_hat +- sqrt(g
         Sigma_k g') <= high - margin for all rows.
         """
-        values, count = self.root.dot(estimates), len(self.root)
+        values = self.root.dot(estimates)
         if self.cone:
-            left = 1.0 - norms(values) - errors.error_reach[0]
+            left = 1.0 - (norms(values) + errors.error_reach[0])
         else:
-            low, high = (ends[:count].reshape(-1, *[1] * (values.ndim - 1)) for ends in (self.low, self.high))
-            left = (np.minimum(high - values, values - low) - errors.error_reach).min(axis=0)
+            of_one = (len(values), *[1] * (values.ndim - 1))
+            middle, half = self.middle[: len(values)].reshape(of_one), self.half[: len(values)].reshape(of_one)
+            left = (half - (np.abs(values - middle) + errors.error_reach)).min(axis=0)
         return left >= margin + self.rounding * self.own_columns.dot(np.abs(estimates))
 
     @own_error_state
@@ -242,34 +242,34 @@ class SetTest:
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.state_rows[first:].dot(estimate)
         values = values if u is None else values + self.input_rows[first:].dot(u)
-        low, high, reach = (each[first - self.cone :] for each in (self.low, self.high, errors.reach))
-        return bool((np.minimum(high - values, values - low) - reach - rounding >= margin).all())
+        middle, row_limits = self.middle[first - self.cone :], errors.row_limits[first - self.cone :]
+        return bool((np.abs(values - middle) <= row_limits - rounding - margin).all())
 
 
 class ReachableSets(NamedTuple):
     """Where next states lie, for each of N environments.
 
-    Errors, disturbance and rounding are taken off the limits first. What an input u leaves of the rest is its margin,
-    which is negative where it asks for more: with c = A x_hat + B u the least of radius - |T G c|, and of high - g c
-    and g c - low less the reach of each row. This test margin decides: x+ is in the set unless it is negative. The
-    reported margin (`Decision.margin`) has no T, and is at most that.
+    Errors, disturbance and rounding are taken off the limits first. What is left for c = A x_hat + B u is the `radius`,
+    of rows the `row_limits`; what an input leaves of that is its margin, which is negative where it asks for more. The
+    test margin, the least of radius - |T G c| and of row limit - |g c - middle|, decides: x+ is in the set unless it is
+    negative. The reported margin (`Decision.margin`) has no T, and is at most that.
 
     Attributes:
         test: What holds for all of them.
         estimates: x_hat, shape (n, N).
         center: G A x_hat of the cone, shape (k, N).
         weighting: T of `PredictedErrors`, shape (k, k, N).
-        reach: Of the rows, shape (r, N), to which
-        rounding: is added, shape (N,); NaN if nothing is known.
-        radius: That of `PredictedErrors` less rounding, shape (N,); no input passes if it is not positive. NaN if
-            nothing is known.
+        row_limits: Largest |g c - middle| that passes, shape (r, N), before
+        rounding: what they lose by rounding, shape (N,); NaN if nothing is known.
+        radius: That of the cone, else the least row limit, less rounding, shape (N,); no input passes if it is not
+            positive. NaN if nothing is known.
     """
 
     test: SetTest
     estimates: np.ndarray
     center: np.ndarray
     weighting: np.ndarray
-    reach: np.ndarray
+    row_limits: np.ndarray
     rounding: np.ndarray
     radius: np.ndarray
 
@@ -292,16 +292,15 @@ class ReachableSets(NamedTuple):
         return np.minimum(margins[0], least), np.minimum(margins[1], least)
 
     def _least_of_rows(self, inputs: np.ndarray) -> np.ndarray:
-        """Returns the least that inputs u, shape (m, N), leave of a row, shape (N,)."""
+        """Returns the least that inputs u, shape (m, N), leave of a row limit, shape (N,)."""
         joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
-        block, low, high = max(1, BLOCK // len(self.test.joint)), self.test.low[:, None], self.test.high[:, None]
+        block = max(1, BLOCK // len(self.test.joint))
         for start in range(0, len(least), block):
             part = slice(start, start + block)
             center = self.test.joint @ joint[:, part]
-            below = center - low
-            np.subtract(high, center, out=center)
-            np.minimum(center, below, out=center)
-            center -= self.reach[:, part]
+            center -= self.test.middle[:, None]
+            np.abs(center, out=center)
+            np.subtract(self.row_limits[:, part], center, out=center)
             least[part] = center.min(axis=0)
         least -= self.rounding
         return least
@@ -309,10 +308,9 @@ class ReachableSets(NamedTuple):
     def smallest_test_margin(self) -> np.ndarray:
         """Returns that of the worst input within the limits, shape (N,); in the cone a vertex: the norm is convex."""
         test, cone = self.test, self.test.cone
-        center = test.state_rows[cone:] @ self.estimates
-        pushed = (np.abs(test.input_rows[cone:]) @ test.plant.u_max)[:, None]
-        worst = np.minimum(test.high[:, None] - center, center - test.low[:, None]) - pushed - self.reach
-        worst = worst.min(axis=0, initial=np.inf) - self.rounding
+        center = np.abs(test.state_rows[cone:] @ self.estimates - test.middle[:, None])
+        pushed = np.abs(test.input_rows[cone:]) @ test.plant.u_max
+        worst = (self.row_limits - center - pushed[:, None]).min(axis=0, initial=np.inf) - self.rounding
         if not cone:
             return worst
         vertices = np.array(list(product(*((-limit, limit) for limit in test.limits)))).T
@@ -348,22 +346,21 @@ class ReachableSets(NamedTuple):
         if m > 1 and count > block:
             parts = [np.arange(start, min(start + block, count)) for start in range(0, count, block)]
             return np.hstack([self.some(part)._closest_on_rows(inputs[:, part], margin) for part in parts])
-        offset, taken = self.test.state_rows[cone:] @ self.estimates, self.reach + (self.rounding + margin)
-        return self.test.closest_on_rows(inputs, offset, taken)
+        offset = self.test.state_rows[cone:] @ self.estimates - self.test.middle[:, None]
+        return self.test.closest_on_rows(inputs, offset, self.row_limits - self.rounding - margin)
 
 
 class PredictedErrors(NamedTuple):
     """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
 
     The norm of S is weighted, rows are judged one by one; what a test does not need has no entries. Radius,
-    half_widths, error_reach and reach are NaN for an unusable shape.
+    half_widths, error_reach and row_limits are NaN for an unusable shape.
 
     Attributes:
         weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
-        reach: sqrt(g A Sigma_k A' g') + sqrt(g D g') and the rounding that does not depend on the estimate, for rows g,
-            shape (r, k).
-        radius: 1 - h less that rounding; without a cone the least that half of a row's range exceeds its reach by,
-            shape (k,).
+        row_limits: Half of a row's range less sqrt(g A Sigma_k A' g') + sqrt(g D g') and the rounding that does not
+            depend on the estimate, for rows g, shape (r, k).
+        radius: 1 - h less that rounding; without a cone the least row limit, shape (k,).
         half_widths: Largest error of each state, shape (n, k).
         error_reach: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope
             sqrt(g Sigma_k g'), shape (r, k).
@@ -372,7 +369,7 @@ class PredictedErrors(NamedTuple):
     """
 
     weighting: np.ndarray
-    reach: np.ndarray
+    row_limits: np.ndarray
     radius: Any
     half_widths: np.ndarray
     error_reach: np.ndarray

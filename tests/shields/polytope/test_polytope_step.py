@@ -98,7 +98,7 @@ def test_closest_points_are_those_of_a_conic_solver_in_three_dimensions():
     rng = np.random.default_rng(0)
     effect, room = rng.standard_normal((12, 3)), rng.uniform(0.2, 1.0, (12, 40))
     offset, wanted = 0.3 * rng.standard_normal((12, 40)), rng.uniform(-3.0, 3.0, (3, 40))
-    found = closest_between(wanted, offset, np.repeat(effect[..., None], 40, axis=-1), -room, room)
+    found = closest_between(wanted, offset, np.repeat(effect[..., None], 40, axis=-1), room)
     infeasible = 0
     for k in range(40):
         u = cp.Variable(3)
@@ -135,10 +135,8 @@ def test_parallel_rows_do_not_hide_the_closest_point():
         effect = np.stack([row, rng.uniform(0.1, 3.0) * row, [1.0, 0.0], [0.0, 1.0]])
         room = np.array([1.0, np.linalg.norm(effect[1]) / np.linalg.norm(row), 5.0, 5.0])
         wanted = 3.0 * rng.standard_normal((2, 1))
-        found = closest_between(wanted, np.zeros((4, 1)), effect[..., None], -room[:, None], room[:, None])[:, 0]
-        once = closest_between(
-            wanted, np.zeros((3, 1)), effect[[0, 2, 3], :, None], -room[[0, 2, 3], None], room[[0, 2, 3], None]
-        )[:, 0]
+        found = closest_between(wanted, np.zeros((4, 1)), effect[..., None], room[:, None])[:, 0]
+        once = closest_between(wanted, np.zeros((3, 1)), effect[[0, 2, 3], :, None], room[[0, 2, 3], None])[:, 0]
         np.testing.assert_allclose(found, once, atol=1e-9)
 
 
