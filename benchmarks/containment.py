@@ -26,9 +26,9 @@ STEPS = 200
 def exact(shield: SafetyFilter, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> bool:
     """Whether everything one step can reach lies in S, with the best s."""
     test = shield.test
-    predicted = outer_sum(test.moved @ error_shape @ test.moved.T, test.D, np.eye(shield.plant.n))
+    predicted = outer_sum(test.state_rows @ error_shape @ test.state_rows.T, test.D, np.eye(shield.plant.n))
     p, axes = np.linalg.eigh(predicted)
-    c = axes.T @ (test.moved @ estimate + test.effect @ u)
+    c = axes.T @ (test.state_rows @ estimate + test.input_rows @ u)
     if p[-1] >= 1.0:
         return False
     bounds = (p[-1] * (1.0 + 1e-9), 1.0)

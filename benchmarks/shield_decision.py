@@ -46,12 +46,12 @@ class ConicFilter:
 
     def decide(self, estimate: np.ndarray, error_shape: np.ndarray, proposed: np.ndarray) -> np.ndarray:
         test, plant = self.shield.test, self.shield.plant
-        predicted = outer_sum(test.moved @ error_shape @ test.moved.T, test.D, np.eye(plant.n))
+        predicted = outer_sum(test.state_rows @ error_shape @ test.state_rows.T, test.D, np.eye(plant.n))
         values, axes = np.linalg.eigh(predicted)
         h = np.sqrt(values[-1])
         weighting = np.sqrt(h * (1.0 - h) / (h - values))[:, None] * axes.T
         self.proposed.value, self.radius.value = proposed, 1.0 - h
-        self.offset.value, self.effect.value = weighting @ test.moved @ estimate, weighting @ test.effect
+        self.offset.value, self.effect.value = weighting @ test.state_rows @ estimate, weighting @ test.input_rows
         self.problem.solve(solver=cp.CLARABEL)
         usable = self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
         return self.u.value if usable else np.clip(self.shield.certificate.K @ estimate, -plant.u_max, plant.u_max)

@@ -397,13 +397,13 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
 
     @property
     def known(self) -> Known:
-        """What a shield decides on, as copies: no wrapper stands between."""
-        return Known(*(each.copy() if isinstance(each, np.ndarray) else each for each in self._known))
+        """What a shield decides on, read-only: no wrapper stands between."""
+        return self._known
 
     @own_error_state
-    def estimates_ahead(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns estimate and error shape of now and of every step until the next decision takes effect."""
-        return [self._estimator.predicted(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
+    def estimates_ahead(self) -> list[tuple[np.ndarray, int]]:
+        """Returns estimate and number of the error shape of now and of every step until the next decision's effect."""
+        return [self._estimator.numbered(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
 
     def close(self) -> None:
         """Closes the window and the process."""
@@ -415,10 +415,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     def _pending(self) -> tuple[np.ndarray, ...]:
         """The inputs of the steps until the next decision takes effect."""
         return self._downlink_state.committed.pending
-
-    def _predicted_estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns estimate, (n,), and error shape, (n, n), of the time at which the next decision takes effect."""
-        return self._estimator.predicted(self._pending)
 
     def _links(self) -> list[tuple[str, EpisodeChannels]]:
         return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
@@ -442,13 +438,13 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._violations += cost
         constraints = Constraints(values, worst, cost, self._violations)
         estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
+        estimate, number = estimator.numbered(self._pending)
+        applied, committed, table = inputs.applied.copy(), inputs.committed.copy(), estimator.table
+        for array in (estimate, applied, committed):
+            array.setflags(write=False)
+        age, damaged = estimator.age, estimator.damaged
         self._known = Known(
-            *self._predicted_estimate(),
-            estimator.age,
-            alarm,
-            estimator.damaged,
-            inputs.applied.copy(),
-            inputs.committed.copy(),
+            estimate, table.shape(number), age, alarm, damaged, applied, committed, table=table, number=number
         )
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:

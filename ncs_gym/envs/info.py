@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ncs_gym.estimation.arrival_histories import ErrorTable
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.requests import Requested
 
@@ -13,7 +14,8 @@ from ncs_gym.network.requests import Requested
 class Known(NamedTuple):
     """What is known where decisions are made, of now; of N environments, arrays whose last axis is the environment.
 
-    A shield takes what it decides on from here, never from an `info`, into which wrappers may have written.
+    A shield takes what it decides on from here, never from an `info`, into which wrappers may have written. Nobody
+    writes into the arrays.
 
     Attributes:
         estimate: x_hat of the time at which the next decision takes effect, shape (n,) or (n, N).
@@ -23,6 +25,8 @@ class Known(NamedTuple):
         damaged: Whether one was because a sample was no finite numbers, a bool or shape (N,).
         applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
         committed: The input decided in the last step, of the same shape.
+        table: What holds Sigma_k by its number; another one after shapes were forgotten.
+        number: That number, an int or shape (N,), by which everything that follows from Sigma_k is found again.
     """
 
     estimate: np.ndarray
@@ -32,6 +36,8 @@ class Known(NamedTuple):
     damaged: Any
     applied: np.ndarray
     committed: np.ndarray
+    table: ErrorTable
+    number: Any
 
 
 class Constraints(NamedTuple):

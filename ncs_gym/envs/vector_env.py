@@ -16,7 +16,7 @@ from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
-from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
+from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel, widest
@@ -31,7 +31,7 @@ from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, own_error_state, setting, shown
+from ncs_gym.validation import as_count, frozen, own_error_state, setting, shown
 
 
 class NCSVectorEnv(SpecOfJson, VectorEnv):
@@ -136,7 +136,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             input_delay = 0 if self._protocol is None else self._protocol.input_delay
             self._requests = Requests(self._channel, self._contract, input_delay, self.num_envs)
         self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
-        self._estimate = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
         self._worst = self._plant.constraint_values(self._state)
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
@@ -157,29 +156,18 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         return tuple(self._downlinks.now)
 
     @property
-    def error_shapes(self) -> tuple[ErrorTable, np.ndarray]:
-        """A table whose `shapes` (k, n, n) are the distinct error shapes so far, and the number there of each one now.
-
-        The table grows; it is another object after shapes were forgotten.
-        """
-        return self._estimator.histories.table, self._estimate[1]
-
-    @property
     def known(self) -> Known:
-        """What a shield decides on, as copies: no wrapper stands between."""
-        return Known(*(each.copy() for each in self._known))
+        """What a shield decides on, read-only: no wrapper stands between."""
+        return self._known
 
     @property
     def ended(self) -> tuple[np.ndarray, Known] | None:
         """With SAME_STEP, where an episode ended in the last step, shape (N,), and what was known at its end."""
-        if self._ended is None:
-            return None
-        done, known = self._ended
-        return done.copy(), Known(*(each.copy() for each in known))
+        return self._ended
 
     @own_error_state
     def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), `error_shapes`."""
+        """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), numbers (k,)."""
         pending = self._downlink_state.committed.pending
         return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
 
@@ -438,13 +426,17 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         values = self._worst.copy() if plant.between_samples is None else plant.constraint_values(self._state)
         cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
-        self._estimate = self._predicted_estimates()
-        table, numbers = self.error_shapes
-        predicted = self._estimate[0], table.shapes.take(numbers, axis=0)
+        estimates, numbers = self._predicted_estimates()
+        table = self._estimator.histories.table
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        own = self._estimator.age.copy(), alarm, self._estimator.damaged.copy()
-        self._known = Known(*predicted, *own, *(each.copy() for each in inputs[:2]))
+        age, damaged, applied, committed = (
+            each.copy() for each in (self._estimator.age, self._estimator.damaged, inputs.applied, inputs.committed)
+        )
+        shapes = table.shapes.take(numbers, axis=0)
+        for array in (estimates, shapes, age, alarm, damaged, applied, committed, numbers):
+            array.setflags(write=False)
+        self._known = Known(estimates, shapes, age, alarm, damaged, applied, committed, table=table, number=numbers)
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
@@ -456,7 +448,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
         done = self._done.copy()
         ended = self._known
-        self._ended = done, ended
+        self._ended = frozen(done), ended
         final = {key: _where(done, value, np.zeros_like(value)) for key, value in info.items()}
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
@@ -464,7 +456,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._worst = self._plant.constraint_values(self._state)
         fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
-        self._known = Known(*self._known[:5], *inputs)
+        self._known = self._known._replace(applied=frozen(next(inputs)), committed=frozen(next(inputs)))
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

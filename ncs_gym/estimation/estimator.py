@@ -12,6 +12,7 @@ from ncs_gym.estimation.arrival_histories import (
     NO_SAMPLE,
     UNKNOWN,
     ArrivalHistories,
+    ErrorTable,
     arrival_histories,
     histories_of,
 )
@@ -199,18 +200,27 @@ class Estimator:
             if self._usual is full:  # or it would stay in memory, and be full again after every reset
                 self._usual = self._histories
 
+    @property
+    def table(self) -> ErrorTable:
+        """The error shapes by the numbers that `numbered` returns; another one after shapes were forgotten."""
+        return self._histories.table
+
     def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.
 
         It is what `advance` makes of the present estimate with these inputs and without packets: the error then lies in
         that ellipsoid, whatever packets arrive later.
         """
+        mean, number = self.numbered(inputs)
+        return mean, self.table.shape(number)
+
+    def numbered(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
+        """Returns what `predicted` does, the number of the error shape in `table` in place of the shape itself."""
         mean = self.mean
         for u in inputs:
             mean = self._predicted(mean, u)
         histories = self._histories
-        number = histories.predicted(histories.present.item(self._history), len(inputs))
-        return mean, histories.table.shape(number)
+        return mean, histories.predicted(histories.present.item(self._history), len(inputs))
 
     def _take_in(self, packet: Packet, history: int) -> int:
         """Returns the history with one more packet, and keeps its sample."""

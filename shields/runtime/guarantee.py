@@ -163,12 +163,15 @@ class GuaranteeMonitor:
             report: What is observed after the step.
             on_time: Behind a downlink, whether the input applied is the one decided for this step.
         """
-        broken = _first(state.broken, _not(moved_once), OTHER_STEPS)
-        broken = _first(broken, _not(same_input), OTHER_INPUT)
+        broken = state.broken
+        if moved_once is not True:
+            broken = _first(broken, _not(moved_once), OTHER_STEPS)
+        if same_input is not True:
+            broken = _first(broken, _not(same_input), OTHER_INPUT)
         if on_time is not True:
             broken = _first(broken, _not(on_time), LATE_INPUT)
         inside = decision.passed
-        if not _all(inside):
+        if inside is not True and not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
         # A passed test proves the times on the grid and the next state; the first one needs x itself in the box.
@@ -183,10 +186,11 @@ class GuaranteeMonitor:
         reason = state.broken
         if not self._is_promised:
             reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
-        reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
+        if state.inside is not True:
+            reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
         if self._input_delay or self._on_grid:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
-        if _all(state.certified):
+        if state.certified is True or _all(state.certified):
             return reason
         is_large = _not(state.certified)
         reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
@@ -207,12 +211,13 @@ class GuaranteeMonitor:
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
-        broken = _first(_first(broken, damaged, NOT_FINITE), alarm, ALARM)
-        if not _all(within):
+        if alarm is not False or damaged is not False:
+            broken = _first(_first(broken, damaged, NOT_FINITE), alarm, ALARM)
+        if not np.logical_and.reduce(within, axis=None):
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
             broken = _first(_first(broken, _not(usable), UNUSABLE), _not(near), FAR_OUT)
-        if not _all(inside):
+        if inside is not True and not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
                 broken = _first(broken, _not(inside), LEFT_MODEL)

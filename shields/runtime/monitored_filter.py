@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym.network import CommittedInputs, DownlinkProtocol
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState
-from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
 from shields.runtime.starts import StartKnown, first_store, known_inside
 
 
@@ -29,13 +29,14 @@ class MonitoredFilter:
 
     Attributes:
         filter: The same.
+        errors: What it knows of the error shapes of the loop's estimator.
         input_delay: c, the number of steps from a decision to its effect.
         report: What was observed last.
         decided: Entries of the input decided last, [physical units].
     """
 
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None) -> None:
-        self.filter = safety_filter
+        self.filter, self.errors = safety_filter, NumberedErrors(safety_filter)
         self.input_delay = 0 if downlink is None else downlink.input_delay
         self._monitor = GuaranteeMonitor(safety_filter, downlink)
         self._schedule = None if downlink is None else CommittedInputs(self.input_delay, safety_filter.plant.m)
@@ -58,17 +59,17 @@ class MonitoredFilter:
         known: Sequence[StartKnown],
         unmoved: bool = True,
         is_first: bool = True,
-        earlier: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+        earlier: Sequence[LoopObservation] = (),
         pending: tuple[np.ndarray, ...] = (),
     ) -> None:
         """Begins an episode, or anew within one.
 
         Args:
-            report: What is observed.
+            report: What is observed; nobody writes into its estimate.
             known: What is known of x_0 .. x_c (`starts_known`).
             unmoved: Whether the plant has not moved since.
             is_first: Whether no step of the episode led here.
-            earlier: Estimates and error shapes of x_0 .. x_{c-1}, before the first decision takes effect.
+            earlier: What is known of x_0 .. x_{c-1}, before the first decision takes effect.
             pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self.report = report
@@ -77,13 +78,12 @@ class MonitoredFilter:
         if self._schedule is not None:
             self._schedule.start()
             self._schedule.pending = pending or self._schedule.pending
-            reports = [self.reported(mean.copy(), shape, alarm=False) for mean, shape in earlier]
-            acting = pending or (None,) * len(reports)
+            acting = pending or (None,) * len(earlier)
             inside = [
                 known_inside(self.filter, start, each.estimate, each.errors, u)
-                for start, each, u in zip(known[:-1], reports, acting, strict=True)
+                for start, each, u in zip(known[:-1], earlier, acting, strict=True)
             ]
-            self._state = self._monitor.cover(self._state, zip(inside, reports, strict=True))
+            self._state = self._monitor.cover(self._state, zip(inside, earlier, strict=True))
 
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the estimate reported last; never raises."""
@@ -116,12 +116,6 @@ class MonitoredFilter:
             self._stored = self._stored[:0]
         self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report, on_time)
         self.report = report
-
-    def reported(
-        self, estimate: np.ndarray, error_shape: Any, alarm: bool, age: int = 0, damaged: bool = False
-    ) -> LoopObservation:
-        """Returns the report of an estimate, shape (n,), that nobody writes into, and of an error shape, (n, n)."""
-        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm, age, damaged)
 
     @property
     def plan_length(self) -> int:

@@ -324,7 +324,8 @@ class SafeLoop:
         self._phase = _Phase.STOPPED
         limits = self._filter.plant.u_max
         u = _as_input(proposed, limits.shape)  # what is none is decided as such
-        decision = self._monitored.decide(np.empty(0) if u is None else np.minimum(np.maximum(u, -limits), limits))
+        u = np.full_like(limits, np.nan) if u is None else np.minimum(np.maximum(u, -limits), limits)
+        decision = self._monitored.decide(u)
         self._inputs.commit(decision.input)
         if self._requests is not None or ask:
             requests = require_on_request(self._requests)
@@ -457,7 +458,9 @@ class SafeLoop:
     def _begin(self, known: Sequence[StartKnown]) -> None:
         """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
         pending = self._inputs.pending
-        earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._input_delay)]
+        ahead = [self._estimator.numbered(pending[:steps]) for steps in range(self._input_delay)]
+        table, errors = self._estimator.table, self._monitored.errors
+        earlier = [LoopObservation(mean, errors.one(table, number), False) for mean, number in ahead]
         self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
 
     def _find(self, packets: Iterable[Packet]) -> None:
@@ -481,7 +484,9 @@ class SafeLoop:
 
     def _report(self) -> LoopObservation:
         estimator = self._estimator
-        return self._monitored.reported(*self._predicted(), estimator.alarm, estimator.age, estimator.damaged)
+        estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
+        errors = self._monitored.errors.one(estimator.table, number)
+        return LoopObservation(estimate, errors, estimator.alarm, estimator.age, estimator.damaged)
 
     @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import isnan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from shields.runtime.set_test import (
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
+    from ncs_gym.estimation.arrival_histories import ErrorTable
     from shields.runtime.backup_plans import Lookahead
 
 MODES = ("project", "switch", "boundary", "monitor", "lookahead")
@@ -108,31 +110,35 @@ class SafetyFilter(ReadOnlyArrays):
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
 
     def decide(
-        self, estimate: np.ndarray, errors: np.ndarray | PredictedErrors, input_proposed: np.ndarray, stored: Any = ()
+        self,
+        estimate: np.ndarray,
+        error_shape: np.ndarray | PredictedErrors,
+        input_proposed: np.ndarray,
+        stored: Any = (),
     ) -> Decision:
         """Returns the input to apply; never raises.
 
         Args:
             estimate: x_hat, shape (n,), float64.
-            errors: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k). Or what `errors_of` says of it.
+            error_shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k). Or what `errors_of` says of it.
             input_proposed: Shape (m,) [physical units]; the very float64 value that would be applied.
             stored: In mode "lookahead" the `plan` of the last decision, shape (k, m), if its input was applied and one
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
-        known = errors if isinstance(errors, PredictedErrors) else self.errors_of(errors)
+        errors = error_shape if isinstance(error_shape, PredictedErrors) else self.errors_of(error_shape)
         if (x_hat.shape, proposed.shape) != self._single:
             self._tell_of_shapes(estimate, input_proposed)
         elif self.mode != "boundary":
             try:
-                decision = self._decide_alone(x_hat, known, proposed)
+                decision = self._decide_alone(x_hat, errors, proposed)
             except FloatingPointError:  # underflow, where numpy is told to raise
                 decision = None
             if decision is not None:
                 return decision
         n, m = self.plant.n, self.plant.m
         plans = None if self.lookahead is None else self.lookahead.as_stored(stored)[..., None]
-        decided = self.decide_columns(_as_column(x_hat, n), known.batch(), _as_column(proposed, m), plans)
+        decided = self.decide_columns(_as_column(x_hat, n), errors.batch(), _as_column(proposed, m), plans)
         one = Decision(*(array[..., 0].tolist() for array in decided))
         plan = decided.plan[..., 0]
         plan = plan[~np.isnan(plan[:, 0])] if len(plan) else self._no_plan
@@ -140,13 +146,13 @@ class SafetyFilter(ReadOnlyArrays):
 
     def _decide_alone(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
         """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected."""
-        test_margin, margin = self.test.margins_alone(estimate, errors, proposed)
         for u, limit in zip(proposed.tolist(), self.test.limits, strict=True):
-            if not -limit <= u <= limit:
+            if not -limit <= u <= limit:  # neither NaN
                 return None
+        test_margin, margin = self.test.margins_alone(estimate, errors, proposed)
         if test_margin >= MARGIN:
             return Decision(proposed, False, True, False, margin, REASONS[SAFE], self._no_plan)
-        if test_margin != test_margin:  # NaN
+        if isnan(test_margin):
             return None
         if self.lookahead is not None:
             plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
@@ -257,10 +263,12 @@ class SafetyFilter(ReadOnlyArrays):
         return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
-        """Returns what is known of one error shape, (n, n), without a last axis, read-only.
+        """Returns what is known of one error shape, (n, n), without a last axis, read-only; itself if it is that.
 
         It is remembered, since shapes recur: all loops of this filter share it, in whatever threads they run.
         """
+        if isinstance(error_shape, PredictedErrors):
+            return error_shape
         shape = _as_array(error_shape)
         key = shape.tobytes() if shape.shape == (self.plant.n, self.plant.n) else b""
         known = self._remembered.get(key)
@@ -280,13 +288,13 @@ class SafetyFilter(ReadOnlyArrays):
         return known if self.lookahead is not None else known._replace(shape=known.shape[:0])
 
     @own_error_state
-    def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:
+    def margin(self, estimate: np.ndarray, error_shape: np.ndarray | PredictedErrors, u: np.ndarray) -> float:
         """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""
         x_hat, u = _as_column(_as_array(estimate), self.plant.n), _as_column(_as_array(u), self.plant.m)
         return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).margins(u)[1].item()
 
     @own_error_state
-    def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
+    def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray | PredictedErrors) -> bool:
         """Returns whether estimate and error shape prove that x is in the certificate's safe set."""
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
@@ -353,3 +361,44 @@ def _as_array(value: Any) -> np.ndarray:
 def _as_column(array: np.ndarray, size: int) -> np.ndarray:
     """Returns a batch of one, shape (size, 1); NaN for an array of another shape."""
     return array[:, None] if array.shape == (size,) else np.full((size, 1), np.nan)
+
+
+class NumberedErrors:
+    """What a filter knows of the error shapes of estimators, by the numbers that these have for them.
+
+    A number belongs to a table, in which it never changes its meaning; with another table all is looked up anew.
+
+    Args:
+        safety_filter: What knows.
+    """
+
+    def __init__(self, safety_filter: SafetyFilter) -> None:
+        self._filter = safety_filter
+        self._table: ErrorTable | None = None
+        self._alone: dict[int, PredictedErrors] = {}
+        self._known: PredictedErrors
+
+    def one(self, table: ErrorTable, number: int) -> PredictedErrors:
+        """Returns what is known of one error shape, without a last axis."""
+        if table is not self._table:
+            self._take(table)
+        errors = self._alone.get(number)
+        if errors is None:
+            if len(self._alone) >= MOST_REMEMBERED:
+                self._alone.clear()
+            errors = self._alone[number] = self._filter.errors_of(table.shape(number))
+        return errors
+
+    def many(self, table: ErrorTable, numbers: np.ndarray) -> PredictedErrors:
+        """Returns what is known of N error shapes, numbers of shape (N,)."""
+        if table is not self._table:
+            self._take(table)
+        known = self._known
+        if len(table.shapes) > len(known.radius):
+            known = known.followed_by(self._filter.errors_of_many(table.shapes[len(known.radius) :]))
+            self._known = known
+        return known.of(numbers)
+
+    def _take(self, table: ErrorTable) -> None:
+        self._alone, self._known = {}, self._filter.errors_of_many(table.shapes[:0])
+        self._table = table  # last: if this is interrupted, nothing is known of either table

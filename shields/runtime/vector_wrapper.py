@@ -25,7 +25,8 @@ from shields.runtime.guarantee import (
     LoopObservation,
     MonitorState,
 )
-from shields.runtime.set_test import PredictedErrors, norms
+from shields.runtime.safety_filter import NumberedErrors
+from shields.runtime.set_test import norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 from shields.runtime.wrapper import BaseShield
 
@@ -89,7 +90,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         self._interventions, self._proved = np.zeros((2, count), np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
         self._stored = np.full((self._filter.horizon or 0, inner.plant.m, count), np.nan)
-        self._table: Any = None
+        self._errors = NumberedErrors(self._filter)
         self._no_reason = np.full(count, "", dtype=object)
         self._no_reason.flags.writeable = False
         # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
@@ -194,18 +195,8 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         return observation, rewards, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        errors = self._errors_of(self._inner.error_shapes[1])
-        return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age, known.damaged)
-
-    def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
-        """Returns what is known of the error shapes with these numbers in the environment's table."""
-        table = self._inner.error_shapes[0]
-        if table is not self._table:
-            self._table, self._known = table, self._filter.errors_of_many(table.shapes[:0])
-        if len(table.shapes) > len(self._known.radius):
-            new = self._filter.errors_of_many(table.shapes[len(self._known.radius) :])
-            self._known = self._known.followed_by(new)
-        return self._known.of(np.asarray(numbers, np.intp))
+        errors = self._errors.many(known.table, known.number)
+        return LoopObservation(np.ascontiguousarray(known.estimate), errors, known.alarm, known.age, known.damaged)
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
@@ -232,7 +223,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         """Takes in what is known of the steps before the first decisions take effect, where episodes began."""
         earlier, no_alarm = [], np.zeros(len(chosen), np.bool_)
         for ahead, (means, numbers) in enumerate(self._inner.estimates_ahead(chosen)[:-1]):
-            errors = self._errors_of(numbers)
+            errors = self._errors.many(self._inner.known.table, numbers)
             inside = [
                 known_inside(self._filter, known[e][ahead], means[:, k].copy(), errors.single(k))
                 for k, e in enumerate(chosen.tolist())
@@ -256,7 +247,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
         final, (is_done, known) = dict(info), ended
         done = np.flatnonzero(is_done)
-        errors = self._filter.errors_of_many(known.error_shape[done])
+        errors = self._errors.many(known.table, known.number[done])
         known = known._replace(applied=known.applied[:, done], committed=known.committed[:, done])
         alarms = known.alarm[done], known.age[done], known.damaged[done]
         report = LoopObservation(known.estimate[:, done], errors, *alarms)

@@ -224,13 +224,15 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         self._require_same()
         self._look_at({self._inner.episode_channel})
         clock, known, start = self._read_clock(), self._inner.known, self._inner.start
-        report = self._observed(known)
+        report, errors = self._observed(known), self._monitored.errors
+        ahead = self._inner.estimates_ahead()[:-1]
+        earlier = [LoopObservation(mean, errors.one(known.table, number), False) for mean, number in ahead]
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._input_delay)
-        self._monitored.begin(report, self._known, clock[1] == 0, earlier=self._inner.estimates_ahead()[:-1])
+        self._monitored.begin(report, self._known, clock[1] == 0, earlier=earlier)
         self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
-        margin = self._filter.margin(report.estimate, known.error_shape, u)
+        margin = self._filter.margin(report.estimate, report.errors, u)
         self._clock = clock
         info = info | self._info(u, u, margin, intervened=False)
         self._lost.begin()
@@ -267,7 +269,8 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age, known.damaged)
+        errors = self._monitored.errors.one(known.table, known.number)
+        return LoopObservation(known.estimate, errors, known.alarm, known.age, known.damaged)
 
     def _read_clock(self) -> tuple[int, int]:
         return self._inner.episodes, self._inner.steps

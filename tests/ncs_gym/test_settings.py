@@ -182,4 +182,4 @@ def test_what_estimators_share_cannot_be_written_to():
     many = gym.make_vec("ncs_gym/CartPole-v0", num_envs=3).unwrapped
     many.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
-        many.error_shapes[0].shapes[...] = 1e-4
+        many.known.table.shapes[...] = 1e-4

@@ -1,13 +1,14 @@
 import pickle
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
 from shields import SafetyFilter
-from shields.runtime.safety_filter import MARGIN, MODES, REASONS
+from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.shields.attacks.cases import RANDOM
@@ -441,3 +442,17 @@ def test_a_filter_decides_the_same_after_pickling(certificate, loaded):
         first, second = twin.decide(*case), pickle.loads(pickle.dumps(twin)).decide(*case)
         assert first[1:6] == second[1:6]
         np.testing.assert_array_equal(first.input, second.input)
+
+
+def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
+    shield, sizes = SafetyFilter(certificate, loaded), np.array([0.1, 0.5, 0.3])
+    known, shapes = NumberedErrors(shield), sizes[:, None, None] * certificate.Sigma
+    for each in (shapes, shapes[::-1], shapes[1:], shapes):
+        table = SimpleNamespace(shapes=each[:2], shape=each.__getitem__)
+        for growing in (each[:2], each):
+            table.shapes = growing
+            numbers = np.arange(len(growing))[::-1]
+            assert all(known.one(table, k) is shield.errors_of(growing[k]) for k in numbers.tolist())
+            np.testing.assert_array_equal(
+                known.many(table, numbers).radius, shield.errors_of_many(growing[::-1]).radius
+            )
