@@ -98,13 +98,6 @@ class Estimator:
         self.episode, self._is_new = (0, True) if after is None else (after.episode, after._is_new)
         self._begin(np.zeros(plant.n))
 
-    def saved(self) -> dict[str, Any]:
-        """Returns all that changes, as attributes to be put back; arrays are replaced, never written into."""
-        saved = vars(self).copy()
-        for name in ("_priors", "_inputs", "_samples"):
-            saved[name] = saved[name].copy()
-        return saved
-
     def reset(self, mean: np.ndarray) -> None:
         """Starts an episode at step 0 with a first estimate, shape (n,), whose error lies in E(r0^2 I).
 

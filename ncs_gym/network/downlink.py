@@ -317,10 +317,6 @@ class CommittedInputs:
         else:
             self.pending = tuple(np.where(chosen, 0.0, u) for u in self.pending)
 
-    def saved(self) -> dict[str, Any]:
-        """Returns all that changes, as attributes to be put back."""
-        return {"pending": self.pending}
-
     def commit(self, u: Any) -> None:
         """Adds the input decided now."""
         self.pending = (*self.pending, np.array(u, dtype=np.float64))
@@ -362,10 +358,6 @@ class AppliedInputs:
         self._digests: tuple[bytes, ...] = (
             NO_INPUTS,
         )  # after the newest number of steps, then one step less, and so on
-
-    def saved(self) -> dict[str, Any]:
-        """Returns all that changes, as attributes to be put back."""
-        return vars(self).copy()
 
     def add(self, u: np.ndarray) -> None:
         """Takes in the input that was due in the step that has gone by, shape (m,)."""

@@ -109,10 +109,6 @@ class Requests:
     def _spare_with(self, channel: Channel) -> int:
         return 0 if channel.most_consecutive_losses is None else spare_samples(channel, self._contract) or 0
 
-    def saved(self) -> dict[str, Any]:
-        """Returns all that changes, as attributes to be put back; arrays are replaced, never written into."""
-        return vars(self).copy()
-
     def ask(self, asked: Any) -> None:
         """Asks for the sample that is decided next, or does not: the last call before `decide` counts.
 

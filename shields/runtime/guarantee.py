@@ -255,10 +255,6 @@ class LostGuarantee:
         self._said = np.zeros((count, len(EXPLANATIONS)), np.bool_)
         self._news: frozenset[int] = frozenset()
 
-    def saved(self) -> dict[str, Any]:
-        """Returns all that changes, as attributes to be put back."""
-        return {"_said": self._said.copy(), "_news": self._news}
-
     def begin(self, restarted: Any = slice(None)) -> None:
         """Begins episodes, in which nothing has been said, in the loops chosen by a mask or index."""
         self._said[restarted] = False

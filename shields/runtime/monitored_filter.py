@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
-from typing import Any
 
 import numpy as np
 
@@ -45,13 +43,6 @@ class MonitoredFilter:
         self._decision: Decision
         self.decided: list[float] = []
         self._stored: np.ndarray
-
-    def saved(self) -> dict[str, Any]:
-        """Returns all that changes, as attributes to be put back."""
-        saved = vars(self).copy()
-        if self._schedule is not None:
-            saved["_schedule"] = copy(self._schedule)
-        return saved
 
     def begin(
         self,

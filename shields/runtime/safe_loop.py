@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from enum import Enum, auto
-from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, own_error_state, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
-from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     LATE_INPUT,
@@ -50,34 +48,6 @@ class _Phase(Enum):
     DECIDED = auto()
 
 
-def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Concatenate[SafeLoop, P], T]:
-    """Makes calls of a method transactions: where one does not come to its end, nothing has happened.
-
-    While a call changes something the loop counts as stopped; so it stays if even the way back is interrupted. That the
-    guarantee is lost is said when all has happened, and takes nothing back.
-    """
-
-    @wraps(method)
-    def call(loop: SafeLoop, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        phase, discarded, unknown = loop._phase, loop._discarded, loop._unknown
-        parts = (loop._estimator, loop._monitored, loop._inputs, loop._applied, loop._lost)
-        parts = parts if loop._requests is None else (*parts, loop._requests)
-        before = [(part, part.saved()) for part in parts]
-        try:
-            with np.errstate(all="ignore"):
-                return method(loop, *args, **kwargs)
-        except (GuaranteeLostError, GuaranteeLostWarning, UnusedPacketsWarning):  # warnings where they are errors
-            raise
-        except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
-            loop._phase = _Phase.STOPPED
-            for part, saved in before:
-                vars(part).update(saved)
-            loop._phase, loop._discarded, loop._unknown = phase, discarded, unknown
-            raise
-
-    return call
-
-
 class SafeLoop:
     """Keeps a real plant in its safe set, whatever its controller proposes (docs/deployment.md).
 
@@ -99,8 +69,8 @@ class SafeLoop:
     loop cannot see is that the clock misses a step, that the actuator applies something else (unless it is told, or
     hears `echoes`), or that packets carry wrong stamps. A certificate under a channel contract brings its error sets
     along. Not for use by several threads at once. A loop can be pickled between two calls, and goes on from there
-    where it is loaded. Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has
-    happened: call it again.
+    where it is loaded. Where `start`, `receive` or `decide` is interrupted, by whatever it may be, the loop is stopped
+    and nothing is proved until the next `start`.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect
@@ -202,7 +172,7 @@ class SafeLoop:
         ]
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
-    @_transaction
+    @own_error_state
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None, *, known: bool = True) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
@@ -245,7 +215,7 @@ class SafeLoop:
         self._lost.begin()
         self._lost.tell_of(self.reason)
 
-    @_transaction
+    @own_error_state
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()) -> np.ndarray:
         """Returns the estimate at this control step, shape (n,): predicted from the last one, then corrected.
 
@@ -280,8 +250,8 @@ class SafeLoop:
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
+        self._phase = _Phase.STOPPED
         if phase is _Phase.DECIDED:
-            self._phase = _Phase.STOPPED
             decided, due = np.array(self._monitored.decided), self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
             taken = due if told is None else told
@@ -305,7 +275,7 @@ class SafeLoop:
         self._lost.tell_of(self.reason)
         return estimate
 
-    @_transaction
+    @own_error_state
     def decide(self, proposed: Any, *, ask: bool = False) -> Decision:
         """Returns what to apply from now until the next step, and why.
 
@@ -321,15 +291,16 @@ class SafeLoop:
         """
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
-        self._phase = _Phase.STOPPED
-        limits = self._filter.plant.u_max
+        limits, requests = self._filter.plant.u_max, self._requests
+        if as_flag(ask, "ask"):
+            requests = require_on_request(requests)
         u = _as_input(proposed, limits.shape)  # what is none is decided as such
+        self._phase = _Phase.STOPPED
         u = np.full_like(limits, np.nan) if u is None else np.minimum(np.maximum(u, -limits), limits)
         decision = self._monitored.decide(u)
         self._inputs.commit(decision.input)
-        if self._requests is not None or ask:
-            requests = require_on_request(self._requests)
-            requests.ask(as_flag(ask, "ask") or self._unknown is not None)  # a state that is not known is to be found
+        if requests is not None:
+            requests.ask(ask or self._unknown is not None)  # a state that is not known is to be found
             requests.decide(self._estimator.age)
         self._phase = _Phase.DECIDED
         return decision
