@@ -102,7 +102,7 @@ def synthesize(
     """
     if not isinstance(plant, LinearPlant):
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
-    if method != "certified":
+    if not isinstance(method, str) or method != "certified":
         raise ValueError(f"method must be 'certified' (the paper's is shields.paper.synthesize), got {shown(method)}")
     if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")

@@ -77,6 +77,7 @@ def test_multiplier_moves_at_every_rollout_although_all_episodes_end_in_the_same
     assert len(set(prices.noted)) > 3
 
 
+@pytest.mark.slow
 def test_training_raises_the_price_of_what_the_agent_violates():
     prices, loop = Prices(), LoopConfig(env=CRUISE.env, lagrangian=LagrangianSettings(learning_rate=0.5))
     result = train(loop, 1600, 0, hyperparams=TINY, callbacks=[prices])

@@ -20,6 +20,7 @@ from ncs_gym.reading import (
     LARGEST_DOCUMENT,
     LARGEST_HYPERPARAMS,
     LARGEST_LOG,
+    MOST_LINES,
     MOST_PACKETS,
     MOST_VALUES,
     json_values,
@@ -129,7 +130,7 @@ LOGS = {
     "ping summary": "64 bytes: icmp_seq=1 ttl=1 time=1 ms\n"
     "9999999999 packets transmitted, 1 received, 99% packet loss, time 1000ms\n",
     "missing numbers": "seq,sent,received\n1,0,0.1\n9000000000,1,1.1\n",
-    "empty lines": "12\n" + 2_500_000 * "\n" + "12\n",
+    "empty lines": "12\n" + (MOST_LINES + 1) * "\n" + "12\n",
     "one field": "sent,received\n0,0\n" + '"' + 200_000 * "1" + '",1\n',
 }
 

@@ -209,7 +209,6 @@ SHIELDED = {
     "the vector shield's certificate": lambda env, many, certificate, value: VectorSafetyShield(many, value),
     "the filter's plant": lambda env, many, certificate, value: SafetyFilter(certificate, value),
     "the plant of verify": lambda env, many, certificate, value: verify(certificate, value),
-    "the engine of verify": lambda env, many, certificate, value: verify(certificate, env.plant, engine=value),
     "the certificate of verify": lambda env, many, certificate, value: verify(value, env.plant),
     "the plant of synthesize": lambda env, many, certificate, value: synthesize(value),
     "the method of synthesize": lambda env, many, certificate, value: synthesize(env.plant, method=value),

@@ -7,8 +7,8 @@ from experiments.terminal import wrapped
 SENTENCE = "The sentence of a well-known length goes on and on. " * 8
 
 
-@pytest.mark.parametrize(("columns", "width"), [("70", 70), ("300", 100), ("20", 60)])
-def test_text_follows_the_terminal_between_60_and_100_columns(monkeypatch, columns, width):
+@pytest.mark.parametrize(("columns", "width"), [("70", 70), ("300", 80), ("20", 60)])
+def test_text_follows_the_terminal_between_60_and_80_columns(monkeypatch, columns, width):
     monkeypatch.setenv("COLUMNS", columns)
     first, *rest = wrapped(SENTENCE).splitlines()
     assert width - 12 < max(map(len, [first, *rest])) <= width

@@ -76,6 +76,7 @@ def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
     assert violating(loop, certificate, "lookahead") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["psf", "trusting"])
 def test_margins_keep_the_box_on_an_ideal_channel_and_larger_ones_keep_it_longer_on_the_real_one(name):

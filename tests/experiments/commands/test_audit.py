@@ -65,6 +65,7 @@ def test_every_claim_has_its_verdict_and_figures(claims):
             assert figure in claim.computed + claim.charitable, start
 
 
+@pytest.mark.slow
 def test_verdicts_follow_the_numbers():
     # With a smaller printed epsilon and gain other claims would hold: nothing is a constant. The row about OP would
     # take seconds.

@@ -64,6 +64,7 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_work
     assert_one_sentence(ncs("attack", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")
 
 
+@pytest.mark.slow
 def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers):
     short = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_steps=16", "n_envs=2")
     run = ncs("train", *ENV, *short, "--out", "r", cwd=folder)

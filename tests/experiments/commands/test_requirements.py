@@ -55,12 +55,13 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     assert numbers["kept"] <= numbers["replay"]
     assert "Read as a table: 'sent' in s, 'received' in s." in found.stdout
     assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
-    assert max(map(len, found.stdout.splitlines())) <= 100
+    assert max(map(len, found.stdout.splitlines())) <= 80
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("page", ["contracts.md", "requirements.md"])
 def test_pages_show_what_the_command_prints_of_the_record_of_the_example(page, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("COLUMNS", "80")
     path = ROOT / "examples" / "wifi_record.py"
     subprocess.run([sys.executable, path], cwd=tmp_path, env=environment(), check=True, capture_output=True)
     found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")

@@ -124,6 +124,7 @@ def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_
             assert EXPLANATIONS[state.broken] == reason
 
 
+@pytest.mark.slow
 def test_remainder_that_the_box_cannot_bear_is_named():
     plant = LinearPlant(
         A=[[1.2]],

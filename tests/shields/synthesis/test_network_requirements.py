@@ -58,6 +58,7 @@ def test_more_room_is_never_less(found):
                 assert loose.share >= tight.share
 
 
+@pytest.mark.slow
 def test_largest_age_is_followed_by_one_for_which_none_was_found(found):
     for largest in found.largest_ages:
         assert largest.certified is not None

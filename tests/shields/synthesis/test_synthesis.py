@@ -147,6 +147,7 @@ def test_input_limits_too_wide_to_bind_do_not_spoil_the_programs(u_max):
     assert area_fraction(synthesize(plant, safe_set="ellipsoid"), plant) > 0.9999
 
 
+@pytest.mark.slow
 def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
     plant = truck_trailer(gamma=0.5)
     with (
