@@ -1,6 +1,6 @@
 """Sixty small faults in what guarantees rest on, and the test of `make test` that notices each.
 
-    python benchmarks/mutants.py [--count 60] [--jobs 2] [--only NUMBER ...] [--list]
+    python benchmarks/mutants.py [--count 60] [--jobs 2] [--only NUMBER ...] [--stages 3] [--list]
 
 A mutant is the program with one operator, comparison, condition or number changed. Fifteen each are spread evenly over
 shields/runtime, shields/verification, ncs_gym/estimation and ncs_gym/network, always the same ones for the same source.
@@ -128,7 +128,7 @@ def chosen(count: int) -> list[Mutant]:
     return mutants
 
 
-def fate(mutant: Mutant) -> str:
+def fate(mutant: Mutant, stages: int) -> str:
     """Returns the test that notices a mutant; an empty text if none does."""
     with tempfile.TemporaryDirectory() as folder:
         copied = Path(folder) / "copy"
@@ -138,7 +138,7 @@ def fate(mutant: Mutant) -> str:
                 shutil.copyfile(ROOT / name, copied / name)
         (copied / mutant.file).write_text(mutant.source)
         package, inner = Path(mutant.file).parts[:2]
-        for tests in (f"tests/{package}/{inner}", f"tests/{package}", "tests"):
+        for tests in (f"tests/{package}/{inner}", f"tests/{package}", "tests")[:stages]:
             if (copied / tests).exists() and (noticed := _first_failure(copied, tests)):
                 return noticed
     return ""
@@ -164,13 +164,14 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", type=int, nargs="*", help="numbers of mutants")
+    parser.add_argument("--stages", type=int, default=3, help="1 for tests of the same folder, 2 of the package, 3 all")
     parser.add_argument("--list", action="store_true", help="name the mutants, run nothing")
     options = parser.parse_args()
     mutants = dict(enumerate(chosen(options.count)))
     mutants = {number: each for number, each in mutants.items() if options.only is None or number in options.only}
     killed = 0
     with ThreadPoolExecutor(options.jobs) as pool:
-        fates = pool.map(lambda each: "" if options.list else fate(each), mutants.values())
+        fates = pool.map(lambda each: "" if options.list else fate(each, options.stages), mutants.values())
         for (number, mutant), test in zip(mutants.items(), fates, strict=True):
             killed += bool(test)
             print(f"{number:3d} {mutant.file}:{mutant.line}, {mutant.change}", end="" if options.list else ": ")
