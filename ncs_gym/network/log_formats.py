@@ -36,8 +36,8 @@ class Record(NamedTuple):
     may_be_milliseconds: bool = False
 
 
-# Longer lines are not ping's, and longer cells are no numbers [characters].
-_LONGEST_LINE, _LONGEST_CELL = 1000, 64
+# Longer lines are not ping's, longer rows not those of a table, and longer cells are no numbers [characters].
+_LONGEST_LINE, _LONGEST_ROW, _LONGEST_CELL = 1000, 4096, 64
 
 
 def read_record(path: str | os.PathLike[str], period: float | None, step: float) -> Record:
@@ -62,7 +62,10 @@ def read_record(path: str | os.PathLike[str], period: float | None, step: float)
             return _of_ping(text, period)
         if text.lstrip()[:1] in ("{", "["):
             return _of_json(text)
-        return _of_table(text.splitlines(), period, step)
+        rows = text.splitlines()
+        if any(len(row) > _LONGEST_ROW for row in rows):
+            raise ValueError(f"a row of a table has at most {_LONGEST_ROW:,} characters, a longer one is no record")
+        return _of_table(rows, period, step)
     except csv.Error as error:
         raise ValueError(f"{shown(path)} is no CSV file: {error}") from error
     except ValueError as error:

@@ -131,6 +131,7 @@ LOGS = {
     "9999999999 packets transmitted, 1 received, 99% packet loss, time 1000ms\n",
     "missing numbers": "seq,sent,received\n1,0,0.1\n9000000000,1,1.1\n",
     "empty lines": "12\n" + (MOST_LINES + 1) * "\n" + "12\n",
+    "one long row": "sent" + 200_000 * " " + "x\n1\n2\n",
     "one field": "sent,received\n0,0\n" + '"' + 200_000 * "1" + '",1\n',
 }
 
