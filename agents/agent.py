@@ -275,7 +275,7 @@ def load_sb3_zip(path: Path, env_id: str, vec_normalize: str | Path | None = Non
     try:
         require_moderate_networks(saved.policy_kwargs)
     except ValueError as error:
-        raise AgentError(f"the agent in {path} is too large: {error}") from error
+        raise AgentError(f"the agent in {path} is refused: {error}") from error
     cls = algorithm_class(saved.algorithm)
     sde = {"use_sde": True} if saved.use_sde else {}
     rest: dict[str, Any] = sde if saved.algorithm in ON_POLICY else sde | {"buffer_size": 1}

@@ -113,11 +113,7 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
         raise ValueError(f"unknown algorithm {algorithm!r}; known are {', '.join(ALGORITHMS)}")
     if not isinstance(given, Mapping | None):
         raise ValueError(f"hyperparameters must be a dictionary, got {type(given).__name__}")
-    try:
-        copied = json.loads(json.dumps(dict(given or {}), allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"hyperparameters must be JSON values: {error}") from error
-    hyperparams = with_changes(DEFAULTS[algorithm], copied)
+    hyperparams = with_changes(DEFAULTS[algorithm], _as_json(given or {}))
     for name, most in _COUNTS.items():
         if name in hyperparams and (type(value := hyperparams[name]) is not int or not 1 <= value <= most):
             at_most = f" and at most {most:,}" if type(value) is int and value > most else ""
@@ -135,21 +131,36 @@ def require_moderate_networks(policy_kwargs: Any) -> None:
     """Raises unless networks of these settings are moderate; whether they are right the library says.
 
     Raises:
-        ValueError: If they have more than `MOST_WEIGHTS` weights, or a count that is larger than `MOST_OUTPUTS`.
+        ValueError: If they have more than `MOST_WEIGHTS` weights, a count that is larger than `MOST_OUTPUTS`, or widths
+            in a form that the library does not know.
     """
     if not isinstance(policy_kwargs, Mapping):
         return
     counts = {name: each for name, each in policy_kwargs.items() if type(each) in (int, float)}
     if any(not abs(each) <= MOST_OUTPUTS for each in counts.values()):
         raise ValueError(f"policy_kwargs must have numbers of at most {MOST_OUTPUTS}, got {shown(counts)}")
-    arch = policy_kwargs.get("net_arch") or []
-    nets = [arch, arch] if isinstance(arch, list) else [*arch.values()] if isinstance(arch, Mapping) else []
+    arch = policy_kwargs.get("net_arch")
     weights = 0
-    for net in nets:
-        widths = [each for each in (net if isinstance(net, list) else []) if type(each) is int]
-        weights += sum(a * b for a, b in zip([MOST_OUTPUTS, *widths], widths, strict=False) if min(a, b) > 0)
+    for widths in _networks_of([] if arch is None else arch):
+        weights += sum(a * b for a, b in zip([MOST_OUTPUTS, *widths], widths, strict=False))
     if (total := weights * 2 * max(counts.get("n_critics", 1), 1)) > MOST_WEIGHTS:
         raise ValueError(f"networks may have {MOST_WEIGHTS:,} weights, those of {shown(arch)} might have {total:,.0f}")
+
+
+def _networks_of(arch: Any) -> list[list[int]]:
+    """Returns the widths of an agent's two networks, or of each that is named, in all forms that the library takes.
+
+    That is a list of widths for both, a dictionary of such lists, or a list of dictionaries (an older form).
+
+    Raises:
+        ValueError: If it is anything else.
+    """
+    if isinstance(arch, list) and arch and all(isinstance(each, Mapping) for each in arch):
+        return [widths for each in arch for widths in _networks_of(each)]
+    nets = [*arch.values()] if isinstance(arch, Mapping) else [arch, arch]
+    if not all(isinstance(net, list) and all(type(each) is int and each >= 1 for each in net) for net in nets):
+        raise ValueError(f"net_arch must be widths >= 1, [64, 64] or {{'pi': [64], 'vf': [64]}}, got {shown(arch)}")
+    return nets
 
 
 def rollout_steps(algorithm: str, hyperparams: Mapping[str, Any]) -> int:
@@ -191,7 +202,8 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
         env_id: Id by which the environment is registered.
 
     Raises:
-        ValueError: If the file has no entry for the environment, is damaged, or has an expression that is no literal.
+        ValueError: If the file has no entry for the environment, is damaged, or has an expression that is no literal or
+            a value that JSON has not, such as a date.
         OSError: If it cannot be read.
     """
     path = Path(file)
@@ -208,7 +220,7 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
     if left_out:
         warnings.warn(f"{', '.join(left_out)} in {path}: only rl-zoo3 reads that, it is left out here", stacklevel=2)
     try:
-        return {name: value_of(name, value) for name, value in entry.items() if name not in RL_ZOO_KEYS}
+        return _as_json({name: value_of(name, value) for name, value in entry.items() if name not in RL_ZOO_KEYS})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -227,6 +239,18 @@ def _parts_of_node(node: Any) -> list[Any]:
     """Returns the nodes in a node of YAML: of a list its entries, of a dictionary keys and values."""
     parts = node.value if node is not None and isinstance(node.value, list) else []
     return [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
+
+
+def _as_json(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a copy; raises ValueError for the first value that JSON has not."""
+    copied: dict[str, Any] = {}
+    for name, value in hyperparams.items():
+        try:
+            copied |= json.loads(json.dumps({name: value}, allow_nan=False))
+        except (TypeError, ValueError, RecursionError) as error:
+            given = f"{shown(name)}: {shown(value)}"
+            raise ValueError(f"hyperparameters must be JSON values, got {given} ({error})") from error
+    return copied
 
 
 def value_of(name: str, value: Any) -> Any:

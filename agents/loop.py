@@ -31,7 +31,8 @@ class ShieldSettings:
         on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
 
     Raises:
-        ValueError: If the mode is unknown, or what is to be done where nothing is proved.
+        ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
+            that a shield takes.
     """
 
     certificate: Certificate
@@ -41,6 +42,8 @@ class ShieldSettings:
     on_unproved: str = "warn"
 
     def __post_init__(self) -> None:
+        if not isinstance(self.certificate, Certificate):
+            raise ValueError(f"certificate must be a Certificate, got {type(self.certificate).__name__}")
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
         LostGuarantee(self.on_unproved)

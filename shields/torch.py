@@ -191,6 +191,8 @@ def _numbers(value: Any, name: str) -> np.ndarray:
         raise ValueError(
             f"{name} must be float32 or float64, got {value.dtype}: no error set holds what that rounds off"
         )
+    if isinstance(value, torch.Tensor) and value.layout != torch.strided:
+        raise ValueError(f"{name} must be a dense tensor, got one of {value.layout}: call to_dense()")
     try:
         return np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -16,7 +16,10 @@ from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor
+from ncs_gym.validation import warn_caller
 
+# Steps after which an agent that may ask for samples is told that nobody does.
+PATIENCE = 10
 # Keeps what the network draws apart from what an environment of the same seed draws.
 NETWORK_STREAM = 0x6E6574
 
@@ -70,6 +73,9 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
     Attributes:
         episode_channel: The channel of this episode; with several a dictionary of them. `reset` takes another one as
             its option "channel" (and "downlink"), or what draws one (`RandomChannel`).
+
+    Warns:
+        UserWarning: Once in an episode, where the channel takes samples on request and nobody asks (`RequestActions`).
 
     Raises:
         ValueError: If a setting is wrong, or does not fit the environment's spaces.
@@ -157,6 +163,7 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
             arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
         settings, given = self._settings, self.episode_downlink
         self._actuator = None if given is None else _Actuator(settings, ChannelState(given, rng))
+        self._is_asked = False
         if self._requests is not None:
             self._requests.begin()
         idle = settings.neutral if settings.neutral is not None else nothing(self.action_space)
@@ -176,6 +183,12 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
             self._requests.decide(self._oldest)
         observation, reward, terminated, truncated, info = self.env.step(applied)
         self._step = step = step + 1
+        if step == PATIENCE and self._requests is not None and not self._is_asked:
+            warn_caller(
+                f"the channel sends samples on request, and nobody called request in {PATIENCE} steps: the agent sees "
+                "nothing but the first observation; put RequestActions around Networked, or call request before steps",
+                UserWarning,
+            )
         self._earned += reward if settings.delay_reward else 0.0
         sample = None
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
@@ -201,6 +214,7 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
             ValueError: If the channel sends samples by itself, or what is given is no bool.
         """
         require_on_request(self._requests).ask(asked)
+        self._is_asked = True
 
     @property
     def outstanding(self) -> int:

@@ -33,8 +33,8 @@ NO_EPISODE = 0
 LONGEST_ANSWER = 20
 # Steps for which all nodes hear of an episode before it starts, and 2 c more: `_prelude`.
 PRELUDE = PATIENCE + 2 + SETTLED + LONGEST_ANSWER
-# Greetings that are answered at a step, the newest of different ones.
-MOST_GREETINGS = 32
+# Senders of greetings that are answered at a step, the newest, and addresses to which messages go, the quickest.
+MOST_SENDERS = 32
 # The newest step of a peer of which nothing was heard.
 NEVER = -(2**62)
 # What begins within this part of a step begins now.
@@ -175,32 +175,43 @@ class ActuatorNode(_PlantNode):
 class _Peer:
     """What a controller knows of a sensor or an actuator: what carries the number of the episode, and who greets.
 
-    A greeting proves nothing, because it may be a recording. It is answered, beside what goes to the peer, until
-    somebody answers with the number of the episode.
+    Who sends is authenticated, from where is not: somebody may have copied the message. So all addresses are answered
+    from which a greeting came, until somebody answers with the number of the episode, and then all from which messages
+    of the episode came, as long as newer ones do. No address takes the place of another one.
     """
 
-    def __init__(self) -> None:
-        self.newest = NEVER
-        self._address: Any = None
-        self._challenge = 0
-        self._greetings: dict[int, Any] = {}
+    def __init__(self, patience: int) -> None:
+        self.newest, self._patience = NEVER, patience
+        # Newest step and challenge by address, the newest first and of one step the quickest first.
+        self._heard: dict[Any, tuple[int, int]] = {}
+        # Challenges and addresses, the newest last.
+        self._greetings: dict[tuple[int, Any], None] = {}
+
+    def is_silent(self, step: int) -> bool:
+        """Returns whether nothing was heard that was sent in the last steps."""
+        return step - self.newest > self._patience
 
     def greet(self, challenge: int, address: Any) -> None:
         """Takes in a greeting."""
-        self._greetings.pop(challenge, None)
-        self._greetings[challenge] = address
-        if len(self._greetings) > MOST_GREETINGS:
+        self._greetings.pop((challenge, address), None)
+        self._greetings[challenge, address] = None
+        if len(self._greetings) > MOST_SENDERS:
             del self._greetings[next(iter(self._greetings))]
 
     def hear(self, step: int, challenge: int, address: Any) -> None:
         """Takes in a message of the episode."""
         if step > self.newest:
-            self.newest, self._challenge, self._address, self._greetings = step, challenge, address, {}
+            self.newest, self._greetings = step, {}
+        if step > self._heard.get(address, (NEVER, 0))[0]:
+            self._heard.pop(address, None)
+            self._heard[address] = step, challenge
+            newest_first = sorted(self._heard.items(), key=lambda each: -each[1][0])[:MOST_SENDERS]
+            self._heard = {sender: sent for sender, sent in newest_first if sent[0] >= self.newest - self._patience}
 
     @property
-    def addressees(self) -> dict[int, Any]:
-        """Addresses to which messages go, by challenge."""
-        return self._greetings if self.newest == NEVER else {self._challenge: self._address} | self._greetings
+    def addressees(self) -> list[tuple[int, Any]]:
+        """Challenges and addresses to which messages go."""
+        return [(challenge, address) for address, (_, challenge) in self._heard.items()] + [*self._greetings]
 
 
 class ControllerNode:
@@ -258,7 +269,7 @@ class ControllerNode:
     def begin(self, x_hat0: Any, *, known: bool) -> None:
         """Ends the episode; the next one begins when the others have noticed, after c + `PATIENCE` steps of silence."""
         self.episode, self._first = NO_EPISODE, (x_hat0, known)
-        self._peers = {Kind.SAMPLE: _Peer(), Kind.ECHO: _Peer()}
+        self._peers = {Kind.SAMPLE: _Peer(self._patience), Kind.ECHO: _Peer(self._patience)}
         self._waiting: list[Packet | Echo] = []
         self.arrived: list[int] = []
         self.skipped, self.missing, self._is_started = 0, 0, False
@@ -281,7 +292,7 @@ class ControllerNode:
         step = self.clock.step_at(now + EARLY * self.clock.dt)
         x_hat0, known = self._first
         is_beginning = not self._is_started and step >= self._joined_by
-        if is_beginning and any(self._is_silent(peer, step) for peer in self._peers.values()):
+        if is_beginning and any(peer.is_silent(step) for peer in self._peers.values()):
             self.begin(x_hat0, known=known and self.step <= self._joined_by)
             return None
         if step < 0:
@@ -322,17 +333,14 @@ class ControllerNode:
 
     def _answer(self, heard: Kind, kind: Kind, step: int, **fields: Any) -> None:
         common = {"kind": kind, "episode": self.episode, "stamp": step + self._prelude}
-        for challenge, address in self._peers[heard].addressees.items():
+        for challenge, address in self._peers[heard].addressees:
             self.transport.send(self.wire.encode(Message(**common, challenge=challenge, **fields)), address)
-
-    def _is_silent(self, peer: _Peer, step: int) -> bool:
-        return step - peer.newest > self._patience
 
     def _hear(self, message: Message, datagram: Datagram) -> None:
         """Takes in a message, and where its sender is."""
         peer = self._peers[message.kind]
         if message.episode == NO_EPISODE:  # a node that waits or was restarted, or a recording
-            if self._is_silent(peer, self.step):
+            if peer.is_silent(self.step):
                 peer.greet(message.challenge, datagram.sender)
             return
         if message.episode != self.episode:

@@ -18,7 +18,7 @@ class Datagram(NamedTuple):
     Attributes:
         time: When, by the clock of the event loop [s].
         data: Its bytes.
-        sender: Where an answer is sent to.
+        sender: Where an answer is sent to; hashable.
     """
 
     time: float

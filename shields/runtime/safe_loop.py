@@ -24,6 +24,7 @@ from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     LATE_INPUT,
     NOT_CONFIRMED,
+    NOT_FINITE,
     OTHER_INPUT,
     UNKNOWN_START,
     LoopObservation,
@@ -359,7 +360,8 @@ class SafeLoop:
         if self._applied.is_other:
             return LATE_INPUT if self._input_delay else OTHER_INPUT
         if self._unknown is not None:
-            return UNKNOWN_START
+            is_finite = all(np.isfinite(y).all() for y in self._unknown[0].values())
+            return UNKNOWN_START if is_finite else NOT_FINITE
         unconfirmed = "" if self._applied.is_confirmed(self.steps) else NOT_CONFIRMED
         return self._monitored.reason or unconfirmed
 
@@ -439,14 +441,15 @@ class SafeLoop:
         assert self._unknown is not None
         (samples, inputs), step, plant = self._unknown, self.steps, self._filter.plant
         for packet in packets:
-            if packet.episode == self.episode and packet.stamp >= 0 and np.isfinite(packet.measurement).all():
+            if packet.episode == self.episode and packet.stamp >= 0:
                 samples = {packet.stamp: packet.measurement} | samples
         samples = {stamp: y for stamp, y in samples.items() if 0 <= step - stamp <= len(inputs)}
         self._unknown = samples, inputs
         noise = plant.sensor_error_with(self._estimator.channel.quantization_step).shape_matrix
+        usable = {stamp: y for stamp, y in samples.items() if np.isfinite(y).all()}
         # As of the newest sample: those that are on their way can then be used, and the contract counts on them.
-        newest = max(samples, default=step)
-        by_age, since = {newest - stamp: y for stamp, y in samples.items()}, step - newest
+        newest = max(usable, default=step)
+        by_age, since = {newest - stamp: y for stamp, y in usable.items()}, step - newest
         found = first_estimate(plant, self._estimator.error_set, by_age, inputs[since:], noise)
         if found is not None:
             self._unknown = None

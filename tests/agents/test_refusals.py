@@ -12,11 +12,21 @@ from agents import evaluate
 from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
 from ncs_gym import truck_trailer
+from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 REPLAY = dict(n_envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
 CERTIFICATE = certificate_of(truck_trailer(mass=4000.0))
+PAPER = PaperCertificate(
+    L=np.eye(2),
+    K=np.zeros((1, 2)),
+    kappa=0.5,
+    rho=1.0,
+    epsilon=0.1,
+    epsilon_up=0.1,
+    fingerprint=CERTIFICATE.fingerprint,
+)
 NAN, INF = float("nan"), float("inf")
 OBSERVED = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \(N, 3\), got "
 
@@ -45,8 +55,10 @@ HYPERPARAMS = [
     ("TD3", {"noise_type": "pink"}, "TD3: noise_type cannot be 'pink'"),
     ("SAC", {"buffer_size": -1}, "buffer_size must be a whole number >= 1, got -1"),
     ("SAC", {"stored_action": "both"}, "stored_action must be"),
-    ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values"),
-    ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values"),
+    ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values, got 'policy_kwargs': "),
+    ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values, got 'learning_rate': nan"),
+    *(("PPO", {"policy_kwargs": {"net_arch": value}}, "net_arch must be widths >= 1") for value in
+      ("64", 64, [64.0], [True], [0], [-1], [[64], [64]], [64, {"pi": [64]}], {"pi": 64}, {"pi": {"64": 64}})),
     ("DQN", {}, "unknown algorithm 'DQN'"),
     ("SAC", {"n_epochs": 2}, "unknown hyperparameter 'n_epochs'"),
 ]  # fmt: skip
@@ -57,6 +69,8 @@ CALLS = [
     (partial(train, CRUISE, 64, 0, "DQN"), "unknown algorithm 'DQN'"),
     (partial(require_trainable, CRUISE, 2_000, "SAC", {}), "2000 steps train nothing"),
     (partial(evaluate, CRUISE, None, 0, 0), "episodes must be at least 1, got 0"),
+    *((partial(ShieldSettings, value), f"certificate must be a Certificate, got {type(value).__name__}") for value in
+      (PAPER, None, CERTIFICATE.document)),
     (partial(LoopConfig, env=CRUISE.env, shield=CERTIFICATE),
      r"^shield must be ShieldSettings\(certificate\), got Certificate$"),
     (partial(LoopConfig, env=CRUISE.env, shield=ShieldSettings(CERTIFICATE), filter=print),

@@ -70,6 +70,15 @@ def test_what_cannot_be_read_is_named_with_its_key_and_file(text, culprit, tmp_p
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("entry", ["n_steps: 2001-01-01", "2001-01-01: 3", "policy_kwargs: {net_arch: !!set {8}}"])
+def test_value_that_json_has_not_is_named_with_its_key_and_file(entry, tmp_path):
+    said = "zoo.yml: hyperparameters must be JSON values, got "
+    with pytest.raises(ValueError, match=said) as caught:
+        read_hyperparams(file_of(tmp_path, f"  gamma: 0.9\n  {entry}\n"), CRUISE)
+    assert entry.split(":")[0].replace("2001-01-01", "datetime.date(2001, 1, 1)") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 def test_keys_of_the_zoo_itself_are_left_out_with_a_note(tmp_path):
     keys = "".join(f"  {name}: something\n" for name in RL_ZOO_KEYS)
     with pytest.warns(UserWarning, match="only rl-zoo3 reads that, it is left out here") as caught:

@@ -196,6 +196,8 @@ def test_yaml_with_moderate_aliases_is_read(write):
 HUGE = [
     {"policy_kwargs": {"net_arch": [12_000, 12_000]}},
     {"policy_kwargs": {"net_arch": {"pi": [64], "vf": [12_000, 12_000]}}},
+    {"policy_kwargs": {"net_arch": [{"pi": [12_000, 12_000], "vf": [64]}]}},
+    {"policy_kwargs": {"net_arch": {"pi": [64], "qf": [12_000, 12_000]}}},
     {"policy_kwargs": {"net_arch": [10**9]}},
     {"policy_kwargs": {"net_arch": [64] * 100_000}},
     {"policy_kwargs": {"n_critics": 10**9}},
@@ -221,7 +223,7 @@ def test_hyperparameters_that_take_much_memory_are_refused(hyperparams):
 def test_networks_of_usual_sizes_are_taken():
     from agents.hyperparams import complete_hyperparams
 
-    for arch in ([64, 64], [400, 300], [1024, 1024], {"pi": [256, 256], "qf": [512, 512]}):
+    for arch in ([64, 64], [400, 300], [1024, 1024], {"pi": [256, 256], "qf": [512, 512]}, [{"pi": [64], "vf": []}]):
         for algorithm in ("PPO", "SAC"):
             complete_hyperparams(algorithm, {"policy_kwargs": {"net_arch": arch}})
 
@@ -237,11 +239,12 @@ def forged(folder, hyperparams):
     return folder
 
 
-def test_agent_of_large_networks_is_refused_before_they_are_made(tmp_path):
+@pytest.mark.parametrize("arch", [[12_000, 12_000], [{"pi": [12_000, 12_000], "vf": [12_000, 12_000]}]])
+def test_agent_of_large_networks_is_refused_before_they_are_made(arch, tmp_path):
     pytest.importorskip("stable_baselines3")
     from agents import Agent, AgentError
 
-    folder = forged(tmp_path, {"policy_kwargs": {"net_arch": [12_000, 12_000]}})
+    folder = forged(tmp_path, {"policy_kwargs": {"net_arch": arch}})
     with little_memory(), pytest.raises(AgentError, match="weights"):
         Agent.load(folder)
 

@@ -264,6 +264,33 @@ def test_samples_on_request_cost_and_come_only_then(env_id):
         assert seen[-2] == k % 3
 
 
+def test_agent_that_sees_nothing_because_nobody_asks_is_told_once_in_an_episode():
+    env = Networked(Counter(), Channel(on_request=True))
+    for _ in range(2):
+        env.reset()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(30):
+                env.step(env.action_space.sample())
+        assert [each.category for each in caught] == [UserWarning]
+        assert "RequestActions" in str(caught[0].message)
+        assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("asks", [True, False])
+def test_agent_that_may_ask_is_told_nothing_whether_it_does_or_not(asks):
+    env = RequestActions(Networked(gym.make("Pendulum-v1"), Channel(on_request=True)))
+    env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(30):
+            env.step(np.array([0.5, 1.0 if asks else -1.0], np.float32))
+        env = Networked(Counter(), Channel())
+        env.reset()
+        for _ in range(30):
+            env.step(env.action_space.sample())
+
+
 def test_time_limits_stand_inside_and_outside():
     for env in (TimeLimit(Networked(Counter(), LATE), 7), Networked(TimeLimit(Counter(), 7), LATE)):
         assert [each[3] for each in run(env, 7)[1:]] == [False] * 6 + [True]

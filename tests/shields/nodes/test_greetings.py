@@ -47,6 +47,7 @@ class Line:
     def __init__(self, channel=CHANNEL):
         self.now, self.sent, self.loses = 0.0, [], lambda data, sender, receiver: False
         self.channel, self.applied, self.steps = channel, [], []
+        self.quicker, self.slower = [], []  # addresses from which copies reach the controller before and after
         self.at_controller = Socket(self)
         self.sensor = self.actuator = self.controller = None
         self.clock = StepClock(PLANT.dt)
@@ -55,8 +56,14 @@ class Line:
 
     def carry(self, data, sender, receiver):
         self.sent.append((data, sender, receiver))
-        if not self.loses(data, sender, receiver):
-            receiver.inbox.append(Datagram(self.now, data, sender))
+        is_heard = receiver is self.at_controller
+        came = [] if self.loses(data, sender, receiver) else [sender]
+        for each in [*self.quicker, *came, *self.slower] if is_heard else came:
+            receiver.inbox.append(Datagram(self.now, data, each))
+
+    def addresses(self, number):
+        """Addresses of somebody who copies what is sent."""
+        return [Socket(self) for _ in range(number)]
 
     def repeat(self, data, receiver, sender="somebody"):
         """Sends a recording."""
@@ -351,3 +358,79 @@ def test_samples_that_may_be_too_late_for_a_prelude_are_refused_at_once():
     loop = SafeLoop(certificate_of(PLANT), PLANT, Channel(delay=21), **settings)
     with pytest.raises(ValueError, match="21 steps late"):
         ControllerNode(loop, line.wire, line.at_controller, StepClock(PLANT.dt), np.zeros(PLANT.n), known=True)
+
+
+@pytest.mark.parametrize(("quicker", "slower"), [(0, 1), (1, 0), (31, 0), (0, 31), (15, 16)])
+def test_copies_from_other_addresses_neither_keep_the_loop_from_starting_nor_divert_anything(quicker, slower):
+    line = Line().add_controller().add_sensor().add_actuator()
+    line.quicker, line.slower = line.addresses(quicker), line.addresses(slower)
+    proved = line.run(A_WHILE)
+    assert len(proved) > A_WHILE // 2
+    assert all(proved)
+    assert line.actuator.actuator.echo.missing == 0
+    assert all(each.inbox for each in line.quicker)  # they are answered beside the nodes
+
+
+def test_copies_that_come_after_the_originals_divert_nothing_however_many_there_are():
+    line = started()
+    line.quicker, line.slower = line.addresses(31), line.addresses(100)
+    assert all(line.run(A_WHILE))
+    assert line.actuator.actuator.echo.missing == 0
+
+
+def test_copies_that_come_steps_before_the_originals_divert_nothing():
+    line = started()
+    line.quicker, held = line.addresses(31), []
+
+    def holds(data, sender, receiver):
+        if receiver is line.at_controller:
+            held.append((line.now + 2.5 * PLANT.dt, data, receiver, sender))
+        return receiver is line.at_controller
+
+    def release():
+        while held and held[0][0] < line.now:
+            line.repeat(*held.pop(0)[1:])
+
+    line.loses = holds
+    assert all(line.run(A_WHILE, release))
+    assert line.actuator.actuator.echo.missing == 0
+
+
+def test_copy_of_a_message_whose_original_is_lost_diverts_nothing():
+    line, count = started(), itertools.count()
+    line.quicker = line.addresses(1)
+    line.loses = lambda data, sender, receiver: receiver is line.at_controller and next(count) % 3 > 0
+    assert all(line.run(A_WHILE))
+    assert line.actuator.actuator.echo.missing == 0
+
+
+def test_more_greetings_than_are_answered_keep_the_loop_from_starting_and_it_claims_nothing():
+    line = Line().add_controller().add_sensor().add_actuator()
+    line.slower = line.addresses(32)
+    assert line.run(2 * A_WHILE) == []
+    line.slower = []
+    proved = line.run(2 * A_WHILE)
+    assert proved
+    assert all(proved)
+
+
+def test_more_quicker_copies_than_are_answered_divert_commands_and_the_loop_reports_it():
+    line = started()
+    line.quicker = line.addresses(32)
+    proved = line.run(A_WHILE)
+    told = proved.index(False)
+    assert told <= CHANNEL.longest_delay + 2 * line.input_delay + 2
+    assert not any(proved[told:])
+    assert line.controller.loop.reason == LATE_INPUT
+
+
+def test_address_from_which_nothing_newer_comes_is_told_nothing_more():
+    line = started()
+    line.quicker = [somebody] = line.addresses(1)
+    line.run(1)
+    line.quicker = []
+    line.run(40)
+    told = len(somebody.inbox)
+    assert 0 < told < 60
+    line.run(40)
+    assert len(somebody.inbox) == told

@@ -207,6 +207,8 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
             ("error_shapes must be finite numbers", ONE, NONE, NONSENSE),
             ("actions must be a tensor of floats.* got ndarray", np.zeros((2, 1)), NONE),
             ("tensor of floats.* got one of torch.int64", torch.zeros((2, 1), dtype=torch.int64), NONE),
+            ("actions must be a dense tensor.* torch.sparse_coo: call to_dense", ONE.to_sparse(), NONE),
+            ("estimates must be a dense tensor.* torch.sparse_coo", ONE, NONE.to_sparse()),
             (r"actions must have shape \(0, 1\)", torch.tensor(0.0), NONE),
             (r"actions must have shape \(1, 1\) beside 1 actions, got \(1,\)", torch.zeros(1), torch.zeros(2)),
             (r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)", ONE, torch.zeros(3, 2)),

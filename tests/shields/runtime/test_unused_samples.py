@@ -10,7 +10,7 @@ import pytest
 from ncs_gym import Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, truck_trailer
 from ncs_gym.processes.plant_step import PlantSimulation
 from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import ALARM, NOT_FINITE
+from shields.runtime.guarantee import ALARM, NOT_FINITE, UNKNOWN_START
 from tests.certificates import certificate_of
 
 PLANT = truck_trailer(mass=4000.0)
@@ -88,6 +88,23 @@ def test_one_sensor_of_two_without_a_reading_is_named_as_that():
     with pytest.warns(GuaranteeLostWarning, match="contradicts the assumed bounds"):
         loop.step(0.0, [Packet(1, [0.0, 9.0], loop.episode)])
     assert loop.reason == ALARM
+
+
+def test_sample_without_a_reading_is_named_while_the_state_is_sought_and_the_others_tell_where_it_is():
+    loop = started()
+    loop.start(np.zeros(2), known=False)
+    assert loop.reason == UNKNOWN_START
+    with pytest.warns(GuaranteeLostWarning, match="a sample held NaN or infinity"):
+        loop.step(0.0, [Packet(0, [0.0, np.nan], loop.episode)])
+    for step in range(1, 20):
+        loop.step(0.0, [Packet(step, [np.inf, 0.0], loop.episode)])
+        assert loop.reason == NOT_FINITE
+    for _ in range(20):  # what was held is too old
+        loop.step(0.0)
+    assert loop.reason == UNKNOWN_START
+    for _ in range(5):
+        loop.step(0.0, [Packet(loop.steps + 1, np.zeros(2), loop.episode)])
+    assert loop.guaranteed
 
 
 @pytest.mark.parametrize("many", [False, True])
