@@ -98,7 +98,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             chosen = np.ones(count, np.bool_)
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
-        observations, info = self.env.reset(seed=seed, options=own or None)
+        observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
         first = seed[0] if isinstance(seed, list) else seed
         if first is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))

@@ -189,7 +189,7 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
                 "nothing but the first observation; put RequestActions around Networked, or call request before steps",
                 UserWarning,
             )
-        self._earned += reward if settings.delay_reward else 0.0
+        self._earned += float(reward) if settings.delay_reward else 0.0
         sample = None
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             link, packet = arrivals.link, None

@@ -68,7 +68,7 @@ class ZmqTransport:
     def send(self, data: bytes, to: Any = None) -> None:
         """Sends a message."""
         sent = self._socket.send_multipart([to, data] if self._is_router else [data], zmq.NOBLOCK)
-        sent.exception()  # nobody is there
+        sent.exception()  # nobody is there  # pyright: ignore[reportAttributeAccessIssue]
 
     def received(self) -> list[Datagram]:
         """Returns what arrived since the last call."""
