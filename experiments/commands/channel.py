@@ -40,6 +40,11 @@ def _numbers(log: PacketLog, dt: float, asked: int | None) -> dict[str, Any]:
     if not len(arrived):
         raise ValueError("none of the packets arrived")
     ages = log.ages(dt)
+    if len(ages) < 2:
+        raise ValueError(
+            f"the record spans one control step of {dt:g} s, a contract needs two: take a longer record, a shorter "
+            "step, or, if its times are not in seconds, name their unit (sent_ms)"
+        )
     samples = len(log.sent) - log.left_out(dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isnan(log.delays).astype(np.int8), [0]])))
     first, second = (int(half.max()) for half in np.array_split(ages, 2) if len(half))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -114,8 +115,11 @@ _SUMMARIES = (
 )
 # The first number is 0 where the header has "56 data bytes" behind a colon (BusyBox, macOS); Linux counts from 1.
 _FROM_ZERO = re.compile(r"PING6|PING .*: \d+ data bytes")
-# Numbers begin anew after 65535.
-_NUMBERS = 65536
+# Numbers begin anew after 65535, where only stamps tell late answers from lost packets; more than so many numbers late
+# nobody waits for. Repeated or late are few in a row, unless something began anew.
+_NUMBERS, _LATEST, _MOST_LATE = 65536, 1024, 16
+# Who is sent later than the newest by more than this is no late one, whenever its answer was printed [s].
+_PRINTED = 1.0
 # Windows waits so long for an answer before it sends the next packet, unless told otherwise [s].
 _WINDOWS_TIMEOUT = 4.0
 _WAY_AND_BACK = "delays are those of the whole way and back"
@@ -133,6 +137,8 @@ def _of_ping(text: str, period: float | None) -> Record:
     for number, line in enumerate(lines, 1):
         if len(line) > _LONGEST_LINE:
             raise ValueError(f"line {number} is longer than any of ping")
+    if "time of day goes back" in text:
+        raise ValueError("ping warns that the clock was set back: record anew, or cut the record there")
     if sum(line.startswith(("PING", "Pinging ")) for line in lines) > 1:
         raise ValueError("it holds several runs of ping: put each into a file of its own")
     found = [match for line in lines for pattern in _SUMMARIES if (match := pattern.match(line))]
@@ -154,28 +160,49 @@ def _of_numbers(
     """Returns the packets of a program that numbers them; a number without an answer is a lost packet."""
     answers: dict[int, float] = {}
     stamps: dict[int, float] = {}
-    hosts, last, turns, origin = set(), 0, 0, None
-    for line in lines:
+    header = next((line for line in lines if line.startswith("PING")), None)
+    hosts, last, late, origin, printed, newest = set(), None, 0, None, None, -np.inf
+    for count, line in enumerate(lines, 1):
         if (found := pattern.match(line)) is None:
             continue
         hosts.add(found.groupdict().get("host"))
-        number = int(found["number"]) + _NUMBERS * turns
-        if number < last - _NUMBERS // 2:
-            turns, number = turns + 1, number + _NUMBERS
-        last = max(last, number)
-        known = answers.setdefault(number, np.nan)
-        if found["time"] is not None and np.isnan(known):  # a further answer is a duplicate
-            answers[number] = _milliseconds(found["time"])
-            if found["stamp"] is not None:
-                stamp = Decimal(found["stamp"])
-                origin = stamp if origin is None else origin
-                stamps[number] = float(stamp - origin) - answers[number]
+        number, known = int(found["number"]), np.nan
+        delay = np.nan if found["time"] is None else _milliseconds(found["time"])
+        now = sent = None
+        if found["stamp"] is not None:
+            stamp = Decimal(found["stamp"])
+            origin = stamp if origin is None else origin
+            if printed is not None and stamp < printed:
+                raise ValueError(f"line {count}: the clock was set back by {printed - stamp:f} s, cut the record there")
+            printed, now = stamp, float(stamp - origin)
+            sent = None if found["time"] is None else now - delay
+        if "(DUP!)" in line:
+            continue
+        if last is not None:
+            if program == "ping" and number < _NUMBERS:  # the nearest number of which this is the remainder
+                number = last + (number - last + _NUMBERS // 2) % _NUMBERS - _NUMBERS // 2
+            if program == "ping" and number <= last and sent is not None and sent > newest + _PRINTED:
+                number += _NUMBERS
+            known = answers.get(number)
+            is_late = number <= last and (known is None or not np.isnan(known))
+            late = late + 1 if is_late else 0
+            too_late = last - number > _LATEST and sent is None
+            if too_late or late > _MOST_LATE or (header is not None and number < 0):
+                raise ValueError(
+                    f"line {count}: number {found['number']} may be a late answer, or come after many lost ones or of "
+                    "another run: record with ping -D, whose stamps tell, and each run in a file of its own"
+                )
+        last = number if last is None else max(last, number)
+        newest = max(newest, -np.inf if now is None else now if sent is None else sent)
+        if np.isnan(answers.setdefault(number, np.nan)):  # a further answer is a duplicate
+            answers[number] = delay
+            if sent is not None:
+                stamps[number] = sent
     if len(hosts) > 1:
         raise ValueError("it has the answers of several hosts: put each into a file of its own")
     if not answers:
         raise ValueError("no packet of ping has a number")
     first, last = min(answers), max(answers)
-    header = next((line for line in lines if line.startswith("PING")), None)
     begins = 0 if first == 0 or program == "fping" or (header is not None and _FROM_ZERO.match(header)) else 1
     if header is not None:
         first = min(first, begins)
@@ -186,6 +213,8 @@ def _of_numbers(
     delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
     if len(stamps) > 1:
         sent, how = _between_stamps(numbers, stamps), "sent when its stamps say"
+        for number, stamp in stamps.items():  # the answer came when it came
+            delays[number - first] += stamp - sent[number - first]
     else:
         between, how = _period_of(summary, period)
         sent = between * (numbers - first)
@@ -228,8 +257,18 @@ def _milliseconds(text: str) -> float:
 def _between_stamps(numbers: np.ndarray, stamps: dict[int, float]) -> np.ndarray:
     """Returns when packets were sent, those without a stamp evenly between their neighbors, shape (k,) [s]."""
     known = np.array(sorted(stamps))
-    times = np.maximum.accumulate([stamps[each] for each in known.tolist()])
-    slope = float(np.median(np.diff(times) / np.diff(known)))
+    # None was sent after a later one: where stamps were printed late the earlier time is nearer.
+    times = np.minimum.accumulate([stamps[each] for each in known[::-1].tolist()])[::-1]
+    steps, gaps = np.diff(known), np.diff(times)
+    if (steps == 1).any():
+        expected = steps * np.quantile(gaps[steps == 1], 0.05)
+        hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
+        if len(hurried):
+            raise ValueError(
+                f"between the packets {known[hurried[0]]} and {known[hurried[0] + 1]} its stamps leave too little time "
+                "for the lost ones: the clock was set back there, cut the record"
+            )
+    slope = float(np.median(gaps / steps))
     sent = np.interp(numbers, known, times)
     before, after = numbers < known[0], numbers > known[-1]
     sent[before] = times[0] - slope * (known[0] - numbers[before])
@@ -297,6 +336,10 @@ _LARGEST = Decimal(10) ** 305
 _LOST = {"", "na", "n/a", "nan", "none", "null", "-", "--", "*", "lost", "timeout"}
 _YES, _NO = {"1", "1.0", "true", "yes", "y"}, {"0", "0.0", "false", "no", "n", ""}
 _SINCE = datetime(1970, 1, 1, tzinfo=UTC)
+# The years 2000 and 2100 [s since 1970].
+_YEARS = 946_684_800, 4_102_444_800
+# Packets closer to each other are in another unit than seconds, as in the days of spreadsheets [s].
+_CLOSEST = 1e-4
 
 
 class _Column(NamedTuple):
@@ -314,8 +357,8 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     rest = lines[number + 1 :]
     if "#" in line and (found := next(((n, each) for n, each in enumerate(lines) if _is_data(each)), None)):
         # Of lines of comment in front of the numbers the last one may have the names.
-        number, rest = found[0], lines[found[0] :]
-        line = next((each for each in reversed(lines[: found[0]]) if each.strip()), line)
+        number = next((n for n in reversed(range(found[0])) if lines[n].strip()), number)
+        line, rest = lines[number], lines[number + 1 :]
     line = line.strip().lstrip("#").strip()
     separator = next((each for each in ",;\t|" if each in line), " ")
     if separator == " ":
@@ -323,14 +366,16 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     names = next(iter(_rows([line], separator, 1)))[1]
     if all(_is_number(name) for name in names):
         if len(names) == 1:
-            return _of_list(_rows(lines[head[0] :], separator, head[0] + 1), period)
+            return _of_list(_rows(lines, separator, 1, with_empty=True), period)
         raise ValueError(
             "its columns have no names, and neither their order nor their unit can be guessed safely: write them into "
             "the first line, as in sent_ms,received_ms"
         )
     columns = _columns(names)
     first = len(lines) - len(rest) + 1
-    rows = _rows(rest, separator, first, len(names))
+    is_list = set(columns) - {"lost"} == {"delay"}
+    rows = _rows(rest, separator, first, len(names), with_empty=is_list)
+    rows = _with_decimals(rows, [each.index for role, each in columns.items() if role in ("sent", "received", "delay")])
     if {"episode", "sent", "received"} <= columns.keys():
         return _of_steps(rows, columns, step)
     if "sent" in columns and ("received" in columns or "delay" in columns):
@@ -350,14 +395,18 @@ def _is_data(line: str) -> bool:
 
 
 def _rows(
-    lines: Sequence[str], separator: str, first: int, width: int | None = None
+    lines: Sequence[str], separator: str, first: int, width: int | None = None, *, with_empty: bool = False
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yields the cells of the rows with their numbers, without empty lines and comments."""
+    """Yields the cells of the rows with their numbers, without comments, and without empty lines unless asked for."""
     # A stretch of white space separates, or any other separator with white space around it.
     texts = (" ".join(line.split()) if separator == " " else line for line in lines)
     for number, cells in enumerate(csv.reader(texts, delimiter=separator, skipinitialspace=True), first):
         cells = [cell.strip() for cell in cells]
-        if not any(cells) or cells[0].startswith("#"):
+        if not any(cells):
+            if with_empty:
+                yield number, []
+            continue
+        if cells[0].startswith("#"):
             continue
         if width is not None and separator == " " and len(cells) != width:
             raise ValueError(
@@ -366,6 +415,25 @@ def _rows(
         if width is not None and any(cells[width:]):
             raise ValueError(f"line {number} has more columns than the names in the first line")
         yield number, cells
+
+
+def _with_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]) -> Iterator[tuple[int, list[str]]]:
+    """Yields the rows, and raises ValueError after the last one if all commas may separate thousands."""
+    doubtful, is_decimal = None, False
+    for line, cells in rows:
+        for cell in [] if is_decimal else [cells[index] for index in indices if index < len(cells)]:
+            if "," not in cell or not re.fullmatch(r"[+-]?\d+,\d+", cell):
+                continue
+            if re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell):
+                doubtful = doubtful or (line, cell)
+            else:
+                is_decimal = True
+        yield line, cells
+    if doubtful is not None and not is_decimal:
+        line, cell = doubtful
+        raise ValueError(
+            f"line {line}: the comma in {shown(cell)} may be that of decimals or of thousands: write decimal points"
+        )
 
 
 def _columns(names: Sequence[str]) -> dict[str, _Column]:
@@ -419,7 +487,7 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
     """Returns the packets of a table with the time at which each was sent, and that of its arrival or its delay."""
     sent_at, by = columns["sent"], "received" if "received" in columns else "delay"
     until = columns[by]
-    sent, delays, marked, at_zero, numbers, flagged = [], [], [], [], [], []
+    sent, arrived, delays, marked, at_zero, numbers, flagged, places = [], [], [], [], [], [], [], []
     origin, unit, until_unit, scale, until_scale = Decimal(0), "", "", Decimal(1), Decimal(1)
     for line, cells in rows:
         cells += (len(names) - len(cells)) * [""]
@@ -437,31 +505,44 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
             unit, until_unit = _units(sent_at, until, by, start)
             scale, until_scale = _UNITS[unit], _UNITS[until_unit]
             origin = start * scale
+            named = sent_at.unit or (by == "received" and until.unit)
+            _require_moment(cells[sent_at.index], origin, is_guessed=not named and unit != "s")
         start *= scale
+        places.append(line)
         sent.append(float(start - origin))
         if end is None:
+            arrived.append(np.nan)
             delays.append(np.nan)
             continue
         if end in _MARKS and (by == "delay" or start > end):  # a lost packet, marked by a number
             marked.append(len(delays))
         elif end == start == 0:  # as in the other lines, if zeros are marks there
             at_zero.append(len(delays))
-        delays.append(float(end * until_scale - start if by == "received" else end * until_scale))
+        delay = end * until_scale - start if by == "received" else end * until_scale
+        arrived.append(float(start - origin + delay))
+        delays.append(float(delay))
     if len(sent) < 2:
         raise ValueError("a log needs at least two packets, each with the time at which it was sent")
     require_packets(len(sent))
     moments, delays = np.array(sent), np.array(delays)
     marked += at_zero if marked else []
     delays[marked] = np.nan
+    _require_order(moments, np.where(np.isnan(delays), np.nan, arrived), places)
     if flagged:
         delays[flagged] = np.nan
     order = np.argsort(moments, kind="stable")
     moments, delays = moments[order], delays[order]
+    guessed = not sent_at.unit and unit == "s" and not until.unit
     missing = 0
     if "number" in columns:
         before = len(moments)
         moments, delays = _with_missing(moments, delays, np.array(numbers)[order])
         missing = len(moments) - before
+    if guessed and abs(origin) < 10**8 and 0.0 < _median_gap(moments) < _CLOSEST:
+        raise ValueError(
+            f"its packets would be sent every {_median_gap(moments):.3g} s, if times were seconds: write the unit into "
+            "the names of the columns (sent_ms), and the days of a spreadsheet as seconds"
+        )
     epoch = "" if origin < 10**8 else ", times since 1970"
     used = {each.index for each in columns.values()}
     unused = [shown(name) for index, name in enumerate(names) if index not in used]
@@ -472,7 +553,6 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         read_as += f" A number without a line stands for a lost packet ({_many(missing, 'number')})."
     if unused:
         read_as += f" Not used: {', '.join(unused)}."
-    guessed = not sent_at.unit and unit == "s" and not until.unit
     return Record(moments, delays, read_as, guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0)
 
 
@@ -484,6 +564,42 @@ def _units(sent: _Column, until: _Column, by: str, first: Decimal) -> tuple[str,
     magnitude = next((unit for above, unit in reversed(_EPOCHS) if abs(first) >= above), "")
     own = sent.unit or (until.unit if by == "received" else "") or magnitude or "s"
     return own, until.unit or (own if by == "received" else "s")
+
+
+def _median_gap(sent: np.ndarray) -> float:
+    gaps = np.diff(sent)
+    return float(np.median(gaps[gaps > 0.0])) if gaps.any() else 0.0
+
+
+def _require_moment(cell: str, moment: Decimal, *, is_guessed: bool) -> None:
+    """Raises ValueError if a time is after 2100, or, where its unit follows from it, before 2000 [s]."""
+    if abs(moment) > _YEARS[1] or (is_guessed and moment < _YEARS[0]):
+        raise ValueError(
+            f"{shown(cell)} is no time since 1970 of these decades: write times of a calendar as in "
+            "2026-11-26T10:00:00.020Z, or name the unit of the others (sent_ms)"
+        )
+
+
+def _require_order(sent: np.ndarray, arrived: np.ndarray, lines: Sequence[int]) -> None:
+    """Raises ValueError if rows are neither in the order of sending nor, those that were overtaken, in that of arrival.
+
+    Sorting them would hide that a clock was set back. A lost packet was not known before it was sent.
+    """
+    newest = np.maximum.accumulate(sent)
+    logged = np.where(np.isnan(arrived), sent, arrived)
+    late = sent < newest
+    back = late & (np.isnan(arrived) | (logged < np.maximum.accumulate(logged)))
+    since = np.arange(len(late)) - np.maximum.accumulate(np.where(late, 0, np.arange(len(late))))
+    back |= since > _MOST_LATE  # as many were overtaken by one: the sender's clock was set back
+    if not back.any():
+        return
+    at = int(np.argmax(back))
+    if since[at] > _MOST_LATE:
+        at -= int(since[at]) - 1
+    raise ValueError(
+        f"line {lines[at]}: the time of sending goes back by {newest[at] - sent[at]:.6g} s: if a clock was set back "
+        "or began anew, or an hour comes twice in local time, cut the record there; otherwise sort the rows by it"
+    )
 
 
 def _count(cell: str) -> int:
@@ -515,6 +631,12 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
     sent, delays, numbers = sent[order], delays[order], numbers[order]
     once = np.append(True, (np.diff(numbers) != 0) | (np.diff(sent) > 0.0))
     sent, delays, numbers = sent[once], delays[once], numbers[once]
+    back = np.flatnonzero((numbers[1:-1] < numbers[:-2]) & (numbers[:-2] < numbers[2:]))
+    if len(back):
+        raise ValueError(
+            f"by its time packet {numbers[back[0] + 1]} was sent after packet {numbers[back[0]]}: a clock was set "
+            "back, or numbers come twice"
+        )
     steps = np.diff(numbers)
     gaps = np.where(steps > 1, steps - 1, 0)
     require_packets(len(sent) + int(np.minimum(gaps, 10**9).sum()))
@@ -549,20 +671,16 @@ def _of_list(
     """Returns the packets of a list of delays, one per line; without a name they are milliseconds, as ping's are."""
     known = {"delay": _Column(0, "", "ms")} if columns is None else columns
     column = known["delay"]
-    delays, numbers, marked, before = [], [], 0, None
+    delays, numbers, marked = [], [], 0
     for line, cells in rows:
-        if len(known) == 1:  # then an empty line between two others stands for a packet
-            empty = 0 if before is None else line - before - 1
-            require_packets(len(delays) + empty)
-            delays, marked, before = delays + empty * [np.nan], marked + empty, line
         try:
             value = _number(cells[column.index] if column.index < len(cells) else "")
             if "number" in known:
                 numbers.append(_count(cells[known["number"].index]))
-            lost = "lost" in known and _flag(cells[known["lost"].index])
+            lost = not cells or ("lost" in known and _flag(cells[known["lost"].index]))
         except (ValueError, IndexError):
             raise ValueError(f"line {line} is not a delay") from None
-        marked += value in _MARKS
+        marked += not cells or value in _MARKS
         delays.append(np.nan if value is None or value in _MARKS or lost else float(value * _UNITS[column.unit]))
     if len(delays) < 2:
         raise ValueError("a log needs at least two packets")
@@ -614,6 +732,8 @@ def _of_irtt(trips: list[Any]) -> Record:
             moment = moments.get("monotonic", moments.get("wall"))
             lost = trip["lost"] not in ("false", False)
             delay = np.nan if lost else trip["delay"]["rtt"] / 1e9
+            if not abs(int(moment)) < 2**63:
+                raise ValueError("too large")
             sent.append(int(moment))
             delays.append(float(delay))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
@@ -621,6 +741,11 @@ def _of_irtt(trips: list[Any]) -> Record:
     if len(sent) < 2:
         raise ValueError("a log needs at least two packets, each with the time at which it was sent")
     require_packets(len(sent))
-    order = np.argsort(sent, kind="stable")
-    moments = np.array([(each - sent[0]) / 1e9 for each in sent])[order]
-    return Record(moments, np.array(delays)[order], f"Read as the JSON of irtt: {_WAY_AND_BACK}.")
+    for number, (before, after) in enumerate(itertools.pairwise(sent), 1):
+        if after < before:
+            raise ValueError(
+                f"round trip {number} of irtt: the clock was set back by {(before - after) / 1e9:g} s, cut the "
+                "record there"
+            )
+    moments = np.array([(each - sent[0]) / 1e9 for each in sent])
+    return Record(moments, np.array(delays), f"Read as the JSON of irtt: {_WAY_AND_BACK}.")

@@ -85,9 +85,13 @@ def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
     assert "kept throughout" not in said
 
 
-def test_channel_refuses_a_file_in_one_sentence(tmp_path):
-    (tmp_path / "packets.csv").write_text("0,1\n1,2\n")
-    found = ncs("channel", tmp_path / "packets.csv")
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [("0,1\n1,2\n", "no names"), ("sent,received\n0,0.001\n0.01,0.011\n", "spans one control step")],
+)
+def test_channel_refuses_a_file_in_one_sentence(content, words, tmp_path):
+    (tmp_path / "packets.csv").write_text(content)
+    found = ncs("channel", tmp_path / "packets.csv", "--sampling-period", 0.02)
     assert found.returncode != 0
     assert len(found.stderr.strip().splitlines()) == 1
-    assert "no names" in found.stderr
+    assert words in found.stderr

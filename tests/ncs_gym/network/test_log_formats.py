@@ -57,6 +57,31 @@ def ping(answers):
     return "".join(f"64 bytes from 192.0.2.1: icmp_seq={i} ttl=64 time={time} ms\n" for i, time in answers)
 
 
+def stamped(answers):
+    """Output of ping -D; the numbers of packets, and when each was answered."""
+    return "".join(f"[{1700000000 + at}.012] {ping([(n, 9)])}" for n, at in answers)
+
+
+def rows(names, *runs, in_order=False):
+    """A table of packets, each 10 ms on its way, by their times or their numbers and times."""
+    packets = [each if isinstance(each, tuple) else (i, each) for run in runs for i, each in enumerate(run)]
+    packets = sorted(packets, key=lambda each: each[1]) if in_order else packets
+    number, until = "{0}," * names.startswith("seq"), "0.01" if names.endswith("rtt") else "{2:.2f}"
+    return f"{names}\n" + "".join(f"{number}{{1}},{until}\n".format(n, at, at + 0.01) for n, at in packets)
+
+
+def irtt_sent(*moments):
+    """JSON of irtt, by when each was sent [ms]."""
+    return json.dumps(
+        {
+            "round_trips": [
+                {"lost": "false", "timestamps": {"client": {"send": {"wall": 10**6 * ms}}}, "delay": {"rtt": 10**6}}
+                for ms in moments
+            ]
+        }
+    )
+
+
 LINUX = "PING host (192.0.2.1) 56(84) bytes of data.\n"
 MACOS = "PING host (192.0.2.1): 56 data bytes\n"
 STAMPED = {1: "0.00", 2: "0.05", 3: "0.10", 4: "7.40", 5: "7.45", 7: "7.55"}
@@ -129,8 +154,8 @@ KINDS = {
     ),
     "table in milliseconds since 1970 with missing numbers": Kind(
         "\ufeffseq,size,send_time_ms,recv_time_ms\r\n7,60,1700000000000,1700000000012\r\n8,60,1700000000020,\r\n"
-        "11,60,1700000000080,1700000000095\r\n10,60,1700000000060,1700000000061\r\n",
-        times("0.02", ["0.012", None, None, "0.001", "0.015"]),
+        "11,60,1700000000080,1700000000095\r\n10,60,1700000000060,1700000000099\r\n",
+        times("0.02", ["0.012", None, None, "0.039", "0.015"]),
         "0.02",
         "times since 1970. A number without a line stands for a lost packet (1 number). Not used: 'size'",
     ),
@@ -190,6 +215,31 @@ KINDS = {
         "0.05",
         "one number per line, in ms, packets sent every 50 ms",
         0.05,
+    ),
+    "list of round trips with empty lines at both ends": Kind(
+        "\n\n12\n\n15\n\n\n",
+        times("1", [None, None, "0.012", None, "0.015", None, None]),
+        "0.5",
+        "an empty line stands for a lost packet (5 lines)",
+    ),
+    "named list with a flag and empty lines at both ends": Kind(
+        "# today\n# rtt_ms,lost\n\n12,no\n,\n15,no\n14,yes\n\n",
+        times("1", [None, "0.012", None, "0.015", None, None]),
+        "0.5",
+        "an empty line stands for a lost packet (3 lines)",
+    ),
+    "ping -D with duplicates": Kind(
+        "".join(f"[{1700000000 + i}.012] " + 2 * ping([(i, "12.0")]) for i in range(1, 4))
+        + "[1700000009.5] 64 bytes from 192.0.2.1: icmp_seq=3 ttl=64 time=12.0 ms (DUP!)\n",
+        times("1", 3 * ["0.012"]),
+        "0.5",
+        "sent when its stamps say",
+    ),
+    "table with decimal commas of three digits": Kind(
+        "sent\treceived\n0,980\t0,985\n1,000\t1,005\n1,020\t1,025\n",
+        times("0.02", ["0.005", "0.005", "0.005"]),
+        "0.02",
+        "'sent' in s",
     ),
     "named list of round trips": Kind(
         "RTT (µs)\n12300\n-1\n15000\n",
@@ -304,6 +354,53 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent,received\n0,1\n" + 70 * "1" + ",2\n", "line 3"),
         (f"{LINUX}{2000 * 'x'} icmp_seq=1\n", "line 2 is longer"),
         ("\n\n", "at least two packets"),
+        (stamped([(1, 0), (2, 1), (3, -1), (4, 0)]), "line 3: the clock was set back by 2.000 s"),
+        (
+            stamped([(n, n if n <= 20 else n - 2) for n in range(1, 40) if not 18 <= n < 22]),
+            "between the packets 17 and 22 its stamps leave too little time",
+        ),
+        (
+            f"{LINUX}Warning: time of day goes back (-2us), taking countermeasures\n{ping([(1, 2)])}",
+            "the clock was set",
+        ),
+        (f"{LINUX}{ping((n, 9) for n in [*range(1, 40001), 24465])}", "line 40002: number 24465 may be a late answer"),
+        (ping((n, 9) for n in [*range(500), *range(500)]), "line 517: number 16 may be a late answer"),
+        (f"{LINUX}{ping([(1, 9), (65530, 9)])}", "line 3: number 65530 may be a late answer"),
+        ("".join(f"h : [{n % 500}], 64 bytes, 1 ms (1 avg, 0% loss)\n" for n in range(1000)), "number 16 may be"),
+        (
+            rows("sent,received", (t if t < 5 else t - 2.5 for t in range(9))),
+            "line 7: the time of sending goes back by 1.5",
+        ),
+        (rows("seq,sent,received", (t if t < 5 else t - 2.5 for t in range(9))), "line 7: the time of sending"),
+        (rows("sent,rtt", (t if t < 5 else t - 2.5 for t in range(9))), "line 7: the time of sending"),
+        ("sent,received\n0,0.1\n1,\n5,\n3,3.1\n4,4.1\n", "line 5: the time of sending goes back by 2 s"),
+        ("sent,received\n0,0.1\n1,\n5,\n3,\n4,4.1\n", "line 5: the time of sending goes back by 2 s"),
+        (
+            "sent,received\n" + "".join(f"{n % 60},{n + 0.01}\n" for n in range(120)),  # the sender alone begins anew
+            "line 62: the time of sending goes back by 59 s",
+        ),
+        (
+            "sent,received\n"
+            + "".join(f"2026-10-25T02:{m:02}:00,2026-10-25T02:{m:02}:01\n" for m in (0, 20, 54, 1, 20)),
+            "line 5: the time of sending goes back by 3180 s: if a clock was set back or began anew, or an hour comes",
+        ),
+        (
+            rows("seq,sent,received", ((n, n) for n in range(9)), ((n + 9, n + 0.5) for n in range(9)), in_order=True),
+            "by its time packet 1 was sent after packet 9",
+        ),
+        ("sent,received\n20261126100000.020,20261126100000.025\n20261126100000.040,\n", "no time since 1970"),
+        ("sent,received\n20261126100000020,20261126100000025\n20261126100000040,\n", "no time since 1970"),
+        ("sent,received\n20261126100000020000,20261126100000025000\n20261126100000040000,\n", "no time since 1970"),
+        ("sent,received\n261126100000,261126100000\n261126100001,\n", "no time since 1970"),
+        ("sent_ms,received_ms\n20261126100000020,20261126100000025\n20261126100000040,\n", "no time since 1970"),
+        ("sent_ms\treceived_ms\n980\t985\n1,000\t1,005\n1,020\t1,025\n", "line 3: the comma in '1,000' may be"),
+        ("rtt_ms\n1,020\n1,040\n", "line 2: the comma in '1,020' may be"),
+        (
+            "sent,received\n46352.4000000000,46352.4000000579\n46352.4000002315,46352.4000002894\n",
+            "days of a spreadsheet",
+        ),
+        (irtt_sent(0, 20, 10), "round trip 2 of irtt: the clock was set back by 0.01 s"),
+        (irtt_sent(0, 10**400), "round trip 1 of irtt has no time sent"),
     ],
 )
 def test_file_that_is_not_understood_is_refused_in_one_sentence(content, words, written):
@@ -353,6 +450,51 @@ def test_replay_in_an_environment_has_the_ages_of_the_record(record):
             break
     assert tuple(ages[1:].tolist()) in replayed
     assert len(replayed) <= len(trace)
+
+
+WRAPS = {
+    "a late answer": (
+        LINUX + ping((n % 65536, 9) for n in [*range(1, 65535), 65536, 65535, *range(65537, 65600)]),
+        [1] * 65599,
+    ),
+    "numbers of macOS that do not wrap without an answer": (
+        f"{MACOS}{ping((n, 9) for n in range(65536))}Request timeout for icmp_seq 65536\n{ping([(1, 9)])}",
+        [*65536 * [1], 0, 1],
+    ),
+    "a gap with stamps": (
+        "".join(
+            f"[{1700000000 + n}.009] {ping([(n % 65536, 9)])}"
+            for n in (*range(1, 9), *range(60000, 60009), *range(110000, 110009))
+        ),
+        [*8 * [1], *59991 * [0], *9 * [1], *49991 * [0], *9 * [1]],
+    ),
+    "the same number with a later stamp": (
+        "".join(f"[{1700000000 + n}.009] {ping([(n % 65536, 9)])}" for n in (*range(1, 9), 65544, 65545)),
+        [*8 * [1], *65535 * [0], 1, 1],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRAPS)
+def test_numbers_of_ping_wrap(name, written):
+    text, arrived = WRAPS[name]
+    log = PacketLog.load(written(text))
+    assert np.isfinite(log.delays).tolist() == [bool(each) for each in arrived]
+    assert np.allclose(np.diff(log.sent), 1.0)
+
+
+def test_numpy_may_raise_at_underflow():
+    with np.errstate(all="raise"):
+        log = PacketLog(np.array([0.0, 1e-310, 1.0]), np.array([1e-310, 0.1, 0.1]))
+        assert log.ages(0.05).max() == 20
+        assert log.channel(0.05).delays[0] == 0 or log.left_out(0.05) == 1
+
+
+def test_stamp_that_was_printed_late_makes_no_packet_fresher(written):
+    at = ["0.1", "1.1", "2.9", "3.1", "4.1"]  # the third line was printed late
+    log = PacketLog.load(written("".join(f"[{t}] {ping([(n, 100)])}" for n, t in enumerate(at, 1))))
+    assert log.sent[2] <= 2.8
+    assert np.allclose(log.sent + log.delays, np.array(at, float) - 0.1)
 
 
 def test_equal_channels_of_a_record_stay_equal_and_read_only_when_copied():
