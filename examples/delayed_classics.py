@@ -2,7 +2,7 @@
 
     python examples/delayed_classics.py [--seeds 3] [--smoke] [--out delayed_classics.png]
 
-Takes about 3000 seconds on one core (with --smoke 40). PPO of stable-baselines3 (and SAC, where actions are
+Takes about 4500 seconds on one core (with --smoke 40). PPO of stable-baselines3 (and SAC, where actions are
 continuous) is trained and evaluated on no network, on one that delays observations by two steps, and on one that
 loses half of them in bursts, with and without the age of the newest observation and the pending actions beside it.
 Hyperparameters are those of rl-baselines3-zoo, but that all observations are normalized (ages and actions have other
@@ -90,7 +90,9 @@ def draw(found, out):
         axis.set_title(f"{panel[0]}, {panel[1]}", fontsize=10)
         axis.set_xlim(-0.5, len(NETWORKS) - 0.5)
     np.atleast_1d(axes)[0].set_ylabel("mean return")
-    np.atleast_1d(axes)[0].legend(fontsize=7, loc="lower left")
+    figure.legend(
+        *np.atleast_1d(axes)[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False
+    )
     figure.savefig(out, dpi=150)
 
 
