@@ -166,7 +166,7 @@ def _of_numbers(
         if (found := pattern.match(line)) is None:
             continue
         hosts.add(found.groupdict().get("host"))
-        number, known = int(found["number"]), np.nan
+        number = int(found["number"])
         delay = np.nan if found["time"] is None else _milliseconds(found["time"])
         now = sent = None
         if found["stamp"] is not None:
