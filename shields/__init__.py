@@ -2,7 +2,7 @@
 
 `synthesize` finds a robust control invariant ellipsoid with its gain for a plant, `verify` checks the resulting
 `Certificate` in exact arithmetic, and `SafetyShield`, `VectorSafetyShield`, `SafeLoop` and `SafetyFilter` use it to
-keep any agent inside the safe set.
+keep any agent inside the safe set. `shields.paper` has the published method as printed.
 """
 
 from importlib import import_module
@@ -71,7 +71,9 @@ _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names
 
 
 def __getattr__(name: str) -> Any:
-    """Returns a public name whose import takes long."""
+    """Returns a public name, or module, whose import takes long."""
     if name in _MODULE_OF:
         return getattr(import_module(f"shields.{_MODULE_OF[name]}"), name)
+    if name == "paper":
+        return import_module("shields.paper")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -453,9 +453,10 @@ def _columns(names: Sequence[str]) -> dict[str, _Column]:
 
 def _is_number(cell: str) -> bool:
     try:
-        return _number(cell) is None or True
+        _number(cell)
     except ValueError:
         return False
+    return True
 
 
 def _number(cell: str) -> Decimal | None:

@@ -1,4 +1,6 @@
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 
 import gymnasium as gym
@@ -62,6 +64,11 @@ def test_no_shield_takes_a_certificate_of_the_paper(paper):
         verify(paper, SMALL)
     with pytest.raises(ValueError, match=r"shields\.paper\.synthesize"):
         shields.synthesize(SMALL, "paper")
+
+
+def test_what_the_message_names_is_there_without_a_further_import():
+    program = "import shields; print(shields.paper.synthesize.__name__)"
+    assert subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
 
 
 @pytest.mark.slow
