@@ -107,7 +107,7 @@ def _arguments(
         raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
     if stored == "applied":
         own["replay_buffer_class"] = AppliedActionBuffer
-        own["replay_buffer_kwargs"] = {"limits": env.get_attr("plant")[0].u_max}
+        own["replay_buffer_kwargs"] = {"limits": env.get_attr("plant")[0].input_ends}
     if (noise_type := hyperparams.get("noise_type")) not in (None, "normal"):
         raise ValueError(f"noise_type cannot be {shown(noise_type)}")
     if (deviation := hyperparams.get("noise_std")) is not None:
@@ -177,19 +177,20 @@ APPLIED = "input_committed"
 class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
-    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits": plant.u_max}`;
+    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits": plant.input_ends}`;
     `SB3VecEnv` needs `info_keys=("input_committed",)`. `train` does so with the hyperparameter
     `stored_action="applied"`.
 
     Args:
         arguments: Those of `ReplayBuffer`.
-        limits: u_max, shape (m,), which actions are in units of.
+        limits: The ends of the inputs, shape (2, m), for which actions -1 and 1 stand.
         keywords: Those of `ReplayBuffer`.
     """
 
     def __init__(self, *arguments: Any, limits: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
-        self._limits = np.asarray(limits, dtype=np.float64)
+        low, high = np.asarray(limits, dtype=np.float64)
+        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
 
     def add(
         self,
@@ -207,5 +208,5 @@ class AppliedActionBuffer(ReplayBuffer):
         """
         if any(APPLIED not in info for info in infos):
             raise ValueError(f'infos have no "{APPLIED}": make SB3VecEnv(..., info_keys=("{APPLIED}",))')
-        applied = np.array([info[APPLIED] for info in infos]) / self._limits
+        applied = (np.array([info[APPLIED] for info in infos]) - self._middle) / self._half
         super().add(obs, next_obs, applied.reshape(action.shape).astype(action.dtype), reward, done, infos)

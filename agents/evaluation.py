@@ -68,7 +68,7 @@ def _played(
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
     single = inner.single if isinstance(inner, NCSVectorEnv) else ncs_env(inner.envs[0])
-    terminates, rows = single.terminate_on_violation, single.plant.box_rows
+    terminates, plant = single.terminate_on_violation, single.plant
     if terminates and isinstance(inner, NCSVectorEnv):
         # Episodes that end early are stepped on without being counted: the others' random numbers stay the same.
         envs = loop.vector(count, terminate_on_violation=False)
@@ -93,7 +93,7 @@ def _played(
         happened = {
             "steps": ~nothing,
             "violation_steps": info["cost"] > 0.0,
-            "estimate_violation_steps": np.abs(info["estimate"] @ rows.T).max(axis=1) > 1.0,
+            "estimate_violation_steps": plant.constraint_values(info["estimate"].T).max(axis=0) > 0.0,
             "interventions": info.get("shield_intervened", nothing).astype(np.bool_),
             "planned": info.get("shield_plan_length", nothing) > 0,
         }

@@ -83,7 +83,7 @@ def trained(env_id: str, algorithm: str, layer: SafeLayer | None, seed: int, ste
         return PPO("MlpPolicy" if layer is None else SafePPOPolicy, envs, **settings, **kwargs).learn(steps)
     kwargs = {"gamma": 0.9, "learning_rate": 1e-3, "learning_starts": 1000, "gradient_steps": 8, "device": "cpu"}
     if layer is not None:
-        kwargs |= {"replay_buffer_class": AppliedActionBuffer, "replay_buffer_kwargs": {"limits": plant.u_max}}
+        kwargs |= {"replay_buffer_class": AppliedActionBuffer, "replay_buffer_kwargs": {"limits": plant.input_ends}}
     policy = own | {"net_arch": [64, 64]}
     model = SAC("MlpPolicy" if layer is None else SafeSACPolicy, envs, seed=seed, policy_kwargs=policy, **kwargs)
     return model.learn(steps)

@@ -7,12 +7,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_setting, read_only, shown
+from ncs_gym.validation import FILLED_IN_LATER, ReadOnlyArrays, as_matrix, as_setting, as_vector, read_only, shown
 from shields.certificate_text import (
     contract_text,
     counted,
@@ -121,6 +121,29 @@ class Updates(ReadOnlyArrays):
         self._make_arrays_read_only()
 
 
+class Fallback(NamedTuple):
+    """The fallback input u = u_c + K (x_hat - x_c) of a certificate, K x_hat around the operating point.
+
+    Attributes:
+        gain: K, shape (m, n).
+        resting_state: x_c, shape (n,).
+        resting_input: u_c, shape (m,).
+    """
+
+    gain: np.ndarray
+    resting_state: np.ndarray
+    resting_input: np.ndarray
+
+    @property
+    def constant(self) -> np.ndarray:
+        """u_c - K x_c, shape (m,), which K x_hat is added to."""
+        return self.resting_input - self.gain @ self.resting_state
+
+    def with_gain(self, gain: np.ndarray) -> Fallback:
+        """Returns the input of another gain around the same point."""
+        return self._replace(gain=gain)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
@@ -134,13 +157,16 @@ class Certificate(ReadOnlyArrays):
 
     Attributes:
         L: Shape of the ellipsoid S = E(L), (n, n) [squares of the states' units].
-        K: Gain of the fallback input u = K x_hat, shape (m, n) [input per state].
+        K: Gain of the fallback input, shape (m, n) [input per state].
         proofs: One for each error set: under a channel contract for the ages 0..h of the newest sample, otherwise a
             single one.
         D: Shape of the disturbance set that the proofs assume, (n, n).
         rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32.
         updates: What a channel contract adds to the proofs; None without a contract.
         polytope: The polytope that a shield keeps in place of S; None without one.
+        resting_state: x_c of the fallback input u = u_c + K (x_hat - x_c), shape (n,), around which its sets are: an
+            equilibrium without estimation error and disturbance; zero, the plant's operating point, by default.
+        resting_input: u_c, shape (m,).
         between_samples: The plant's: the state is claimed to be in the box at all times if it is given, None claims it
             at the sampling instants.
         fingerprint: Fingerprint of the plant that the certificate belongs to.
@@ -154,6 +180,8 @@ class Certificate(ReadOnlyArrays):
     rounding: float
     updates: Updates | None = None
     polytope: Polytope | None = None
+    resting_state: np.ndarray = FILLED_IN_LATER
+    resting_input: np.ndarray = FILLED_IN_LATER
     between_samples: int | None = None
     fingerprint: str
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -168,6 +196,9 @@ class Certificate(ReadOnlyArrays):
             object.__setattr__(self, "K", as_matrix(self.K, (None, n), "K"))
             object.__setattr__(self, "D", as_matrix(self.D, (n, n), "D"))
             object.__setattr__(self, "rounding", float(_as_array(self.rounding, (), "rounding")))
+            for name, size in (("resting_state", n), ("resting_input", len(self.K))):
+                value = getattr(self, name)
+                object.__setattr__(self, name, np.zeros(size) if value is None else as_vector(value, size, name))
             self._check_error_sets(n)
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
@@ -194,6 +225,9 @@ class Certificate(ReadOnlyArrays):
             raise ValueError("either all of its proofs have multipliers of (I), or none has")
         if self.polytope is None and not self.keeps_ellipsoid:
             raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
+        around = self.resting_state if self.polytope is None else self.polytope.center
+        if len(around) == n and not np.array_equal(around, self.resting_state):
+            raise ValueError("its polytope must be around its resting state")
 
     @property
     def method(self) -> str:
@@ -205,6 +239,11 @@ class Certificate(ReadOnlyArrays):
         """The inverse of L, shape (n, n)."""
         inverse = np.linalg.inv(self.L)
         return read_only(0.5 * (inverse + inverse.T))
+
+    @property
+    def fallback(self) -> Fallback:
+        """The input that keeps the state in the safe set."""
+        return Fallback(self.K, self.resting_state, self.resting_input)
 
     @cached_property
     def ellipsoid(self) -> Ellipsoid:
@@ -287,7 +326,8 @@ class Certificate(ReadOnlyArrays):
         safe_set = ""
         if self.polytope is not None:
             inside = "inside it the ellipsoid" if self.keeps_ellipsoid else "inside it, not invariant, the ellipsoid"
-            safe_set = f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; {inside} "
+            kind = "|g x| <= 1" if self.polytope.is_symmetric else "low <= g x <= high"
+            safe_set = f"the polytope {kind} of {len(self.polytope.rows)} rows g; {inside} "
         widths = ", ".join(f"{width:.4g}" for width in np.sqrt(np.diag(self.L)))
         rows = [
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
@@ -295,11 +335,17 @@ class Certificate(ReadOnlyArrays):
             ("claim", f"in the safe box {claim}"),
             ("size", size_of(recorded)),
             ("polytope", missing_polytope_of(recorded) if self.polytope is None else ""),
-            ("fallback", "u = K x_hat"),
+            ("fallback", self._fallback_text()),
             ("contract", contract_text(self.contract)),
             *provenance_rows(recorded),
         ]
         return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
+
+    def _fallback_text(self) -> str:
+        if not (self.resting_state.any() or self.resting_input.any()):
+            return "u = K x_hat"
+        x_c, u_c = (", ".join(f"{each:.4g}" for each in point) for point in (self.resting_state, self.resting_input))
+        return f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
 
     def without_polytope(self) -> Certificate:
         """Returns the certificate of the ellipsoid alone.
@@ -370,6 +416,8 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         ages = {"contract": asdict(updates.contract), "sets": sets, **by_age}
     optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
     optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
+    if c.resting_state.any() or c.resting_input.any():
+        optional |= {"resting_state": c.resting_state.tolist(), "resting_input": c.resting_input.tolist()}
     return optional | {
         "L": c.L.tolist(),
         "K": c.K.tolist(),
@@ -396,9 +444,9 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     Sigma, ages = content["Sigma"], content["ages"]
     stated = Multipliers(**content["multipliers"])
     fields["rounding"] = stated.rounding
-    fields["between_samples"] = content.get("between_samples")
+    fields |= {name: content.get(name) for name in ("between_samples", "resting_state", "resting_input")}
     if content.get("polytope") is not None:
-        fields["polytope"] = polytope_of(content["polytope"])
+        fields["polytope"] = polytope_of(content["polytope"], fields["resting_state"])
     shares = [stated.state, stated.estimate, stated.disturbance]
     own = Sigma, stated.error, None if shares == [None] * 3 else shares, stated.inputs
     rows: list[tuple[Any, Any, Any, Any]] = [own]

@@ -10,7 +10,16 @@ import numpy as np
 from scipy.optimize import linprog
 
 from ncs_gym.plants.between_samples import MOST_POINTS
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, own_error_state, read_only, shown
+from ncs_gym.plants.limits import as_row_ends
+from ncs_gym.validation import (
+    FILLED_IN_LATER,
+    ReadOnlyArrays,
+    as_matrix,
+    as_vector,
+    own_error_state,
+    read_only,
+    shown,
+)
 from shields.errors import CertificateError
 
 # A polytope has at most so many rows, so that a decision and a verification stay fast; each stands for two faces.
@@ -21,46 +30,80 @@ MOST_MULTIPLIERS = (MOST_POINTS + 2) * MOST_ROWS
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Polytope(ReadOnlyArrays):
-    """The polytope P = {x : |g x| <= 1 for every row g} (docs/shield_proof.md, "Polytopes").
+    """The polytope P = {x : low <= G x <= high} around a point c (docs/shield_proof.md, "Polytopes").
 
     For every row g, and for every row of the gain K, there are numbers lambda_i that write what the closed loop makes
-    of it as a sum of rows, g (A+BK) = sum_i lambda_i g_i + r; what is left, r, is mere rounding. P is symmetric, so
-    that one row stands for two faces and a lambda_i may have either sign.
+    of it as a sum of rows, g (A+BK) = sum_i lambda_i g_i + r; what is left, r, is mere rounding. They bound g (A+BK) x
+    on P from above, others from below. Where P is symmetric these are the same, and one row stands for two faces.
 
     Attributes:
         rows: G, shape (r, n) [1 per unit of the state]; the first are the rows of the safe box.
+        low, high: Ends of the rows, shape (r,); -1 and 1 by default, infinite where there is none.
+        center: c, shape (n,), strictly inside: the resting point of the fallback input; zero by default.
         multipliers: Lambda, shape (r + m, r): of the rows of P without unit, then of the gain's in the inputs' units.
+        lower_multipliers: Those that bound from below, of the same shape; the same ones by default.
     """
 
     rows: np.ndarray
     multipliers: np.ndarray
+    low: np.ndarray = FILLED_IN_LATER
+    high: np.ndarray = FILLED_IN_LATER
+    center: np.ndarray = FILLED_IN_LATER
+    lower_multipliers: np.ndarray = FILLED_IN_LATER
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if the shapes do not fit, a number is not finite, or there are too many rows."""
+        """Raises CertificateError if shapes do not fit, numbers are not finite, rows are too many, or P has no inside.
+        """
         try:
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
             require_size(len(rows), len(multipliers))
+            ends = None if self.low is None and self.high is None else [self.low, self.high]
+            ends = as_row_ends(ends, len(rows), "the ends of the polytope", around_zero=False)
+            n = rows.shape[1]
+            center = np.zeros(n) if self.center is None else as_vector(self.center, n, "the center of the polytope")
+            lower = multipliers
+            if self.lower_multipliers is not None:
+                lower = as_matrix(self.lower_multipliers, multipliers.shape, "the lower multipliers of the polytope")
+            reached = rows @ center
+            if not ((ends[0] < reached) & (reached < ends[1])).all():
+                raise ValueError("the center of the polytope is not inside")
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        object.__setattr__(self, "rows", rows)
-        object.__setattr__(self, "multipliers", multipliers)
+        values = {"rows": rows, "multipliers": multipliers, "low": ends[0], "high": ends[1], "center": center}
+        for name, value in (values | {"lower_multipliers": lower}).items():
+            object.__setattr__(self, name, value)
         self._make_arrays_read_only()
 
     @cached_property
-    def low(self) -> np.ndarray:
-        """The lower ends of the rows, shape (r,): -1, since P is symmetric."""
-        return read_only(np.full(len(self.rows), -1.0))
-
-    @cached_property
-    def high(self) -> np.ndarray:
-        """The upper ends of the rows, shape (r,): 1."""
-        return read_only(np.ones(len(self.rows)))
+    def is_symmetric(self) -> bool:
+        """Whether |g x| <= 1 for all rows is what it says, proved by the same multipliers from above and below."""
+        same = np.array_equal(self.multipliers, self.lower_multipliers)
+        return bool((self.low == -1.0).all() and (self.high == 1.0).all() and not self.center.any() and same)
 
     @cached_property
     def F(self) -> np.ndarray:
-        """All faces: P = {x : F x <= 1}, shape (2 r, n); the rows, and then the negative ones."""
-        return read_only(np.concatenate([self.rows, -self.rows]))
+        """All faces: P = {x : F (x - c) <= 1}, shape (q, n); those of high ends, and then those of low ones."""
+        reached = self.rows @ self.center
+        above, below = np.isfinite(self.high), np.isfinite(self.low)
+        return read_only(
+            np.concatenate(
+                [
+                    self.rows[above] / (self.high - reached)[above, None],
+                    self.rows[below] / (self.low - reached)[below, None],
+                ]
+            )
+        )
+
+    @cached_property
+    def widths(self) -> np.ndarray:
+        """Bounds of |x_i - c_i| in P, shape (n,), as far as floats tell: infinite where rows with two ends give none."""
+        bounded = np.isfinite(self.low) & np.isfinite(self.high)
+        rows, reached = self.rows[bounded], self.rows[bounded] @ self.center
+        sizes = np.maximum(self.high[bounded] - reached, reached - self.low[bounded])
+        if not len(rows) or np.linalg.matrix_rank(rows / np.abs(rows).max(axis=0)) < self.dim:
+            return np.full(self.dim, np.inf)
+        return np.abs(np.linalg.pinv(rows / sizes[:, None])).sum(axis=1)
 
     @property
     def dim(self) -> int:
@@ -69,12 +112,12 @@ class Polytope(ReadOnlyArrays):
 
     @own_error_state
     def gauge(self, points: Any) -> Any:
-        """Returns max |g x| over the rows: 0 at the center, 1 on the boundary.
+        """Returns max f (x - c) over the faces f: 0 at the center, 1 on the boundary.
 
         Args:
             points: x, shape (n,), which gives a float, or (count, n), which gives shape (count,).
         """
-        gauges = np.abs(np.asarray(points, dtype=np.float64) @ self.rows.T).max(axis=-1)
+        gauges = ((np.asarray(points, dtype=np.float64) - self.center) @ self.F.T).max(axis=-1)
         return float(gauges) if gauges.ndim == 0 else gauges
 
     @own_error_state
@@ -87,15 +130,16 @@ class Polytope(ReadOnlyArrays):
             ValueError: If the polytope is unbounded in a direction.
         """
         units = 1.0 / np.abs(self.rows).max(axis=0)  # the solver drops small coefficients
-        rows, ones = self.F * units, np.ones(2 * len(self.rows))
-        found = []
-        for direction in np.atleast_2d(np.asarray(directions, dtype=np.float64)) * units:
+        rows, ones, found = self.F * units, np.ones(len(self.F)), []
+        given = np.atleast_2d(np.asarray(directions, dtype=np.float64))
+        for direction in given * units:
             size = float(np.abs(direction).max()) or 1.0
             solution = linprog(-direction / size, A_ub=rows, b_ub=ones, bounds=(None, None))
             if solution.status != 0:
                 raise ValueError(f"the polytope has no support in a direction: {solution.message}")
             found.append(-solution.fun * size)
-        return float(found[0]) if np.ndim(directions) == 1 else np.array(found)
+        reached = np.array(found) + given @ self.center
+        return float(reached[0]) if np.ndim(directions) == 1 else reached
 
     @own_error_state
     def outline(self, pair: tuple[int, int]) -> np.ndarray:
@@ -123,7 +167,7 @@ class Polytope(ReadOnlyArrays):
         """Returns points of the boundary in random directions, shape (count, n)."""
         scale = 1.0 / np.maximum(np.abs(self.rows).max(axis=0), np.finfo(float).tiny)
         directions = rng.standard_normal((count, self.dim)) * scale
-        return directions / self.gauge(directions)[:, None]
+        return self.center + directions / self.gauge(self.center + directions)[:, None]
 
 
 def require_size(rows: int, multipliers: int) -> None:
@@ -136,20 +180,42 @@ def require_size(rows: int, multipliers: int) -> None:
 
 
 def polytope_content(polytope: Polytope) -> dict[str, Any]:
-    """Returns the JSON values of a polytope; of the multipliers the pairs [number of the row, value] that count."""
-    multipliers = [[[int(i), float(row[i])] for i in np.flatnonzero(row)] for row in polytope.multipliers]
-    return {"rows": polytope.rows.tolist(), "multipliers": multipliers}
+    """Returns the JSON values of a polytope; of the multipliers the pairs [number of the row, value] that count.
+
+    The center is the certificate's resting state. What is as by default is left out; an end that is open is null.
+    """
+    content = {"rows": polytope.rows.tolist(), "multipliers": _pairs_of(polytope.multipliers)}
+    if polytope.is_symmetric:
+        return content
+    ends = {name: np.where(np.isfinite(each), each, None).tolist() for name, each in _ends_of(polytope).items()}
+    return content | ends | {"lower_multipliers": _pairs_of(polytope.lower_multipliers)}
 
 
-def polytope_of(content: Any) -> Polytope:
-    """Returns the polytope that JSON values hold.
+def _ends_of(polytope: Polytope) -> dict[str, np.ndarray]:
+    return {"low": polytope.low, "high": polytope.high}
+
+
+def _pairs_of(multipliers: np.ndarray) -> list[list[list[Any]]]:
+    return [[[int(i), float(row[i])] for i in np.flatnonzero(row)] for row in multipliers]
+
+
+def polytope_of(content: Any, center: Any) -> Polytope:
+    """Returns the polytope that JSON values hold, around a point, shape (n,).
 
     Raises:
         KeyError, TypeError, ValueError: If an entry is missing or of a wrong kind.
     """
-    rows, pairs = as_matrix(content["rows"], (None, None), "the rows of the polytope"), content["multipliers"]
-    require_size(len(rows), len(pairs))
-    multipliers = np.zeros((len(pairs), len(rows)))
+    rows = as_matrix(content["rows"], (None, None), "the rows of the polytope")
+    fields = {"multipliers": _multipliers_of(content["multipliers"], len(rows))}
+    if "low" in content:
+        fields |= {"low": content["low"], "high": content["high"]}
+        fields["lower_multipliers"] = _multipliers_of(content["lower_multipliers"], len(rows))
+    return Polytope(rows=rows, center=center, **fields)
+
+
+def _multipliers_of(pairs: Any, rows: int) -> np.ndarray:
+    require_size(rows, len(pairs))
+    multipliers = np.zeros((len(pairs), rows))
     for row, entries in zip(multipliers, pairs, strict=True):
         if len({index for index, _ in entries}) < len(entries):
             raise ValueError("a multiplier of the polytope is given twice")
@@ -157,4 +223,4 @@ def polytope_of(content: Any) -> Polytope:
             if type(index) is not int or not 0 <= index < len(row) or type(value) is not float or value == 0.0:
                 raise ValueError(f"a multiplier of the polytope must be [number of a row, value], got {shown(entries)}")
             row[index] = value
-    return Polytope(rows=rows, multipliers=multipliers)
+    return multipliers

@@ -99,14 +99,15 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, actions: torch.Tensor, shield: SafetyFilter, estimates: Any, shapes: Any) -> torch.Tensor:
-        limits, numbers = shield.plant.u_max, _numbers(actions, "actions")
-        decided = shield.decide_many(estimates, shapes, limits * numbers)
-        safe = np.where(decided.intervened[:, None], decided.input / limits, numbers)
-        jacobians = decided.passed[:, None, None] * np.eye(len(limits))
+        middle, half, numbers = shield.plant.input_middle, shield.plant.input_half, _numbers(actions, "actions")
+        proposals = half * numbers + middle
+        decided = shield.decide_many(estimates, shapes, proposals)
+        safe = np.where(decided.intervened[:, None], (decided.input - middle) / half, numbers)
+        jacobians = decided.passed[:, None, None] * np.eye(len(half))
         moved = np.flatnonzero(decided.passed & decided.intervened)
         if moved.size and ctx.needs_input_grad[0]:
             chosen = shapes if shapes.ndim == 2 else shapes[moved]
-            jacobians[moved] = projection_jacobians(shield, estimates[moved], chosen, limits * numbers[moved])
+            jacobians[moved] = projection_jacobians(shield, estimates[moved], chosen, proposals[moved])
         ctx.save_for_backward(torch.as_tensor(jacobians, dtype=actions.dtype, device=actions.device))
         return torch.as_tensor(safe, dtype=actions.dtype, device=actions.device)
 
@@ -135,9 +136,9 @@ def projection_jacobians(
         error_shapes: Shape (N, n, n) or (n, n).
         proposals: Shape (N, m) [physical units].
     """
-    limits, count = shield.plant.u_max, len(estimates)
-    found = np.zeros((count, len(limits), len(limits)))
-    if len(limits) == 1:  # it is moved to an end of the interval
+    plant, count, m = shield.plant, len(estimates), shield.plant.m
+    found = np.zeros((count, m, m))
+    if m == 1:  # it is moved to an end of the interval
         return found
     errors = shield.errors_of_many(np.broadcast_to(error_shapes, (count, *error_shapes.shape[-2:])))
     sets = shield.test.reachable(np.array(estimates.T, order="C"), errors)
@@ -147,8 +148,9 @@ def projection_jacobians(
     offset = test.state_rows @ sets.estimates
     effect, row_limits = test.input_rows, sets.row_limits - sets.rounding - shield.projection_margin
     for e in range(count):
-        u, held = closest[:, e], np.abs(closest[:, e]) >= (1.0 - ATTAINED) * limits
-        active, ball = np.eye(len(limits))[held], None
+        u = closest[:, e]
+        held = np.abs(u - plant.input_middle) >= (1.0 - ATTAINED) * plant.input_half
+        active, ball = np.eye(m)[held], None
         reached, weighting = offset[:, e] + effect @ u, sets.weighting[..., e]
         center, radius = weighting @ reached[:cone], float(sets.radius[e]) - shield.projection_margin
         if cone and np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
@@ -157,11 +159,11 @@ def projection_jacobians(
         taken = np.abs(reached[cone:] - test.middle)
         attained = taken >= row_limits[:, e] - ATTAINED * np.maximum(row_limits[:, e], 1e-3)
         active = np.vstack([active, effect[cone:][attained]])
-        free = np.eye(len(limits))
+        free = np.eye(m)
         if len(active):
             free = null_space(active / np.linalg.norm(active, axis=1, keepdims=True), rcond=1e-9)
         found[e] = _jacobian(free, ball, wanted[:, e] - u)
-    return found * limits / limits[:, None]  # d(u / limits) / d(w / limits)
+    return found * plant.input_half / plant.input_half[:, None]  # of actions, in units of half the range
 
 
 def _jacobian(free: np.ndarray, ball: tuple[np.ndarray, np.ndarray] | None, moved: np.ndarray) -> np.ndarray:

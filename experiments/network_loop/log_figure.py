@@ -29,7 +29,7 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
             raise ValueError(f"the logs in {folder} are of another plant, without {', '.join(missing)}: give its --env")
     logs = {name: log[log["episode"] == log["episode"].iloc[-1]] for name, log in logs.items()}
     names, units = [*plant.state_names, *plant.input_names], [*plant.state_units, *plant.input_units]
-    widths = [*plant.half_widths, *plant.u_max]
+    widths = [*plant.half_widths, *plant.largest_input]
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure(
             (11.0, 1.0 + 1.4 * len(names)), f"{folder.name}: the dashed lines are the box and the input limits."

@@ -192,7 +192,7 @@ async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
     simulation = PlantSimulation(plant, disturbance, False, process=env.process)
     wire, clock = Wire(plant, loop.protocol.input_delay, loop.key), StepClock(loop.dt(env))
     sensor = SensorNode(wire, await UdpTransport.open(peer=loop.sensor), clock)
-    actuator = Actuator(loop.protocol.input_delay, plant.m, plant.u_max)
+    actuator = Actuator(loop.protocol.input_delay, plant.m, plant.largest_input)
     node = ActuatorNode(wire, await UdpTransport.open(peer=loop.actuator), clock, actuator)
     names = [*(f"x_{name}" for name in plant.state_names), *(f"u_{name}" for name in plant.input_names)]
     log = StepLog(
@@ -320,7 +320,7 @@ def controller_named(
         def push(estimate: np.ndarray) -> np.ndarray:
             nonlocal count
             count += 1
-            return plant.u_max * (1.0 if (count - 1) // PUSH % 2 == 0 else -1.0)
+            return plant.input_ends[1 - (count - 1) // PUSH % 2].copy()
 
         return push
     policy = policy_by_name(name, env_id, env, seed, vec_normalize)

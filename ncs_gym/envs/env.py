@@ -56,7 +56,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     """A plant behind an imperfect network; the controller sees an estimate of the state.
 
     ## Action space
-    `Box(-1, 1, (m,), float32)`: the input in units of its limit, u = u_max * action [physical units].
+    `Box(-1, 1, (m,), float32)`: -1 is the low end of an input's limits, 1 the high one, 0 the middle.
     Finite actions outside the box are clipped.
 
     ## Observation space
@@ -95,7 +95,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
     | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
-    | `constraint_values` | `(k,)` | - | abs(c_j x) - 1 for each of the k rows of the safe box; positive is violated |
+    | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in units of half its range; positive is violated |
     | `worst_constraint_values` | `(k,)` | - | the largest since the last step, also between samples if they count |
     | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
@@ -292,7 +292,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
 
     @own_error_state
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Applies u = u_max * action for one step.
+        """Applies the input of an action for one step.
 
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.

@@ -52,11 +52,13 @@ def loop_contracts(
 def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:
     """Returns the ellipsoid that states start in, by default {x : |C x|^2 <= 0.1^2}; W bounds what C leaves free.
 
+    C are the rows of the largest symmetric box inside the plant's.
+
     Raises:
         ValueError: If it is none, or of another dimension than the plant.
     """
     if initial_set is None:
-        return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.weight))
+        return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.symmetric.weight))
     if expect(initial_set, Ellipsoid, "initial_set").dim != plant.n:
         raise ValueError(f"initial_set must have dimension {plant.n}, got {initial_set.dim}")
     return initial_set

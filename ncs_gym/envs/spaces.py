@@ -57,7 +57,7 @@ def observation_space(
     for _ in range(horizon):
         powers.append(powers[-1] @ plant.A)
     unforced = np.array(powers)
-    added = np.abs(unforced[:-1] @ plant.B) @ plant.u_max + plant.disturbance.support(unforced[:-1])
+    added = np.abs(unforced[:-1] @ plant.B) @ plant.largest_input + plant.disturbance.support(unforced[:-1])
     reach = np.vstack([np.zeros(plant.n), added.cumsum(axis=0)]) + initial_set.support(unforced)
     ages = error_set.ages
     shapes = error_set.Sigma[None] if ages is None else ages.shapes
@@ -66,7 +66,7 @@ def observation_space(
     if plant.spectral_radius >= 1.0:
         known = np.maximum(plant.half_widths, initial_set.support(np.eye(plant.n)))
         for _ in range(input_delay + 1):
-            pushed = np.abs(plant.B) @ plant.u_max + plant.disturbance.support(np.eye(plant.n))
+            pushed = np.abs(plant.B) @ plant.largest_input + plant.disturbance.support(np.eye(plant.n))
             known = np.maximum(known, np.abs(plant.A) @ known + pushed)
         estimate = np.minimum(estimate, known + errors)
     known = {"age": np.array([float(horizon)]), "error": errors}
@@ -98,19 +98,20 @@ def read_observed(observe: Any) -> tuple[str, ...]:
     return names
 
 
-def nearest_action(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
+def nearest_action(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
     """Returns the float32 actions whose inputs are nearest to some, clipped to [-1, 1].
 
     Args:
-        inputs: Of any shape [physical units].
-        limits: u_max, of a shape that goes with it.
+        inputs: Shape (..., m) [physical units].
+        plant: Gives the limits: -1 stands for the low end of an input, 1 for the high one.
     """
-    return np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
+    actions = (inputs - plant.input_middle) / plant.input_half
+    return np.minimum(np.maximum(actions, -1.0), 1.0).astype(np.float32)
 
 
-def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
+def expressible(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
     """Returns the inputs of the nearest float32 actions; see `nearest_action`."""
-    return limits * nearest_action(inputs, limits)
+    return plant.input_half * nearest_action(inputs, plant) + plant.input_middle
 
 
 class Observer:
@@ -174,7 +175,7 @@ def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray
 
     Returns:
         A copy of the action, float32 if it is an array of that and float64 otherwise, and the float64 input
-        u = u_max * clip(action, -1, 1) that it stands for, shape (m,) each.
+        that it stands for, shape (m,) each: -1 the low end of the limits, 1 the high one, clipped to these.
 
     Raises:
         ValueError: If the action is not finite or does not have shape (m,).
@@ -184,9 +185,10 @@ def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray
     if numbers is not None and numbers.shape == (plant.m,):
         values = numbers.tolist()
         if all([-1.0 <= value <= 1.0 for value in values]):  # the usual case, in half the time
-            return numbers, plant.u_max * numbers
+            return numbers, plant.input_half * numbers + plant.input_middle
         if all(map(isfinite, values)):
-            return numbers, plant.u_max * np.array([min(max(value, -1.0), 1.0) for value in values])
+            clipped = np.array([min(max(value, -1.0), 1.0) for value in values])
+            return numbers, plant.input_half * clipped + plant.input_middle
     raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
 
 
@@ -200,8 +202,9 @@ def read_actions(plant: LinearPlant, actions: Any, count: int) -> tuple[np.ndarr
     numbers = actions.copy() if is_float else as_numbers(actions)
     if numbers is not None and numbers.shape == (count, plant.m):
         farthest = np.abs(numbers).max()
+        half, middle = plant.input_half[:, None], plant.input_middle[:, None]
         if farthest <= 1.0:  # the usual case
-            return numbers, plant.u_max[:, None] * numbers.T
+            return numbers, half * numbers.T + middle
         if np.isfinite(farthest):
-            return numbers, plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0)
+            return numbers, half * np.minimum(np.maximum(numbers.T, -1.0), 1.0) + middle
     raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")

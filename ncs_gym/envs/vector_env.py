@@ -210,7 +210,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
 
     @own_error_state
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Applies u = u_max * action, actions of shape (N, m), for one step of every environment.
+        """Applies the inputs of actions of shape (N, m), for one step of every environment.
 
         Raises:
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.

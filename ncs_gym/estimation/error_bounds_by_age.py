@@ -184,11 +184,11 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
 def _cost(plant: LinearPlant) -> np.ndarray:
     """Returns W, shape (n, n): the size of an error in the box, and that of a gain's answer to it."""
     if plant.error_gain is not None:
-        K = plant.error_gain / plant.u_max[:, None]
+        K = plant.error_gain / plant.input_half[:, None]
         return plant.weight + NAMED_ANSWER * K.T @ K
     inverse = np.linalg.cholesky(plant.weight).T
     T = np.linalg.inv(inverse)
-    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.u_max, EFFORT, DECAY)
+    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.input_half, EFFORT, DECAY)
     if K is None:
         return plant.weight
     K = exact.rounded(K @ inverse, REGULATOR_DIGITS)

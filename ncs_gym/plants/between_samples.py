@@ -28,8 +28,8 @@ class GridRows(NamedTuple):
     Attributes:
         state: c A_tau, shape (N, k, n); those of i = 0 are the rows themselves.
         input: c B_tau, shape (N, k, m).
-        remainder: eta, shape (k,): while x is in the box and u within its limits, |c (A_tau x + B_tau u)| is nowhere
-            larger than at the two grid points around tau by more than this, the rounding of the rows included.
+        remainder: eta, shape (k,): while x is in the box and u within its limits, c (A_tau x + B_tau u) is nowhere
+            beyond its values at the two grid points around tau by more than this, the rounding of the rows included.
     """
 
     state: np.ndarray
@@ -43,17 +43,25 @@ def generator(model: np.ndarray) -> np.ndarray:
     return np.concatenate([model, np.zeros((size - n, size))])
 
 
-def widest(box_rows: np.ndarray) -> np.ndarray:
-    """Returns bounds of |x_i| in the safe box, shape (n,): x = (C'C)^-1 C' (C x), and no entry of C x exceeds 1.
+def widest(box: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Returns bounds of |x_i| in the safe box, shape (n,): x = (C'C)^-1 C' (C x) for the rows C that have two ends.
+
+    Args:
+        box: All rows, shape (k, n).
+        ends: Their low and high ends, shape (2, k).
 
     Raises:
         ZeroDivisionError: If the box does not bound every state.
     """
-    gram = exact.product(box_rows.T, box_rows)
-    return np.abs(exact.product(exact.inverse(gram), box_rows.T)).sum(axis=1)
+    bounded = np.isfinite(ends).all(axis=0)
+    rows, sizes = box[bounded], np.abs(ends[:, bounded]).max(axis=0)
+    gram = exact.product(rows.T, rows)
+    return (np.abs(exact.product(exact.inverse(gram), rows.T)) * sizes).sum(axis=1)
 
 
-def grid_rows(model: np.ndarray, box_rows: np.ndarray, u_max: np.ndarray, dt: float, points: int) -> GridRows:
+def grid_rows(
+    model: np.ndarray, box: tuple[np.ndarray, np.ndarray], largest_input: np.ndarray, dt: float, points: int
+) -> GridRows:
     """Returns the rows on the grid; every number is the same on every machine.
 
     Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
@@ -62,17 +70,17 @@ def grid_rows(model: np.ndarray, box_rows: np.ndarray, u_max: np.ndarray, dt: fl
 
     Args:
         model: [Ac, Bc], shape (n, n + m).
-        box_rows: c, shape (k, n).
-        u_max: Input limits, shape (m,).
+        box: c, shape (k, n), and its ends, shape (2, k).
+        largest_input: Largest |u_i| within the limits, shape (m,).
         dt: Duration of a step [s].
         points: N.
 
     Raises:
         ZeroDivisionError: If the box does not bound every state.
     """
-    G, (k, n), h = generator(model), box_rows.shape, dt / points
-    W = np.concatenate([widest(box_rows), u_max])
-    rows = np.concatenate([box_rows, np.zeros((k, len(u_max)))], axis=1)
+    G, (k, n), h = generator(model), box[0].shape, dt / points
+    W = np.concatenate([widest(*box), largest_input])
+    rows = np.concatenate([box[0], np.zeros((k, len(largest_input)))], axis=1)
     onward = [rows] + [exact.product(rows, exact.exponential(G, dt * i / points)) for i in range(1, points)]
     bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
     sizes = [exact.product(np.abs(each), W) for each in onward]
@@ -104,19 +112,20 @@ def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float)
 
 
 class GridValues:
-    """The constraint values |c x| - 1 at the grid points within a step of a simulation, given its two ends.
+    """The constraint values at the grid points within a step of a simulation, given its two ends.
 
     What a disturbance did to the step, d = x+ - A x - B u, has come in proportion to the time: d_tau = (tau / dt) d,
     which lies in E(D) as d does. So c x(tau_i) is a sum of products with x, u and x+.
 
     Args:
         rows: Of the plant.
-        box_rows: c, shape (k, n).
+        box: c, shape (k, n), and its ends, shape (2, k).
         A, B: Of the plant.
     """
 
-    def __init__(self, rows: GridRows, box_rows: np.ndarray, A: np.ndarray, B: np.ndarray) -> None:
+    def __init__(self, rows: GridRows, box: tuple[np.ndarray, np.ndarray], A: np.ndarray, B: np.ndarray) -> None:
         points, k, _ = rows.state.shape
+        box_rows, self._ends = box
         shares = (np.arange(1, points) / points)[:, None, None]
         moved = rows.state[1:] - shares * (box_rows @ A)
         pushed = rows.input[1:] - shares * (box_rows @ B)
@@ -130,7 +139,9 @@ class GridValues:
             state: x, shape (n,) or (n, N).
             u: Applied input, shape (m,) or (m, N).
             x_next: x+, of the shape of x.
-            values: |c x+| - 1, shape (k,) or (k, N).
+            values: Those of x+, shape (k,) or (k, N).
         """
-        sizes = np.abs(self._joint.dot(np.concatenate([state, u, x_next])))
-        return np.maximum(sizes.reshape(*self._shape, *values.shape[1:]).max(axis=0, initial=0.0) - 1.0, values)
+        reached = self._joint.dot(np.concatenate([state, u, x_next])).reshape(*self._shape, *values.shape[1:])
+        low, high = self._ends if values.ndim == 1 else self._ends[:, :, None]
+        beyond = np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0))
+        return np.maximum(beyond, values)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_numbers, as_setting, as_vector, shown
 
+# Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
+NEARLY_SYMMETRIC = 1e-12
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
 EQUILIBRIUM_PRECISION = 1e-12
 
@@ -28,7 +31,7 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
     if numbers.ndim == 2 and _reads_as_two_sides(value, numbers, n):
         raise ValueError(
             "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: if these "
-            "are limits, give their half-widths or, where they are not symmetric, LinearPlant.around(state_limits="
+            "are limits, give their half-widths or, where they are not symmetric, LinearPlant(state_limits="
             "(low, high), ...); if these are rows, no two of them the same but for their signs, give them as an array, "
             f"got {shown(value)}"
         )
@@ -61,25 +64,6 @@ def _reads_as_two_sides(value: Any, rows: np.ndarray, n: int) -> bool:
     return any(bool((low < high).all()) and (not is_computed or np.array_equal(low, -high)) for low, high in sides)
 
 
-def as_input_limits(value: Any, size: int) -> np.ndarray:
-    """Returns input limits as a positive finite array of shape (size,).
-
-    Raises:
-        ValueError: If it is anything else.
-    """
-    limits = as_setting(value)
-    if (
-        limits is None
-        or limits.shape not in ((), (size,))
-        or not ((limits >= SMALLEST_NUMBER) & (limits < LARGEST_NUMBER)).all()
-    ):
-        raise ValueError(
-            f"u_max must be a positive number or shape ({size},), got {shown(value)}; limits that are not symmetric "
-            "are given by LinearPlant.around(input_limits=(low, high), ...)"
-        )
-    return np.broadcast_to(limits, (size,)).copy()
-
-
 def as_operating_point(value: Any, size: int, name: str) -> np.ndarray:
     """Returns the state or the input that deviations are counted from, shape (size,); None stands for zero.
 
@@ -99,28 +83,154 @@ def as_point(value: Any, size: int, name: str) -> np.ndarray:
     return as_vector([value] if size == 1 and numbers is not None and numbers.ndim == 0 else value, size, name)
 
 
-def _symmetric_limits(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
-    """Returns the half-widths of the largest box around a point within limits, shape (size,); infinite where free.
+def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the low and the high ends of limits, shape (size,) each; infinite where there is none.
 
     Args:
         limits: Pair (low, high), each a number or shape (size,), possibly infinite.
-        center: Shape (size,).
+        size: Number of limited quantities.
         name: What the error message calls the limits.
+
+    Raises:
+        ValueError: If it is no such pair, or a low end is not below the high one.
     """
-    sides = [as_setting(side) for side in limits] if isinstance(limits, (tuple, list)) and len(limits) == 2 else []
-    for side in sides:
-        if side is None or side.shape not in ((), center.shape) or np.isnan(side).any():
-            sides = []
-    if not sides:
-        raise ValueError(
-            f"{name} must be a pair (low, high), each a number or shape {center.shape}, got {shown(limits)}"
-        )
-    low, high = (np.broadcast_to(np.asarray(side), center.shape) for side in sides)
+    ends = [as_setting(side) for side in limits] if isinstance(limits, (tuple, list, np.ndarray)) else []
+    if len(ends) != 2 or any(side is None or side.shape not in ((), (size,)) or np.isnan(side).any() for side in ends):
+        raise ValueError(f"{name} must be a pair (low, high), each a number or shape ({size},), got {shown(limits)}")
+    low, high = (np.broadcast_to(np.asarray(side), (size,)).copy() for side in ends)
+    if not (low < high).all():
+        raise ValueError(f"{name} must be (low, high) with low < high everywhere, got {shown(limits)}")
+    return low, high
+
+
+def _from_center(limits: Any, center: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of limits as distances from a point between them, shape (size,) each; infinite where free.
+
+    Raises:
+        ValueError: If they are no limits, or the point is not strictly between them, by more than rounding.
+    """
+    low, high = sides(limits, len(center), name)
     if not ((low < center) & (center < high)).all():
         raise ValueError(
             f"{name} must have the operating point {shown(center.tolist())} strictly between them, got {shown(limits)}"
         )
-    return np.minimum(high - center, center - low)
+    low, high = low - center, high - center
+    nearest, finite = np.minimum(-low, high), np.isfinite(low) & np.isfinite(high)
+    nearly = finite & (np.abs(low + high) <= NEARLY_SYMMETRIC * nearest)
+    low, high = np.where(nearly, -nearest, low), np.where(nearly, nearest, high)
+    size = np.where(np.isfinite([low, high]), np.abs([low, high]), 1.0)
+    if not ((size >= SMALLEST_NUMBER) & (size < LARGEST_NUMBER)).all():
+        raise ValueError(f"{name} must be finite numbers of usual size, or infinite, got {shown(limits)}")
+    return low, high
+
+
+class Rows(NamedTuple):
+    """Limits low <= c_j x <= high, with rows in units of half their range.
+
+    Attributes:
+        rows: c, shape (k, n): half the range of a row is 1; where an end is infinite, the other one is -1 or 1.
+        low, high: Their ends, shape (k,); infinite where there is none.
+    """
+
+    rows: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def _in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Rows:
+    """Returns those of rows, (k, n), with ends in their own units that have any finite end."""
+    limited = np.isfinite(low) | np.isfinite(high)
+    rows, low, high = rows[limited], low[limited], high[limited]
+    half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.minimum(-low, high))
+    symmetric = -low == high
+    low, high = np.where(symmetric, -1.0, low / half), np.where(symmetric, 1.0, high / half)
+    return Rows((1.0 / half)[:, None] * rows, np.where(low < -1e300, -np.inf, low), np.where(high > 1e300, np.inf, high))
+
+
+def _state_rows(limits: Any, center: np.ndarray) -> Rows:
+    return _in_units_of_range(np.eye(len(center)), *_from_center(limits, center, "state_limits"))
+
+
+def _output_rows(outputs: Any, center: np.ndarray) -> Rows:
+    """Returns the rows of output_limits, a list of (row, low, high) with absolute ends."""
+    form = f"output_limits must be a list of (row, low, high), each row of shape ({len(center)},)"
+    if not isinstance(outputs, (list, tuple)) or not all(
+        isinstance(each, (list, tuple)) and len(each) == 3 for each in outputs
+    ):
+        raise ValueError(f"{form}, got {shown(outputs)}")
+    found = []
+    for row, low, high in outputs:
+        row = as_vector(row, len(center), "a row of output_limits")
+        if np.abs(row).max() < SMALLEST_NUMBER:
+            raise ValueError(f"every row of output_limits must limit something, got {shown(row.tolist())}")
+        ends = _from_center((low, high), np.array([row @ center]), "the ends in output_limits")
+        found.append(_in_units_of_range(row[None], *ends))
+    return _joined(found)
+
+
+def _joined(parts: Sequence[Rows]) -> Rows:
+    return Rows(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def as_row_ends(value: Any, rows: int, name: str = "box_ends", *, around_zero: bool = True) -> np.ndarray:
+    """Returns the low and the high ends of rows, shape (2, rows); -1 and 1 for None.
+
+    Args:
+        value: A pair, in lists of which None stands for an infinite end, as in files; or None.
+        rows: Their number.
+        name: What the error message calls them.
+        around_zero: Whether zero has to be between them.
+
+    Raises:
+        ValueError: If they are no such ends, or a row has none.
+    """
+    if value is None:
+        return np.array([[-1.0], [1.0]]) * np.ones(rows)
+    if isinstance(value, list) and len(value) == 2:
+        value = [_with_infinity(side, sign) for side, sign in zip(value, (-np.inf, np.inf), strict=True)]
+    low, high = sides(value, rows, name)
+    if around_zero and not ((low < 0.0) & (high > 0.0)).all():
+        raise ValueError(f"{name} must have 0 between them, got {shown(value)}")
+    if not (np.isfinite(low) | np.isfinite(high)).all():
+        raise ValueError(f"one of {name} must be finite for each row, got {shown(value)}")
+    return np.stack([low, high])
+
+
+def _with_infinity(ends: Any, infinity: float) -> Any:
+    """Returns ends that may be a file's, in which None stands for an infinite one."""
+    return [infinity if each is None else each for each in ends] if isinstance(ends, list) else ends
+
+
+def as_input_limits(value: Any, size: int) -> np.ndarray:
+    """Returns u_max as a positive finite array of shape (size,).
+
+    Raises:
+        ValueError: If it is anything else.
+    """
+    limits = as_setting(value)
+    if (
+        limits is None
+        or limits.shape not in ((), (size,))
+        or not ((limits >= SMALLEST_NUMBER) & (limits < LARGEST_NUMBER)).all()
+    ):
+        raise ValueError(
+            f"u_max must be a positive number or shape ({size},), got {shown(value)}; limits that are not symmetric "
+            "are given by LinearPlant(input_limits=(low, high), ...)"
+        )
+    return np.broadcast_to(limits, (size,)).copy()
+
+
+def as_input_ends(value: Any, size: int) -> np.ndarray:
+    """Returns the limits of inputs in deviations, shape (2, size): low ones below 0, high ones above, all finite.
+
+    Raises:
+        ValueError: If they are no such pair.
+    """
+    low, high = sides(value, size, "input_ends")
+    sizes = np.abs([low, high])
+    if not ((low < 0.0) & (high > 0.0) & (sizes >= SMALLEST_NUMBER) & (sizes < LARGEST_NUMBER)).all():
+        raise ValueError(f"input_ends must be finite, below and above 0, got {shown(value)}")
+    return np.stack([low, high])
 
 
 def _require_equilibrium(
@@ -149,33 +259,59 @@ def _require_equilibrium(
     )
 
 
-def arguments_around(
-    A: Any, B: Any, point: tuple[Any, Any], limits: tuple[Any, Any], settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Returns the arguments of `LinearPlant` of `LinearPlant.around`.
+def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Returns the fields of `LinearPlant` for the arguments of its constructor: limits become rows with two ends.
+
+    What is wrong with other arguments is left to the plant, which says it first.
 
     Raises:
-        ValueError: If the point is not between the limits, or no equilibrium of a model with `offset`, or an argument
-            does not fit.
+        TypeError: If no limits are given.
+        ValueError: If limits are wrong or given twice, or the operating point is no equilibrium of a model with
+            `offset`.
     """
-    twice = sorted({"box", "u_max"} & set(settings))
-    if twice:
-        raise ValueError(f"{' and '.join(twice)} follow from state_limits and input_limits: give these alone")
-    A = as_matrix(A, (None, None), "A")
-    A = as_matrix(A, (len(A), len(A)), "A")
-    B = as_matrix(B, (len(A), None), "B")
-    state = as_operating_point(point[0], len(A), "operating_state")
-    applied = as_operating_point(point[1], B.shape[1], "operating_input")
-    rest = {name: value for name, value in settings.items() if name != "offset"}
-    if (offset := settings.get("offset")) is not None:
-        _require_equilibrium(A, B, as_vector(offset, len(A), "offset"), state, applied)
-    box = _symmetric_limits(limits[0], state, "state_limits")
-    u_max = _symmetric_limits(limits[1], applied, "input_limits")
-    return rest | {
-        "A": A,
-        "B": B,
-        "box": box,
-        "u_max": u_max,
-        "operating_state": state,
-        "operating_input": applied,
-    }
+    missing = [names for names in (("box", "state_limits", "output_limits"), ("u_max", "input_limits", "input_ends"))
+               if not any(arguments.get(name) is not None for name in names)]  # fmt: skip
+    if missing:
+        raise TypeError(f"LinearPlant needs limits: give {', and '.join(' or '.join(names[:2]) for names in missing)}")
+    fields = dict(arguments)
+    published = {name: fields.pop(name, None) for name in ("u_max", "state_limits", "input_limits", "output_limits", "offset")}
+    A, B = as_setting(fields.get("A")), as_setting(fields.get("B"))
+    if A is None or B is None or A.ndim != 2 or B.ndim != 2 or len(A) != A.shape[1] or len(B) != len(A) or not B.size:
+        return fields | {"box": 1.0, "input_ends": (-1.0, 1.0)}  # A or B is wrong
+    (n, m), limits = B.shape, published
+    state = as_operating_point(fields.get("operating_state"), n, "operating_state")
+    applied = as_operating_point(fields.get("operating_input"), m, "operating_input")
+    if limits["offset"] is not None:
+        _require_equilibrium(A, B, as_vector(limits["offset"], n, "offset"), state, applied)
+    if limits["u_max"] is not None:
+        if limits["input_limits"] is not None:
+            raise ValueError("u_max follows from input_limits: give these alone")
+        u_max = as_input_limits(limits["u_max"], m)
+        fields["input_ends"] = np.stack([-u_max, u_max])
+    elif limits["input_limits"] is not None:
+        ends = _from_center(limits["input_limits"], applied, "input_limits")
+        if not np.isfinite(ends).all():
+            raise ValueError(
+                "input_limits must be finite, since actions from -1 to 1 stand for inputs from the low to the high "
+                f"end, got {shown(limits['input_limits'])}"
+            )
+        fields["input_ends"] = np.stack(ends)
+    ends = as_setting(fields.get("box_ends"))
+    if ends is not None and (np.abs(ends) == 1.0).all():
+        del fields["box_ends"]  # symmetric ones need not be told: another box may have another number of rows
+    given = []
+    if limits["state_limits"] is not None:
+        if fields.get("box") is not None:
+            raise ValueError("box follows from state_limits: give these alone")
+        given.append(_state_rows(limits["state_limits"], state))
+    if limits["output_limits"] is not None:
+        if fields.get("box") is not None:
+            rows = as_box_rows(fields["box"], n)
+            given.append(Rows(rows, *as_row_ends(fields.get("box_ends"), len(rows))))
+        given.append(_output_rows(limits["output_limits"], state))
+    if given:
+        rows = _joined(given)
+        if not len(rows.rows):
+            raise ValueError("state_limits and output_limits are all infinite: give at least one finite limit of a state")
+        fields |= {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
+    return fields

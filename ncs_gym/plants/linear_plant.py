@@ -89,42 +89,59 @@ class NoNoiseWarning(UserWarning):
 Kind = TypeVar("Kind", bound=type)
 
 
-def refuses_output_matrix_as_box(kind: Kind) -> Kind:
-    """Makes a constructor say what to give for C=, which is limits to some people and an output matrix to others."""
+def with_limits_as_published(kind: Kind) -> Kind:
+    """Makes a constructor take limits as they are published, and say what to give for C=.
+
+    C= is limits to some people, and an output matrix to others.
+    """
     constructor: Any = kind
     construct: Callable[..., None] = constructor.__init__
 
     @functools.wraps(construct)
-    def __init__(self: Any, **settings: Any) -> None:
-        if "C" in settings:
+    @own_error_state
+    def __init__(self: Any, **arguments: Any) -> None:
+        if "C" in arguments:
             raise ValueError(
                 "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
                 "H=... for the output matrix of a state-space model"
             )
-        construct(self, **settings)
+        construct(self, **limits.fields_of(arguments))
 
     constructor.__init__ = __init__
     return kind
 
 
-@refuses_output_matrix_as_box
+@with_limits_as_published
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(ReadOnlyArrays):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
-    All of it is in deviations from an operating point, (0, 0) unless given. What is declared of the uncertainties adds
+    All of it is in deviations from an operating point, (0, 0) unless given, except the limits of the constructor, which
+    are absolute. A and B are a model of deviations, as linearization gives; of a model in absolute coordinates, x+ = A x
+    + B u + c, give c as `offset`: then the operating point has to be an equilibrium. What is declared of the uncertainties adds
     up: `disturbance_bound`, `sensor_bound` and `initial_bound` bound d, v and the error of the first estimate in the
     plant's units, each a number r (a ball), half-widths per entry (a box), an `Ellipsoid`, or a pair (E, w) for d = E w
     with |w_i| <= w_i; 0 says on purpose that there is none. Covariances are the other way in: they describe Gaussian
     noise that is *truncated*, so that the bounds, and every certificate, hold the fraction 1 - delta of it alone. Of
     noise with a datasheet's covariance a fraction delta of all samples lies outside.
 
+    Args:
+        state_limits: Pair (low, high) around `operating_state`, each a number or shape (n,), infinite where there is no
+            limit. `box` is the short form of symmetric ones: half-widths of the states, shape (n,), infinite where
+            there is no limit, or rows c_j with |c_j x| <= 1, shape (k, n).
+        input_limits: Pair (low, high) around `operating_input`, each a number or shape (m,). `u_max`, a positive number
+            or shape (m,), is the short form of |u_i| <= u_max_i.
+        output_limits: Further limits, a list of (row, low, high) with low <= row x <= high.
+        offset: c of a model in absolute coordinates, shape (n,).
+
     Attributes:
         A: State matrix, shape (n, n).
         B: Input matrix, shape (n, m).
-        box: The safe box: half-widths of the states, shape (n,) (infinite: no limit), or rows c_j with |c_j x| <= 1,
-            shape (k, n). Kept as rows.
-        u_max: Input limits |u_i| <= u_max_i, a positive number or shape (m,).
+        box: Rows c_j of the safe box, shape (k, n), in units of half the range that is allowed; where one end is open,
+            the other one is 1 unit away.
+        box_ends: The low and the high ends of c_j x, shape (2, k); -1 and 1 where limits are symmetric, infinite where
+            there is none.
+        input_ends: The low and the high ends of the inputs, shape (2, m).
         dt: Duration of a step [s].
         gamma: Squared radius of the unknown disturbance, d'd <= gamma.
         H: Output matrix, shape (p, n); the identity by default.
@@ -153,14 +170,16 @@ class LinearPlant(ReadOnlyArrays):
         input_units: Units of the inputs.
 
     Raises:
-        ValueError: If a matrix has a wrong shape, is not finite or not a covariance, or a bound is negative.
+        ValueError: If a matrix has a wrong shape, is not finite or not a covariance, a bound is negative, or the
+            operating point is not strictly between the limits.
     """
 
     A: np.ndarray
     B: np.ndarray
     box: np.ndarray
-    u_max: np.ndarray
+    input_ends: np.ndarray
     dt: float
+    box_ends: np.ndarray = FILLED_IN_LATER
     gamma: float = 0.0
     H: np.ndarray = FILLED_IN_LATER
     process_noise_cov: np.ndarray = FILLED_IN_LATER
@@ -188,9 +207,15 @@ class LinearPlant(ReadOnlyArrays):
             *,
             A: ArrayLike,
             B: ArrayLike,
-            box: ArrayLike,
-            u_max: ArrayLike,
             dt: float,
+            box: ArrayLike | None = None,
+            u_max: ArrayLike | None = None,
+            state_limits: tuple[ArrayLike, ArrayLike] | None = None,
+            input_limits: tuple[ArrayLike, ArrayLike] | None = None,
+            output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
+            offset: ArrayLike | None = None,
+            box_ends: ArrayLike | None = None,
+            input_ends: ArrayLike | None = None,
             gamma: float = 0.0,
             H: ArrayLike | None = None,
             process_noise_cov: ArrayLike | None = None,
@@ -221,7 +246,8 @@ class LinearPlant(ReadOnlyArrays):
         self._set("H", np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H"))
         if (np.abs(self.H).max(axis=1) < SMALLEST_NUMBER).any():
             raise ValueError(f"every row of H must measure something, got {shown(self.H.tolist())}")
-        self._set("u_max", limits.as_input_limits(self.u_max, self.m))
+        self._set("box_ends", limits.as_row_ends(self.box_ends, len(self.box)))
+        self._set("input_ends", limits.as_input_ends(self.input_ends, self.m))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
         is_given = self._check_declared()
         if self.error_gain is not None:
@@ -258,7 +284,7 @@ class LinearPlant(ReadOnlyArrays):
             if not isinstance(self.remainder, Remainder):
                 raise ValueError(f"remainder must be a Remainder, got {shown(self.remainder)}")
             as_bound(self.remainder.bound, self.n, "remainder")
-            model = {name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")}
+            model = {name: getattr(self, name) for name in ("A", "B", "box", "box_ends", "input_ends", "dt")}
             self._set("remainder", self.remainder.of_model(model))
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
@@ -282,44 +308,9 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(
                 "between_samples is for a plant without a remainder, which says nothing of the times between samples"
             )
-        if np.linalg.matrix_rank(self.box) < self.n:
+        if np.linalg.matrix_rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
             raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
         between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt)
-
-    @classmethod
-    @own_error_state
-    def around(
-        cls,
-        *,
-        A: ArrayLike,
-        B: ArrayLike,
-        state_limits: tuple[ArrayLike, ArrayLike],
-        input_limits: tuple[ArrayLike, ArrayLike],
-        operating_state: ArrayLike | None = None,
-        operating_input: ArrayLike | None = None,
-        **settings: Any,
-    ) -> Self:
-        """Returns the plant in deviations from an operating point, with symmetric limits inside those given.
-
-        A and B are a model of deviations, as linearization at the operating point gives; limits are absolute. Of a
-        model in absolute coordinates, x+ = A x + B u + c, give c as `offset`: then the operating point has to be an
-        equilibrium.
-
-        Args:
-            A: State matrix, shape (n, n).
-            B: Input matrix, shape (n, m).
-            state_limits: Pair (low, high) around x0, each a number or shape (n,); infinite where there is no limit.
-            input_limits: Pair (low, high) around u0, each a number or shape (m,).
-            operating_state: x0, shape (n,); zero by default.
-            operating_input: u0, shape (m,); zero by default.
-            settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, shape (n,).
-
-        Raises:
-            ValueError: If (x0, u0) is not strictly between the limits, or not an equilibrium of a model with `offset`,
-                or an argument is wrong.
-        """
-        point = operating_state, operating_input
-        return cls(**limits.arguments_around(A, B, point, (state_limits, input_limits), settings))
 
     @classmethod
     @own_error_state
@@ -332,19 +323,14 @@ class LinearPlant(ReadOnlyArrays):
             dt: Duration of a step [s], needed unless the model has one.
             input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
                 estimator knows; box, bounds and names are given for the model's own states.
-            settings: Other arguments of `LinearPlant` except A, B and H (`box` and `u_max` at least), or those of
-                `LinearPlant.around`.
+            settings: Other arguments of `LinearPlant` except A, B and H; limits at least.
 
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
         if input_delay and settings.get("between_samples") not in (None, 1):
             raise ValueError("between_samples is for plants without input_delay")
-        arguments = statespace.sampled_arguments(sys, dt, settings)
-        given = {"state_limits", "input_limits"} & set(settings)
-        if len(given) == 1:
-            raise ValueError(f"{given.pop()} is given alone: give state_limits and input_limits, or box and u_max")
-        plant = cls.around(**arguments) if given else cls(**arguments)
+        plant = cls(**statespace.sampled_arguments(sys, dt, settings))
         return plant if input_delay == 0 else plant._delayed(input_delay)
 
     @own_error_state
@@ -402,9 +388,10 @@ class LinearPlant(ReadOnlyArrays):
         A = np.zeros((n + stored, n + stored))
         A[:n, :n], A[:n, n : n + m] = self.A, self.B
         A[n:-m, n + m :] = np.eye(stored - m)
-        box = np.zeros((len(self.box_rows) + stored, n + stored))
-        box[: len(self.box_rows), :n] = self.box_rows
-        box[len(self.box_rows) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.u_max), delay))
+        box = np.zeros((len(self.box) + stored, n + stored))
+        box[: len(self.box), :n] = self.box
+        box[len(self.box) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.input_half), delay))
+        ends = np.concatenate([self.box_ends, np.tile(self.input_ends / self.input_half, delay)], axis=1)
         ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(delay, 0, -1)]
         disturbance = self.disturbance_bound
         if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the inputs under way
@@ -419,6 +406,7 @@ class LinearPlant(ReadOnlyArrays):
             A=A,
             B=np.concatenate([np.zeros((n + stored - m, m)), np.eye(m)]),
             box=box,
+            box_ends=ends,
             gamma=0.0,
             H=np.pad(self.H, ((0, 0), (0, stored))),
             process_noise_cov=np.pad(self.process_noise_cov, (0, stored)),
@@ -436,7 +424,11 @@ class LinearPlant(ReadOnlyArrays):
     @property
     def document(self) -> dict[str, Any]:
         """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
-        return {"format": _FORMAT, "plant": {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}}
+        content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
+        if self.is_symmetric:
+            del content["box_ends"], content["input_ends"]
+            content["u_max"] = _as_json(self.u_max)
+        return {"format": _FORMAT, "plant": content}
 
     @classmethod
     def read(cls, given: Mapping[str, Any] | str | os.PathLike[str]) -> Self:
@@ -524,10 +516,87 @@ class LinearPlant(ReadOnlyArrays):
         """The same plant without its remainder: what is declared beside it."""
         return self if self.remainder is None else replace(self, remainder=None)
 
+    @property
+    def box_low(self) -> np.ndarray:
+        """The low ends of c_j x, shape (k,); infinite where there is none."""
+        return self.box_ends[0]
+
+    @property
+    def box_high(self) -> np.ndarray:
+        """The high ends of c_j x, shape (k,); infinite where there is none."""
+        return self.box_ends[1]
+
     @cached_property
+    def is_symmetric(self) -> bool:
+        """Whether limits are as far from the operating point on either side: |c_j x| <= 1 and |u_i| <= u_max_i."""
+        low, high = self.input_ends
+        return bool((np.abs(self.box_ends) == 1.0).all() and np.array_equal(-low, high))
+
+    @property
     def box_rows(self) -> np.ndarray:
-        """Rows c_j of the safe box |c_j x| <= 1, shape (k, n)."""
+        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n).
+
+        Raises:
+            ValueError: If limits are not symmetric.
+        """
+        self._require_symmetric("box, box_low and box_high")
         return self.box
+
+    @property
+    def u_max(self) -> np.ndarray:
+        """Symmetric limits |u_i| <= u_max_i of the inputs, shape (m,).
+
+        Raises:
+            ValueError: If limits are not symmetric.
+        """
+        self._require_symmetric("input_low and input_high")
+        return self.input_high
+
+    def _require_symmetric(self, instead: str) -> None:
+        if not self.is_symmetric:
+            raise ValueError(
+                "the limits of this plant are not symmetric about its operating point, and what was asked for takes "
+                f"only symmetric ones (a plant has {instead}); symmetric limits inside them are those of `symmetric`"
+            )
+
+    @cached_property
+    def symmetric(self) -> LinearPlant:
+        """The plant with the largest symmetric limits inside its own; itself if these are symmetric."""
+        if self.is_symmetric:
+            return self
+        nearest = np.minimum(-self.box_low, self.box_high)
+        box, u_max = self.box / nearest[:, None], np.minimum(-self.input_low, self.input_high)
+        return replace(self, box=box, box_ends=None, input_ends=(-u_max, u_max))
+
+    @cached_property
+    def input_low(self) -> np.ndarray:
+        """The low ends of the inputs, shape (m,)."""
+        return read_only(self.input_ends[0])
+
+    @cached_property
+    def input_high(self) -> np.ndarray:
+        """The high ends of the inputs, shape (m,)."""
+        return read_only(self.input_ends[1])
+
+    @cached_property
+    def input_middle(self) -> np.ndarray:
+        """The input that action 0 stands for, shape (m,): the middle of the limits."""
+        return read_only(0.5 * (self.input_low + self.input_high))
+
+    @cached_property
+    def input_half(self) -> np.ndarray:
+        """Half the range of each input, shape (m,): input_middle +- input_half is within the limits, as floats add."""
+        half = 0.5 * (self.input_high - self.input_low)
+        while True:
+            beyond = (self.input_middle + half > self.input_high) | (self.input_middle - half < self.input_low)
+            if not beyond.any():
+                return read_only(half)
+            half = np.where(beyond, np.nextafter(half, 0.0), half)
+
+    @cached_property
+    def largest_input(self) -> np.ndarray:
+        """The largest |u_i| within the limits, shape (m,)."""
+        return read_only(np.maximum(-self.input_low, self.input_high))
 
     @cached_property
     def grid_rows(self) -> between_samples.GridRows | None:
@@ -535,7 +604,7 @@ class LinearPlant(ReadOnlyArrays):
         if self.between_samples is None or self.continuous_model is None:
             return None
         return between_samples.grid_rows(
-            self.continuous_model, self.box_rows, self.u_max, self.dt, self.between_samples
+            self.continuous_model, (self.box, self.box_ends), self.largest_input, self.dt, self.between_samples
         )
 
     @cached_property
@@ -559,11 +628,13 @@ class LinearPlant(ReadOnlyArrays):
     def digest(self) -> str:
         """Returns what the fingerprint would be if it were computed now."""
         digest = hashlib.sha256()
-        matrices = {"A": self.A, "B": self.B, "C": self.box_rows, "H": self.H, "u_max": self.u_max}
+        matrices = {"A": self.A, "B": self.B, "C": self.box, "H": self.H, "u_max": self.input_high}
         names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
         for name, array in (matrices | {name: getattr(self, name) for name in names}).items():
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
+        if not self.is_symmetric:  # symmetric ones keep the fingerprint they always had
+            digest.update(self.box_ends.astype("<f8").tobytes() + self.input_low.astype("<f8").tobytes())
         if self.error_gain is not None:
             digest.update(self.error_gain.astype("<f8").tobytes())
         for name in ("disturbance_bound", "sensor_bound", "initial_bound", "operating_state", "operating_input"):
@@ -582,13 +653,21 @@ class LinearPlant(ReadOnlyArrays):
 
     @again_if_interrupted
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
-        """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
-        return abs(self.box_rows.dot(state)) - 1.0
+        """Returns how far c_j x is beyond the nearer end, in units of half the range, for each row of the safe box.
+
+        Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
+        """
+        values, (low, high) = self.box.dot(state), self._ends_of_columns if state.ndim > 1 else self.box_ends
+        return np.maximum(values - high, low - values)
+
+    @cached_property
+    def _ends_of_columns(self) -> np.ndarray:
+        return self.box_ends[:, :, None]
 
     @cached_property
     def _grid_values(self) -> between_samples.GridValues | None:
         rows = self.grid_rows
-        return None if rows is None else between_samples.GridValues(rows, self.box_rows, self.A, self.B)
+        return None if rows is None else between_samples.GridValues(rows, (self.box, self.box_ends), self.A, self.B)
 
     @again_if_interrupted
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
@@ -637,7 +716,7 @@ class LinearPlant(ReadOnlyArrays):
     @cached_property
     def weight(self) -> np.ndarray:
         """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
-        gram = exact.product(self.box_rows.T, self.box_rows)
+        gram = exact.product(self.box.T, self.box)
         squares = np.diag(gram)
         return read_only(gram + 1e-6 * np.diag(squares + exact.total(squares) / self.n * (squares == 0.0)))
 
@@ -690,7 +769,7 @@ class LinearPlant(ReadOnlyArrays):
     def _rounding_margin(self) -> np.ndarray:
         """What D gains for rounding, shape (n, n)."""
         reach = SIMULATED_REACH * self.half_widths
-        rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.u_max) + reach
+        rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.largest_input) + reach
         rounding *= (self.n + self.m + 2) * np.finfo(float).eps
         return THINNEST * self._box_shape + 10.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding))
 
@@ -848,11 +927,15 @@ def _describe(plant: LinearPlant) -> str:
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [row_limit(plant, row) for row in plant.box_rows],
+        "safe box": [row_limit(plant, j) for j in range(len(plant.box))],
         "input limits": [
-            _between(name, limit, center, unit)
-            for name, limit, center, unit in zip(
-                plant.input_names, plant.u_max, plant.operating_input, plant.input_units, strict=True
+            _between(name, *ends, center, unit)
+            for name, *ends, center, unit in zip(
+                plant.input_names,
+                *plant.input_ends.tolist(),
+                plant.operating_input.tolist(),
+                plant.input_units,
+                strict=True,
             )
         ],
     }
@@ -877,7 +960,9 @@ def _as_json(value: Any) -> Any:
         return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
     if isinstance(value, tuple):
         return list(value)
-    return value.tolist() if isinstance(value, np.ndarray) else value
+    if isinstance(value, np.ndarray):  # an end of the box that is open is null
+        return value.tolist() if np.isfinite(value).all() else np.where(np.isfinite(value), value, None).tolist()
+    return value
 
 
 def _from_json(value: Any) -> Any:
@@ -897,22 +982,32 @@ def _sized(size: float, unit: str) -> str:
     return f"{size:.4g} {unit}".rstrip()
 
 
-def _between(name: str, limit: float, center: float, unit: str) -> str:
-    """Returns the limits of a quantity around its operating point."""
-    if center == 0.0:
-        return f"|{name}| <= {_sized(limit, unit)}"
-    return f"{center - limit:.6g} <= {name} <= {_sized(center + limit, unit)} (operating point {center:.6g})"
+def _between(name: str, low: float, high: float, center: float, unit: str) -> str:
+    """Returns the limits of a quantity, given its ends from the operating point and that point."""
+    if center == 0.0 and low == -high:
+        return f"|{name}| <= {_sized(high, unit)}"
+    point = f" (operating point {center:.6g})" if center else ""
+    if low == -np.inf:
+        return f"{name} <= {_sized(center + high, unit)}{point}"
+    if high == np.inf:
+        return f"{name} >= {_sized(center + low, unit)}{point}"
+    return f"{center + low:.6g} <= {name} <= {_sized(center + high, unit)}{point}"
 
 
-def row_limit(plant: LinearPlant, row: np.ndarray) -> str:
-    """Returns what a row of the safe box limits."""
+def row_limit(plant: LinearPlant, j: int) -> str:
+    """Returns what row j of the safe box limits."""
+    row, low, high = plant.box[j], float(plant.box_low[j]), float(plant.box_high[j])
     limited = np.flatnonzero(row).tolist()
     if len(limited) == 1:
         i = limited[0]
-        size = 1.0 / abs(row[i])
-        return _between(plant.state_names[i], size, plant.operating_state[i], plant.state_units[i])
-    terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
-    return f"|{terms.removeprefix('+')}| <= 1"
+        ends = sorted([low / row[i], high / row[i]])
+        return _between(plant.state_names[i], *ends, plant.operating_state[i], plant.state_units[i])
+    if low == -high:
+        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
+        return f"|{terms.removeprefix('+')}| <= 1"
+    size, center = float(np.abs(row).max()), float(row @ plant.operating_state)  # in units of its largest entry
+    terms = " ".join(f"{row[i] / size:+.4g} {plant.state_names[i]}" for i in limited)
+    return _between(terms.removeprefix("+"), low / size, high / size, center / size, "")
 
 
 def _deviation(plant: LinearPlant, i: int) -> str:

@@ -111,10 +111,12 @@ class OpenedEnv(Process):
                     f"the plant has {plant.m} inputs, actions have shape {space.shape}: give GymProcess write_action"
                 )
             low, high = space.low.ravel(), space.high.ravel()
-            if (plant.u_max > high * (1.0 + READ_BACK)).any() or (-plant.u_max < low * (1.0 + READ_BACK)).any():
+            room = READ_BACK * np.maximum(np.abs(low), np.abs(high))
+            if (plant.input_high > high + room).any() or (plant.input_low < low - room).any():
                 raise ValueError(
-                    f"u_max = {shown(plant.u_max.tolist())} goes beyond the actions, {shown(low.tolist())} to "
-                    f"{shown(high.tolist())}: choose a smaller one, or give GymProcess write_action"
+                    f"the input limits, {shown(plant.input_low.tolist())} to {shown(plant.input_high.tolist())}, go "
+                    f"beyond the actions, {shown(low.tolist())} to {shown(high.tolist())}: choose closer ones (u_max), "
+                    "or give GymProcess write_action"
                 )
         return space.dtype, space.shape
 

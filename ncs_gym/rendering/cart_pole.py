@@ -11,7 +11,7 @@ from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import FrameRecord
 from ncs_gym.rendering.packet_animation import draw_packets
-from ncs_gym.rendering.phase_plane import limit_of
+from ncs_gym.rendering.phase_plane import range_of
 
 # Height of the track in the frame [pixels].
 _TRACK = theme.PLANT_VIEW.bottom - 24
@@ -36,7 +36,7 @@ class CartPoleDrawing:
 
     def __init__(self, plant: LinearPlant) -> None:
         self._plant = plant
-        self._limit, self._angle_limit = limit_of(plant, 0), limit_of(plant, 2)
+        self._limit, self._angle_limit = range_of(plant, 0).reach, range_of(plant, 2).reach
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws the track with its limits."""
@@ -69,7 +69,7 @@ class CartPoleDrawing:
 
     def _draw_value(self, canvas: Canvas, x: float, height: float, size: int, index: int, value: float) -> None:
         """Writes a state beside the pole, on the side of the middle of the frame."""
-        limit, side = limit_of(self._plant, index), 1.0 if x < theme.WIDTH / 2 else -1.0
+        limit, side = range_of(self._plant, index).reach, 1.0 if x < theme.WIDTH / 2 else -1.0
         text = theme.value_label(value, limit, self._plant.state_units[index])
         place = x + side * 46, _PIVOT - height
         canvas.text(text, place, theme.load_color(value / limit), size, align=0.5 - 0.5 * side, bold=True)

@@ -17,7 +17,7 @@ from ncs_gym.rendering.packet_animation import draw_packets
 _MAX_BARS, _COLUMN = 8, 4
 _TOP = theme.PACKET_LINE + 27
 _SPACING = 28.0
-# The bars reach this far, in units of the limit.
+# The bars reach this far from the middle of the limits, in units of half their range.
 _BAR_REACH = 1.3
 # Widths of the names and numbers beside the bars, with one column and with two [pixels].
 _TEXT_WIDTH, _NARROW_TEXT_WIDTH = 150.0, 96.0
@@ -30,14 +30,22 @@ class _Constraint(NamedTuple):
     Attributes:
         name: Name of the state it limits; a number for a row about several states.
         unit: Unit of that state.
-        limit: Limit of the absolute value of that state.
-        load: Maps a state, shape (n,), to the signed fraction of the limit that it uses.
+        half: Half the range of that state, in its unit.
+        low, high: The limits in units of half the range; infinite where there is none.
+        load: Maps a state, shape (n,), to what is limited, in these units.
     """
 
     name: str
     unit: str
-    limit: float
+    half: float
+    low: float
+    high: float
     load: Callable[[np.ndarray], float]
+
+    @property
+    def middle(self) -> float:
+        """Where the middle of a bar is; the operating point where a limit is open."""
+        return 0.5 * (self.low + self.high) if np.isfinite(self.low + self.high) else 0.0
 
 
 class ConstraintBarsDrawing:
@@ -51,12 +59,12 @@ class ConstraintBarsDrawing:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        self._constraints = [_constraint(plant, j) for j in range(min(len(plant.box_rows), _MAX_BARS))]
-        limited = [int(np.flatnonzero(row)[0]) for row in plant.box_rows if np.count_nonzero(row) == 1]
+        self._constraints = [_constraint(plant, j) for j in range(min(len(plant.box), _MAX_BARS))]
+        limited = [int(np.flatnonzero(row)[0]) for row in plant.box if np.count_nonzero(row) == 1]
         order = list(dict.fromkeys([*limited, *range(plant.n)]))
         self.pair = (min(order[:2]), max(order[:2]))
         self._text_width = _TEXT_WIDTH if len(self._constraints) <= _COLUMN else _NARROW_TEXT_WIDTH
-        self._hidden = len(plant.box_rows) - len(self._constraints)
+        self._hidden = len(plant.box) - len(self._constraints)
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws the names, the empty bars and the limits."""
@@ -65,10 +73,11 @@ class ConstraintBarsDrawing:
             place = bar.x - 10, bar.y + 7
             canvas.text(constraint.name, place, theme.INK, align=1.0, max_width=self._text_width)
             canvas.rect(bar, _OUTSIDE, radius=3)
-            inner = bar.w / _BAR_REACH
-            canvas.rect(theme.Rect(bar.x + (bar.w - inner) / 2, bar.y, inner, bar.h), theme.PAPER)
-            for sign in (-1.0, 1.0):
-                x = _x(bar, sign)
+            left, right = (_x(bar, constraint, end) for end in (constraint.low, constraint.high))
+            canvas.rect(theme.Rect(left, bar.y, right - left, bar.h), theme.PAPER)
+            for x, end in ((left, constraint.low), (right, constraint.high)):
+                if not np.isfinite(end):
+                    continue
                 canvas.dashed([(x, bar.y - 3), (x, bar.bottom + 3)], theme.DANGER, 1.5, dash=3.0)
         if self._hidden:
             text = f"and {self._hidden} more limits"
@@ -78,14 +87,15 @@ class ConstraintBarsDrawing:
         """Draws the true values as bars, the estimated ones as dashed marks, and the packets."""
         for i, constraint in enumerate(self._constraints):
             bar, value = self._bar(i), constraint.load(frame.state)
-            color, middle = theme.load_color(value), bar.x + bar.w / 2
-            x = _x(bar, value)
-            canvas.rect(theme.Rect(min(x, middle), bar.y + 2, abs(x - middle), bar.h - 4), color)
-            canvas.line([(middle, bar.y - 1), (middle, bar.bottom + 1)], theme.MUTED, 1.0)
-            estimated = _x(bar, constraint.load(frame.estimate))
+            used = max(value / constraint.low, value / constraint.high)
+            color, zero = theme.load_color(used), _x(bar, constraint, 0.0)
+            x = _x(bar, constraint, value)
+            canvas.rect(theme.Rect(min(x, zero), bar.y + 2, abs(x - zero), bar.h - 4), color)
+            canvas.line([(zero, bar.y - 1), (zero, bar.bottom + 1)], theme.MUTED, 1.0)
+            estimated = _x(bar, constraint, constraint.load(frame.estimate))
             canvas.dashed([(estimated, bar.y - 4), (estimated, bar.bottom + 4)], theme.ESTIMATE, 2.0, dash=3.0)
-            text = theme.value_label(value * constraint.limit, constraint.limit, constraint.unit)
-            place, violated = (bar.right + 10, bar.y + 7), abs(value) > 1.0
+            text = theme.value_label(value * constraint.half, constraint.half, constraint.unit)
+            place, violated = (bar.right + 10, bar.y + 7), used > 1.0
             text_color = theme.DANGER if violated else theme.INK
             canvas.text(text, place, text_color, bold=violated, max_width=self._text_width)
         draw_packets(canvas, frame, 130.0, theme.WIDTH - 130.0)
@@ -99,14 +109,15 @@ class ConstraintBarsDrawing:
 
 
 def _constraint(plant: LinearPlant, index: int) -> _Constraint:
-    row = plant.box_rows[index]
+    row, low, high = plant.box[index], float(plant.box_low[index]), float(plant.box_high[index])
     if np.count_nonzero(row) != 1:
-        return _Constraint(f"limit {index + 1}", "", 1.0, lambda state: float(row @ state))
+        return _Constraint(f"limit {index + 1}", "", 1.0, low, high, lambda state: float(row @ state))
     i = int(np.flatnonzero(row)[0])
-    limit = 1.0 / abs(row[i])
-    return _Constraint(plant.state_names[i], plant.state_units[i], limit, lambda state: float(state[i]) / limit)
+    half, (low, high) = 1.0 / abs(row[i]), (low, high) if row[i] > 0.0 else (-high, -low)
+    name, unit = plant.state_names[i], plant.state_units[i]
+    return _Constraint(name, unit, half, low, high, lambda state: float(state[i]) / half)
 
 
-def _x(bar: theme.Rect, load: float) -> float:
-    """Returns where a signed fraction of the limit is on a bar [pixels]."""
-    return bar.x + bar.w / 2 * (1.0 + float(np.clip(load / _BAR_REACH, -1.0, 1.0)))
+def _x(bar: theme.Rect, constraint: _Constraint, load: float) -> float:
+    """Returns where what is limited is on a bar [pixels]."""
+    return bar.x + bar.w / 2 * (1.0 + float(np.clip((load - constraint.middle) / _BAR_REACH, -1.0, 1.0)))

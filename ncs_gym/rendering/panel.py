@@ -136,19 +136,19 @@ def _draw_row(canvas: Canvas, y: float, name: str, value: str, color: theme.Colo
 def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> None:
     """Draws an input between its limits; where the shield acts, also an arrow from the proposed input."""
     plant = frame.plant
-    limit = float(plant.u_max[index])
+    limit = float(plant.largest_input[index])
     value = 0.0 if frame.input is None else float(frame.input[index])
     color = theme.SHIELD if frame.intervened else theme.STEEL
     text = theme.value_label(value, limit, plant.input_units[index])
     bar = _draw_row(canvas, y, plant.input_names[index], text, color)
-    middle = bar.x + bar.w / 2
+    middle, half = float(plant.input_middle[index]), float(plant.input_half[index])
 
     def x_of(u: float) -> float:
-        return middle + (bar.w / 2 - 6) * float(np.clip(u / limit, -1.0, 1.0))
+        return bar.x + bar.w / 2 + (bar.w / 2 - 6) * float(np.clip((u - middle) / half, -1.0, 1.0))
 
-    x = x_of(value)
-    canvas.rect(theme.Rect(min(x, middle), bar.y + 2, abs(x - middle), bar.h - 4), color)
-    canvas.line([(middle, bar.y - 2), (middle, bar.bottom + 2)], theme.MUTED, 1.0)
+    x, zero = x_of(value), x_of(0.0)
+    canvas.rect(theme.Rect(min(x, zero), bar.y + 2, abs(x - zero), bar.h - 4), color)
+    canvas.line([(zero, bar.y - 2), (zero, bar.bottom + 2)], theme.MUTED, 1.0)
     annotation = frame.annotation
     if annotation is not None and annotation.intervened and annotation.proposed is not None:
         decided = x if frame.committed is None else x_of(float(frame.committed[index]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -21,10 +23,40 @@ _MAX_COORDINATE = 2000.0
 _FAR = 10.0
 
 
-def limit_of(plant: LinearPlant, index: int) -> float:
-    """Returns the limit of |x_i|; where the safe box has none, how far x_i reaches in the ellipsoid inside the box."""
-    alone = [row[index] for row in plant.box_rows if row[index] != 0.0 and np.count_nonzero(row) == 1]
-    return 1.0 / max(abs(entry) for entry in alone) if alone else float(plant.half_widths[index])
+class Range(NamedTuple):
+    """What the axis of a state is about.
+
+    Attributes:
+        low, high: The limits of the state; where an end is open, or the safe box has none, how far it reaches in the
+            ellipsoid inside the box.
+    """
+
+    low: float
+    high: float
+
+    @property
+    def middle(self) -> float:
+        """The middle of the axis."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def half(self) -> float:
+        """Half the range."""
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def reach(self) -> float:
+        """The largest absolute value."""
+        return max(-self.low, self.high)
+
+
+def range_of(plant: LinearPlant, index: int) -> Range:
+    """Returns the range of a state: between the closest limits of it alone."""
+    alone = [j for j, row in enumerate(plant.box) if row[index] != 0.0 and np.count_nonzero(row) == 1]
+    ends = [sorted([plant.box_low[j] / plant.box[j, index], plant.box_high[j] / plant.box[j, index]]) for j in alone]
+    low, high = max((end[0] for end in ends), default=-np.inf), min((end[1] for end in ends), default=np.inf)
+    reach = float(plant.half_widths[index])
+    return Range(float(low) if np.isfinite(low) else -reach, float(high) if np.isfinite(high) else reach)
 
 
 class PhasePlane:
@@ -38,14 +70,15 @@ class PhasePlane:
 
     def __init__(self, plant: LinearPlant, pair: tuple[int, int], rect: theme.Rect) -> None:
         self._plant, self._pair, self._rect = plant, pair, rect
-        self._limits = np.array([limit_of(plant, index) for index in pair])
+        ranges = [range_of(plant, index) for index in pair]
+        self._middle, self._half = np.array([[each.middle, each.half] for each in ranges]).T
         half = np.array([rect.w, -rect.h]) / 2.0
         self._center = np.array([rect.x, rect.y]) + np.abs(half)
-        self._scale = half / (_AXIS_REACH * self._limits)
+        self._scale = half / (_AXIS_REACH * self._half)
 
     def pixels_of(self, points: np.ndarray) -> np.ndarray:
         """Returns where points in the two coordinates, shape (k, 2), are in the frame, shape (k, 2) [pixels]."""
-        return self._center + self._scale * points
+        return self._center + self._scale * (points - self._middle)
 
     def draw_background(self, canvas: Canvas, safe_set: Ellipsoid | OutlinedSet | None) -> None:
         """Draws what does not move: the box, the safe set, ticks and titles."""
@@ -58,7 +91,7 @@ class PhasePlane:
             outline = self.pixels_of(self._outline(safe_set))
             canvas.polygon(outline, theme.SAFE_FILL)
         for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
-            x, y = self.pixels_of(fraction * self._limits)
+            x, y = self.pixels_of(self._middle + fraction * self._half)
             color = theme.FAINT if fraction == 0.0 else theme.GRID
             canvas.line([(x, rect.y), (x, rect.bottom)], color, 0.5)
             canvas.line([(rect.x, y), (rect.right, y)], color, 0.5)
@@ -85,7 +118,7 @@ class PhasePlane:
         if frame.violated:
             canvas.circle(truth, 9.0, theme.DANGER, width=2.0)
         canvas.clip(None)
-        if np.any(np.abs(frame.state[pair]) > _AXIS_REACH * self._limits):
+        if np.any(np.abs(frame.state[pair] - self._middle) > _AXIS_REACH * self._half):
             place = self._rect.right - 6, self._rect.y + 9
             canvas.text("state outside the axes", place, theme.DANGER, align=1.0, bold=True)
 
@@ -115,7 +148,7 @@ class PhasePlane:
     def _draw_axes(self, canvas: Canvas) -> None:
         rect, plant, (i, j) = self._rect, self._plant, self._pair
         for fraction in (-1.0, 0.0, 1.0):
-            value = fraction * self._limits
+            value = self._middle + fraction * self._half
             x, y = self.pixels_of(value)
             canvas.text(theme.tick_label(value[0]), (x, rect.bottom + 11), theme.MUTED, align=0.5)
             canvas.text(theme.tick_label(value[1]), (rect.x - 6, y), theme.MUTED, align=1.0)
@@ -136,21 +169,22 @@ class TimePlot:
     """
 
     def __init__(self, plant: LinearPlant, rect: theme.Rect) -> None:
-        self._plant, self._rect, self._limit = plant, rect, limit_of(plant, 0)
+        self._plant, self._rect, self._range = plant, rect, range_of(plant, 0)
 
     def draw_background(self, canvas: Canvas, safe_set: Ellipsoid | OutlinedSet | None) -> None:
         """Draws what does not move: limits, the safe set, ticks and titles."""
         rect = self._rect
         canvas.rect(rect, theme.DANGER_FILL)
-        self._fill_band(canvas, self._limit, theme.PAPER)
+        self._fill_band(canvas, *self._range, theme.PAPER)
         if safe_set is not None:
-            high = float(np.atleast_1d(safe_set.support(np.ones((1, 1))))[0])
-            self._fill_band(canvas, high, theme.SAFE_FILL)
-            for y in (self._y(high), self._y(-high)):
+            high, low = (sign * float(np.ravel(safe_set.support(np.array([[sign]])))[0]) for sign in (1.0, -1.0))
+            self._fill_band(canvas, low, high, theme.SAFE_FILL)
+            for y in (self._y(high), self._y(low)):
                 canvas.line([(rect.x, y), (rect.right, y)], theme.SAFE, 2.0)
         for fraction in (-1.0, 0.0, 1.0):
-            y = self._y(fraction * self._limit)
-            canvas.text(theme.tick_label(fraction * self._limit), (rect.x - 6, y), theme.MUTED, align=1.0)
+            value = self._range.middle + fraction * self._range.half
+            y = self._y(value)
+            canvas.text(theme.tick_label(value), (rect.x - 6, y), theme.MUTED, align=1.0)
             ends = [(rect.x, y), (rect.right, y)]
             if fraction:
                 canvas.dashed(ends, theme.DANGER, 1.5)
@@ -176,8 +210,8 @@ class TimePlot:
         canvas.circle(points[-1], 4.0, theme.DANGER if frame.violated else theme.INK)
         canvas.clip(None)
 
-    def _fill_band(self, canvas: Canvas, limit: float, color: theme.Color) -> None:
-        top, bottom = self._y(limit), self._y(-limit)
+    def _fill_band(self, canvas: Canvas, low: float, high: float, color: theme.Color) -> None:
+        top, bottom = self._y(high), self._y(low)
         canvas.rect(theme.Rect(self._rect.x, top, self._rect.w, bottom - top), color)
 
     def _x(self, age: float) -> float:
@@ -185,7 +219,8 @@ class TimePlot:
 
     def _y(self, value: float) -> float:
         half = self._rect.h / 2
-        return self._rect.y + half - (half - 2) * float(np.clip(value / (_AXIS_REACH * self._limit), -1.0, 1.0))
+        load = (value - self._range.middle) / (_AXIS_REACH * self._range.half)
+        return self._rect.y + half - (half - 2) * float(np.clip(load, -1.0, 1.0))
 
 
 def _axis_title(name: str, unit: str) -> str:
@@ -205,14 +240,14 @@ def _draw_interventions(canvas: Canvas, points: list, frame: FrameRecord) -> Non
 
 def _box_corners(plant: LinearPlant, pair: tuple[int, int]) -> np.ndarray:
     """Returns the corners, shape (k, 2), of what the constraints on two coordinates alone allow these."""
-    limits = np.array([limit_of(plant, index) for index in pair])
-    corners = _FAR * limits * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    reach = np.array([_FAR * range_of(plant, index).reach for index in pair])
+    corners = reach * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     others = np.ones(plant.n, dtype=bool)
     others[list(pair)] = False
-    for row in plant.box_rows:
+    for row, low, high in zip(plant.box, *plant.box_ends, strict=True):
         if not row[others].any():
-            for sign in (-1.0, 1.0):
-                corners = _cut(corners, sign * row[list(pair)])
+            for end in filter(np.isfinite, (low, high)):
+                corners = _cut(corners, row[list(pair)] / end)
     return corners
 
 

@@ -9,7 +9,7 @@ from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import FrameRecord
 from ncs_gym.rendering.packet_animation import draw_packets
-from ncs_gym.rendering.phase_plane import limit_of
+from ncs_gym.rendering.phase_plane import range_of
 
 # Height of the road in the frame [pixels].
 _ROAD = theme.PLANT_VIEW.bottom - 24
@@ -36,7 +36,7 @@ class TruckTrailerDrawing:
     pair = (0, 1)
 
     def __init__(self, plant: LinearPlant) -> None:
-        self._limit = limit_of(plant, 0)
+        self._limit = range_of(plant, 0).reach
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws the road and the marks of the limits."""

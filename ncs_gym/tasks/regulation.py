@@ -19,7 +19,7 @@ class Regulation(Task):
 
     Attributes:
         state_cost: Q, shape (n, n); None: C'C, so that the edge of the safe box costs about 1.
-        input_cost: R, shape (m, m); None: 0.01 diag(1 / u_max^2).
+        input_cost: R, shape (m, m); None: 0.01 diag(1 / h^2), h half the range of the inputs.
 
     Raises:
         ValueError: If a cost is not symmetric positive semidefinite.
@@ -50,6 +50,6 @@ class Regulation(Task):
 
 @lru_cache(maxsize=64)
 def _costs(task: Regulation, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
-    Q = plant.box_rows.T @ plant.box_rows if task.state_cost is None else task.state_cost
-    R = np.diag(0.01 / plant.u_max**2) if task.input_cost is None else task.input_cost
+    Q = plant.box.T @ plant.box if task.state_cost is None else task.state_cost
+    R = np.diag(0.01 / plant.input_half**2) if task.input_cost is None else task.input_cost
     return Q, R

@@ -86,7 +86,7 @@ class SetpointTracking(Task):
         moved[: last - 1] = task_state[1:last]
         if self.change_price:
             moved[last:-1] = u
-            moved[-1] = np.abs((u - task_state[last:-1]).T / plant.u_max).mean(axis=-1)
+            moved[-1] = np.abs((u - task_state[last:-1]).T / plant.input_half).mean(axis=-1)
         return moved
 
     def observe(self, task_state):  # noqa: D102
@@ -96,7 +96,7 @@ class SetpointTracking(Task):
 
     def observation_bound(self, plant, horizon):  # noqa: D102
         targets = np.full(1 + self.preview, self.reach)
-        return np.concatenate([targets, plant.u_max]) if self.change_price else targets
+        return np.concatenate([targets, plant.largest_input]) if self.change_price else targets
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
         near = 1.0 - np.minimum(abs(self.output.dot(state) - self.target(task_state)) / self.width, 1.0)
@@ -124,7 +124,7 @@ class SetpointTracking(Task):
 
 
 def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
-    """Returns the largest c x with x = A x + B u, |c_j x| <= 1 and |u_i| <= u_max_i, by a linear program.
+    """Returns up to where c x = +-r holds for some x = A x + B u within the limits, by two linear programs.
 
     Args:
         plant: The plant.
@@ -136,15 +136,19 @@ def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
     from scipy.optimize import linprog  # takes long to import
 
     n, m = plant.n, plant.m
-    rows = np.hstack([plant.box_rows, np.zeros((len(plant.box_rows), m))])
-    scale = np.concatenate([plant.half_widths, plant.u_max])  # all variables are of the same size then
+    rows = np.hstack([plant.box, np.zeros((len(plant.box), m))])
+    scale = np.concatenate([plant.half_widths, plant.input_half])  # all variables are of the same size then
     balance = np.hstack([np.eye(n) - plant.A, -plant.B]) / plant.half_widths[:, None]
-    found = linprog(
-        -np.concatenate([output, np.zeros(m)]) * scale,
-        A_ub=np.concatenate([rows, -rows]) * scale,
-        b_ub=np.ones(2 * len(rows)),
-        A_eq=balance * scale,
-        b_eq=np.zeros(n),
-        bounds=[(None, None)] * n + [(-1.0, 1.0)] * m,
-    )
-    return np.inf if found.status == 3 else -float(found.fun)
+    low, high = plant.input_ends / plant.input_half
+    farthest = np.inf
+    for sign in (1.0, -1.0):
+        found = linprog(
+            -sign * np.concatenate([output, np.zeros(m)]) * scale,
+            A_ub=np.concatenate([rows, -rows]) * scale,
+            b_ub=np.concatenate([plant.box_high, -plant.box_low]),
+            A_eq=balance * scale,
+            b_eq=np.zeros(n),
+            bounds=[(None, None)] * n + list(zip(low, high, strict=True)),
+        )
+        farthest = min(farthest, np.inf if found.status == 3 else -float(found.fun))
+    return farthest

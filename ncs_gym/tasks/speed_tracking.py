@@ -68,7 +68,7 @@ class SpeedTracking(Task):
         return task_state[1:] - task_state[:1]
 
     def observation_bound(self, plant, horizon):  # noqa: D102
-        return np.array([self.fastest + horizon * plant.dt * plant.u_max[self.input_index]])
+        return np.array([self.fastest + horizon * plant.dt * plant.largest_input[self.input_index]])
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
         speed, target = task_state

@@ -237,8 +237,8 @@ class AdversarialDisturbance(Disturbance):
     """The point of E(D) that does the most harm to the next state.
 
     Attributes:
-        M: Shape (n, n): maximize (x+)' M (x+). None: maximize the largest |c_j x+| of those it can move.
-        rows: Shape (r, n), in place of the rows c_j of the safe box, where M is None.
+        M: Shape (n, n): maximize (x+)' M (x+). None: maximize how far a c_j x+, of those it can move, is beyond an end.
+        rows: Shape (r, n), in place of the safe box where M is None, with ends -1 and 1.
 
     Raises:
         ValueError: If M is not symmetric positive semidefinite, or rows are no matrix.
@@ -260,13 +260,16 @@ class AdversarialDisturbance(Disturbance):
         bound = plant.nominal_disturbance
         if self.M is not None:
             return (1.0 - ROUNDING) * bound.farthest_point(nominal_next.T, self.M).T
-        rows = plant.box_rows if self.rows is None else self.rows
-        values = rows @ nominal_next
+        rows, (low, high) = plant.box, plant.box_ends
+        if self.rows is not None:
+            rows, low, high = self.rows, -np.ones(len(self.rows)), np.ones(len(self.rows))
+        values = (rows @ nominal_next).T
+        above, below = values - high, low - values
         reach = np.asarray(bound.support(rows))
         movable = reach > 0.0 if np.any(reach > 0.0) else np.ones(len(reach), np.bool_)
-        worst = np.argmax(np.where(movable, np.abs(values).T + reach, -1.0).T, axis=0)
+        worst = np.argmax(np.where(movable, np.maximum(above, below) + reach, -np.inf), axis=-1)
         extremes = np.stack([bound.extreme_point(row) for row in rows], axis=1)
-        signs = np.where(np.take_along_axis(values, worst[None], axis=0)[0] >= 0.0, 1.0, -1.0)
+        signs = np.where(np.take_along_axis(above >= below, worst[..., None], axis=-1)[..., 0], 1.0, -1.0)
         return (1.0 - ROUNDING) * signs * extremes[:, worst]
 
     def check(self, plant):  # noqa: D102

@@ -113,7 +113,7 @@ class GuaranteeMonitor:
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
         self._under_way = inputs_under_way(plant) if self._is_local else 0
-        self._limits = np.tile(plant.u_max, self._under_way // plant.m)
+        self._limits = np.tile([plant.input_middle, plant.input_half], self._under_way // plant.m)
 
     def start(self, known_inside: Any, unmoved: Any, report: LoopObservation, *, is_first: bool = True) -> MonitorState:
         """Returns the state at the start of an episode, or where the state of one is found.
@@ -199,9 +199,9 @@ class GuaranteeMonitor:
     def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
         if not self._under_way:
             return broken
-        sizes = (np.abs(report.estimate) + report.errors.half_widths)[-self._under_way :]
-        limits = self._limits if sizes.ndim == 1 else self._limits[:, None]
-        return _first(broken, _not(_rows_all(sizes <= limits)), LEFT_MODEL)
+        middle, half = self._limits if report.estimate.ndim == 1 else self._limits[..., None]
+        stored, errors = report.estimate[-self._under_way :], report.errors.half_widths[-self._under_way :]
+        return _first(broken, _not(_rows_all(np.abs(stored - middle) + errors <= half)), LEFT_MODEL)
 
     def _observe(
         self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True

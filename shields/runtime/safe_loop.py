@@ -292,12 +292,12 @@ class SafeLoop:
         """
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
-        limits, requests = self._filter.plant.u_max, self._requests
+        (low, high), requests = self._filter.plant.input_ends, self._requests
         if as_flag(ask, "ask"):
             requests = require_on_request(requests)
-        u = _as_input(proposed, limits.shape)  # what is none is decided as such
+        u = _as_input(proposed, low.shape)  # what is none is decided as such
         self._phase = _Phase.STOPPED
-        u = np.full_like(limits, np.nan) if u is None else np.minimum(np.maximum(u, -limits), limits)
+        u = np.full_like(low, np.nan) if u is None else np.minimum(np.maximum(u, low), high)
         decision = self._monitored.decide(u)
         self._inputs.commit(decision.input)
         if requests is not None:

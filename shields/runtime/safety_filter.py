@@ -74,6 +74,9 @@ class SafetyFilter(ReadOnlyArrays):
     test: SetTest = field(init=False, repr=False)
     lookahead: Lookahead | None = field(init=False, repr=False, default=None)
     _no_plan: np.ndarray = field(init=False, repr=False)
+    _constant: np.ndarray = field(init=False, repr=False)
+    _low: np.ndarray = field(init=False, repr=False)
+    _high: np.ndarray = field(init=False, repr=False)
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -88,6 +91,10 @@ class SafetyFilter(ReadOnlyArrays):
         require_computable(self.certificate, self.plant)
         object.__setattr__(self, "test", certificate_test(self.certificate, self.plant))
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
+        fallback = self.certificate.fallback
+        columns = {"_constant": fallback.constant, "_low": self.plant.input_low, "_high": self.plant.input_high}
+        for name, each in columns.items():
+            object.__setattr__(self, name, read_only(each[:, None]))
         object.__setattr__(self, "_remembered", {})
         if self.mode == "lookahead":
             from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
@@ -95,7 +102,7 @@ class SafetyFilter(ReadOnlyArrays):
             given = DEFAULT_HORIZON if self.horizon is None else self.horizon
             horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
             object.__setattr__(self, "horizon", horizon)
-            object.__setattr__(self, "lookahead", Lookahead(self.test, self.certificate.K, horizon, MARGIN))
+            object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, MARGIN))
         elif self.horizon is not None:
             raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
 
@@ -146,8 +153,8 @@ class SafetyFilter(ReadOnlyArrays):
 
     def _decide_alone(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
         """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected."""
-        for u, limit in zip(proposed.tolist(), self.test.limits, strict=True):
-            if not -limit <= u <= limit:  # neither NaN
+        for u, (low, high) in zip(proposed.tolist(), self.test.limits, strict=True):
+            if not low <= u <= high:  # neither NaN
                 return None
         test_margin, margin = self.test.margins_alone(estimate, errors, proposed)
         if test_margin >= MARGIN:
@@ -183,7 +190,7 @@ class SafetyFilter(ReadOnlyArrays):
         sets = self.test.reachable(estimates, errors)
         test_margin, margin = sets.margins(proposed)
         judged = sets.smallest_test_margin() if self.mode == "boundary" else test_margin
-        within: np.ndarray = np.abs(proposed) <= self.plant.u_max[:, None]
+        within: np.ndarray = (self._low <= proposed) & (proposed <= self._high)
         valid: np.ndarray = within[0] if len(within) == 1 else np.all(within, axis=0)
         passed = (judged >= MARGIN) & valid
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
@@ -343,12 +350,11 @@ class SafetyFilter(ReadOnlyArrays):
     @own_error_state
     def _gained(self, estimates: np.ndarray) -> np.ndarray:
         """Returns K x_hat as actions can express it, shape (m, N); NaN where it cannot be computed."""
-        gained = self.certificate.K @ estimates
+        gained = self.certificate.K @ estimates + self._constant
         return np.where(np.isfinite(gained).all(axis=0), self._expressible(gained), np.nan)
 
     def _expressible(self, inputs: np.ndarray) -> np.ndarray:
-        limits = self.plant.u_max if inputs.ndim == 1 else self.plant.u_max[:, None]
-        return expressible(inputs, limits)
+        return expressible(inputs.T, self.plant).T
 
 
 def _as_array(value: Any) -> np.ndarray:

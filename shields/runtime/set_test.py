@@ -33,6 +33,9 @@ ALTERNATIONS = 8
 ROOT_GROWTHS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
 # Outward rounding of rows that are divided by what is left of the box.
 _OUTWARD = 1.0 + 1e-12
+# An end of a row that is open counts as this far from the other one, in units of the row: a closer end is no less safe,
+# and no set is that wide.
+OPEN = 1e4
 # An estimate this far out, in units of S, is not worth a test (and its square overflows at 1e154).
 FARTHEST = 1e100
 # With a smaller radius 1 - h, rounding of the weights would no longer be small against it.
@@ -68,8 +71,7 @@ class SetTest:
         plant: Gives A, B, D, the limits and the rows between samples.
         cone: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n); (0, n) for P.
         rows: Those of P, shape (r, n); (0, n) for S.
-        low: Their lower ends, shape (r,). Where a limit is open, any number that nothing in P is beyond will do.
-        high: Their upper ends.
+        low, high: Their ends, shape (r,).
 
     Attributes:
         cone: k, the number of rows at the top of the arrays below that are coordinates of the cone.
@@ -85,19 +87,19 @@ class SetTest:
         pushed: Largest norm of |G| |B| |u| within the limits, or its largest entry.
         shift: Largest norm of G B u within the limits, or its largest entry, to which the rounding of an action is
             relative.
-        limits: Entries of u_max.
+        limits: The low and the high end of each input.
     """
 
     @own_error_state  # what is not finite passes no test
     def __init__(
         self, plant: LinearPlant, cone: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray
     ) -> None:
-        self.plant, self.cone, self.limits = plant, len(cone), plant.u_max.tolist()
+        self.plant, self.cone, self.limits = plant, len(cone), plant.input_ends.T.tolist()
         between, self.root = rows_between(plant), read_only(np.concatenate([cone, rows]))
         self.state_rows = read_only(np.concatenate([self.root @ plant.A, between.state]))
         self.input_rows = read_only(np.concatenate([self.root @ plant.B, between.input]))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
-        low, high = np.concatenate([low, between.low]), np.concatenate([high, between.high])
+        low, high = closed(np.concatenate([low, between.low]), np.concatenate([high, between.high]))
         self.middle = read_only(0.5 * (low + high))
         self.half = read_only(0.5 * (high - low) - self.rounding * np.abs(self.middle))
         self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
@@ -120,7 +122,7 @@ class SetTest:
     def _largest(self, pushes: np.ndarray) -> float:
         """Returns the same of the products with inputs within the limits."""
         cone, rows = pushes[: self.cone], pushes[self.cone :]
-        limits = self.plant.u_max
+        limits = self.plant.largest_input
         return max(float(np.linalg.norm(cone, axis=0) @ limits), float((rows @ limits).max(initial=0.0)))
 
     @own_error_state  # what overflows passes no test, what underflows does not count
@@ -199,7 +201,7 @@ class SetTest:
         if self.cone:
             pushed, offset = (errors.weighting.dot(each[: self.cone]) for each in (effect[:, 0], center))
             form = (float(pushed.dot(pushed)), float(pushed.dot(offset)), float(offset.dot(offset)))
-            u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0])
+            u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0][1])
         if len(self.disturbed):
             limits = (errors.row_limits - rounding)[:, None] - margin
             offset = (center[self.cone :] - self.middle)[:, None]
@@ -211,10 +213,10 @@ class SetTest:
 
         The offset is that from the middle.
         """
-        limits = self.plant.u_max[:, None]
-        rows = np.concatenate([self.input_rows[self.cone :], np.eye(len(limits))])
-        offset = np.concatenate([offset, np.zeros(inputs.shape)])
-        bounds = np.concatenate([row_limits, np.broadcast_to(limits, inputs.shape)])
+        middle, half = self.plant.input_middle[:, None], self.plant.input_half[:, None]
+        rows = np.concatenate([self.input_rows[self.cone :], np.eye(len(half))])
+        offset = np.concatenate([offset, np.broadcast_to(-middle, inputs.shape)])
+        bounds = np.concatenate([row_limits, np.broadcast_to(half, inputs.shape)])
         return closest_between(inputs, offset, rows[..., None], bounds)
 
     @own_error_state
@@ -307,13 +309,14 @@ class ReachableSets(NamedTuple):
 
     def smallest_test_margin(self) -> np.ndarray:
         """Returns that of the worst input within the limits, shape (N,); in the cone a vertex: the norm is convex."""
-        test, cone = self.test, self.test.cone
-        center = np.abs(test.state_rows[cone:] @ self.estimates - test.middle[:, None])
-        pushed = np.abs(test.input_rows[cone:]) @ test.plant.u_max
+        test, cone, plant = self.test, self.test.cone, self.test.plant
+        shift = test.input_rows[cone:] @ plant.input_middle - test.middle
+        center = np.abs(test.state_rows[cone:] @ self.estimates + shift[:, None])
+        pushed = np.abs(test.input_rows[cone:]) @ plant.input_half
         worst = (self.row_limits - center - pushed[:, None]).min(axis=0, initial=np.inf) - self.rounding
         if not cone:
             return worst
-        vertices = np.array(list(product(*((-limit, limit) for limit in test.limits)))).T
+        vertices = np.array(list(product(*test.limits))).T
         pieces = max(1, vertices.shape[1] * len(self.radius) // LARGEST_BLOCK)
         for some in np.array_split(vertices, pieces, axis=1):
             centers = self.center[:, None] + (test.input_rows[:cone] @ some)[:, :, None]
@@ -475,7 +478,8 @@ def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
 class RowsBetween(NamedTuple):
     """The box at the times tau_i, i = 1..N-1: low <= row (A_tau x + B_tau u) + disturbance <= high.
 
-    Rows are those of the box, divided by what eta leaves of it; no rows for a plant that counts at samples alone.
+    Rows are those of the box, divided by what eta leaves of half their range; no rows for a plant that counts at
+    samples alone.
 
     Attributes:
         state: Rows on x_hat, shape (g, n).
@@ -484,6 +488,7 @@ class RowsBetween(NamedTuple):
         disturbed: Support of the disturbances, shape (g,).
         at_samples: Rows on the state at a sampling instant, shape (k, n), from which the box is kept until the first of
             these times: those of the box divided by what eta and the disturbances leave, or the box's own.
+        low_at_samples, high_at_samples: Their ends, shape (k,).
     """
 
     state: np.ndarray
@@ -492,6 +497,8 @@ class RowsBetween(NamedTuple):
     high: np.ndarray
     disturbed: np.ndarray
     at_samples: np.ndarray
+    low_at_samples: np.ndarray
+    high_at_samples: np.ndarray
 
     def values(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Returns the rows at states x_hat, shape (N, n), and inputs, (N, m): shape (N, g), without any disturbance."""
@@ -501,23 +508,38 @@ class RowsBetween(NamedTuple):
 @own_error_state  # what is not finite passes no test
 def rows_between(plant: LinearPlant) -> RowsBetween:
     """Returns the rows of a plant's box between two samples."""
-    rows, grid = plant.box_rows, plant.grid_rows
+    rows, grid = plant.box, plant.grid_rows
     if grid is None:
         none = np.empty(0)
-        return RowsBetween(np.empty((0, plant.n)), np.empty((0, plant.m)), none, none, none, rows)
+        return RowsBetween(np.empty((0, plant.n)), np.empty((0, plant.m)), none, none, none, rows, *plant.box_ends)
     D, rounding = plant.disturbance.shape_matrix, 8.0 * plant.n * float(np.finfo(float).eps)
     left = (1.0 - grid.remainder) / _OUTWARD
     rho = supports(rows, D, rounding * (np.abs(rows) @ np.sqrt(np.diag(D))) ** 2)
     at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
     count = len(grid.state) - 1
+    low, high = _shrunk(plant.box_ends, left)
+    low_at_samples, high_at_samples = _shrunk(plant.box_ends, at_samples)
     return RowsBetween(
         state=read_only((grid.state[1:] / left[:, None]).reshape(-1, plant.n)),
         input=read_only((grid.input[1:] / left[:, None]).reshape(-1, plant.m)),
-        low=read_only(np.full(count * len(rows), -1.0)),
-        high=read_only(np.ones(count * len(rows))),
+        low=read_only(np.tile(low, count)),
+        high=read_only(np.tile(high, count)),
         disturbed=read_only(np.tile(np.where(left > 0.0, rho / left, np.inf), count)),
         at_samples=read_only(rows / at_samples[:, None]),
+        low_at_samples=read_only(low_at_samples),
+        high_at_samples=read_only(high_at_samples),
     )
+
+
+def _shrunk(ends: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends, shape (k,) each, of rows that are divided by what is left of half their range, shape (k,)."""
+    (low, high), some = ends, left > 0.0
+    return np.where(some, (low + 1.0 - left) / left, -1.0), np.where(some, (high - 1.0 + left) / left, 1.0)
+
+
+def closed(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns finite ends for ends of which one may be open."""
+    return np.where(np.isfinite(low), low, high - OPEN), np.where(np.isfinite(high), high, low + OPEN)
 
 
 def norms(vectors: np.ndarray) -> np.ndarray:
@@ -575,9 +597,11 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
         CertificateError: If it does not.
     """
     extent = np.sqrt(np.diag(certificate.L))
-    if certificate.polytope is not None:  # anywhere in the box: x'C'Cx is at most the number of its rows there
-        extent = np.maximum(extent, len(plant.box_rows) ** 0.5 * plant.half_widths)
+    if certificate.polytope is not None:
+        extent = np.maximum(extent, certificate.polytope.widths)
     extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
-    error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
-    if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
+    extent = extent + 2.0 * np.abs(certificate.resting_state)
+    sizes = np.abs(certificate.K) @ extent + np.abs(certificate.resting_input)
+    error = (plant.n + 2) * np.finfo(float).eps * sizes
+    if not (error <= 0.25 * float(ACTION_ROUNDING) * plant.input_half).all():
         raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")

@@ -6,6 +6,7 @@ x_1 .. x_c follows from that.
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -51,7 +52,8 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
             [1, x'; x, L] >= 0. Either is inside a polytope exactly if it is between all its pairs of faces.
     """
     if certificate.polytope is not None:
-        return _between(certificate.polytope.rows, initial)
+        P = certificate.polytope
+        return _between(P.rows, P.low, P.high, initial)
     L = rational(certificate.L)
     if isinstance(initial, Ellipsoid):
         return is_positive_semidefinite(subtract(L, rational(initial.shape_matrix)))
@@ -63,30 +65,37 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
 def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether all starts in an ellipsoid, or one state, shape (n,), lie in the safe box, in exact arithmetic.
 
-    E(P) does exactly if c_i P c_i' <= 1 for all rows. Where the box counts between samples, they have to lie in a
+    E(P) does exactly if c_i P c_i' is at most the square of the nearer end for all rows. Where the box counts between samples, they have to lie in a
     smaller one, in which disturbances cannot leave it.
     """
-    return _between(rows_between(plant).at_samples, initial)
+    between = rows_between(plant)
+    return _between(between.at_samples, between.low_at_samples, between.high_at_samples, initial)
 
 
-def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
-    if not isinstance(initial, Ellipsoid) and (verdict := _surely_between(bounds, initial)) is not None:
+def _between(rows: np.ndarray, low: np.ndarray, high: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether low <= g x <= high for all rows g, shape (r, n), and all x in an ellipsoid, or one state."""
+    if not isinstance(initial, Ellipsoid) and (verdict := _surely_between(rows, low, high, initial)) is not None:
         return verdict  # a thousand times faster than in rational arithmetic
-    rows = rational(bounds)
+    given, ends = rational(rows), list(zip(low.tolist(), high.tolist(), strict=True))
     if isinstance(initial, Ellipsoid):
         shape = rational(initial.shape_matrix)
-        return all(quadratic([row], shape) <= 1 for row in rows)
-    return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))
+        nearest = [min(-lo, hi) for lo, hi in ends]  # exact: none of them rounds
+        return all(
+            near > 0.0 and quadratic([row], shape) <= Fraction(near) ** 2
+            for row, near in zip(given, nearest, strict=True)
+        )
+    products = multiply(given, transpose(rational(initial)))
+    return all(lo <= product <= hi for (product,), (lo, hi) in zip(products, ends, strict=True))
 
 
 @own_error_state  # what is not finite is no verdict
-def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
-    """Returns whether |g x| <= 1 for all rows g, shape (r, n), and one state; None where rounding could decide it."""
-    products, sizes = np.abs(bounds @ state), np.abs(bounds) @ np.abs(state)
+def _surely_between(rows: np.ndarray, low: np.ndarray, high: np.ndarray, state: np.ndarray) -> bool | None:
+    """Returns whether low <= g x <= high for all rows and one state; None where rounding could decide it."""
+    products, sizes = rows @ state, np.abs(rows) @ np.abs(state)
     rounding = (len(state) + 2) * float(np.finfo(float).eps) * sizes + float(np.finfo(float).tiny)
-    if (products + rounding <= 1.0).all():
+    if ((low <= products - rounding) & (products + rounding <= high)).all():
         return True
-    return False if (products - rounding > 1.0).any() else None
+    return False if ((products + rounding < low) | (products - rounding > high)).any() else None
 
 
 def starts_known(

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
+from ncs_gym import LinearPlant
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
@@ -152,7 +153,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         actions, proposed = read_actions(self._filter.plant, actions, self.num_envs)
         decided = self._filter.decide_columns(self._report.estimate, self._report.errors, proposed, self._stored)
         if self._filter.mode != "monitor" and np.count_nonzero(decided.intervened):
-            actions = overridden(actions, decided, self._filter.plant.u_max)
+            actions = overridden(actions, decided, self._filter.plant)
         if self._inner.render_mode is not None:
             e = self._inner.rendered_env
             plan, acted = decided.plan[..., e], bool(decided.intervened[e])
@@ -326,10 +327,10 @@ def _as_decided(known: Known, decided: np.ndarray, due: np.ndarray | None) -> tu
     return (known.committed == decided).all(axis=0), (known.applied == due).all(axis=0)
 
 
-def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarray:
+def overridden(actions: Any, decided: Decision, plant: LinearPlant) -> np.ndarray:
     """Returns the actions, shape (N, m), with those that stand for the inputs decided where the shield intervened."""
     numbers = np.asarray(actions)
     numbers = numbers.astype(np.float32 if numbers.dtype == np.float32 else np.float64)
     chosen = np.flatnonzero(decided.intervened)
-    numbers[chosen] = nearest_action(decided.input[:, chosen].T, limits)
+    numbers[chosen] = nearest_action(decided.input[:, chosen].T, plant)
     return numbers

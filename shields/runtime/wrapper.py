@@ -254,7 +254,7 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         (episode, step), self._clock = self._clock, INTERRUPTED
         decision = self._monitored.decide(proposed)
         if decision.intervened and self._filter.mode != "monitor":
-            action = nearest_action(decision.input, self._filter.plant.u_max)
+            action = nearest_action(decision.input, self._filter.plant)
         if self._is_drawn:
             count = self._interventions + decision.intervened
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)

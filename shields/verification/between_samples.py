@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
-from shields.verification.polytope_conditions import half_widths, reach, root_above
+from shields.verification.polytope_conditions import faces_of, root_above, widths_of
 from shields.verification.rational_matrix import (
     Matrix,
     add,
@@ -19,6 +19,7 @@ from shields.verification.rational_matrix import (
     multiply,
     quadratic,
     rational,
+    transpose,
     weighted_size,
 )
 
@@ -42,49 +43,55 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     yield flag("between samples: the certificate has the plant's grid", claimed)
     if rows is None or model is None or points is None or not claimed:
         return
-    (k, n), m = plant.box_rows.shape, plant.m
+    (k, n), m = plant.box.shape, plant.m
     fits = rows.state.shape == (points, k, n) and rows.input.shape == (points, k, m) and model.shape == (n, n + m)
     fits = fits and rows.remainder.shape == (k,) and bool(np.isfinite(rows.remainder).all())
-    fits = fits and bool((rows.state[0] == plant.box_rows).all()) and not rows.input[0].any()
+    fits = fits and bool((rows.state[0] == plant.box).all()) and not rows.input[0].any()
     yield flag("between samples: the grid has all its points and begins with the safe box", fits)
-    widths = half_widths(rational(plant.box_rows))
+    ends = ([Fraction(float(end)) if np.isfinite(end) else None for end in side] for side in plant.box_ends)
+    widths = widths_of(rational(plant.box), *ends)
     yield flag("between samples: the box bounds every state", widths is not None)
     if not fits or widths is None:
         return
-    sizes = widths + [Fraction(float(limit)) for limit in plant.u_max]
+    sizes = widths + [Fraction(float(limit)) for limit in plant.largest_input]
     G, eta = rational(np.concatenate([model, np.zeros((m, n + m))])), rational(rows.remainder)[0]
-    sampled = multiply(rational(plant.box_rows), rational(np.concatenate([plant.A, plant.B], axis=1)))
-    for j, box_row in enumerate(rational(plant.box_rows)):
+    sampled = multiply(rational(plant.box), rational(np.concatenate([plant.A, plant.B], axis=1)))
+    for j, box_row in enumerate(rational(plant.box)):
         grid = [*rational(np.concatenate([rows.state[:, j], rows.input[:, j]], axis=1)), sampled[j]]
         least = _remainder(box_row + [Fraction(0)] * m, grid, G, sizes, Fraction(plant.dt))
         left = Fraction(-1) if least is None else eta[j] - least
         yield scalar_condition(f"(G) what is between grid points is at most eta of row {j + 1}", left)
-    yield from _closed_loop_conditions(certificate, plant, widths)
+    yield from _closed_loop_conditions(certificate, plant)
 
 
-def _closed_loop_conditions(
-    certificate: Certificate, plant: LinearPlant, widths: list[Fraction]
-) -> Iterator[Condition]:
-    """Checks (B), and (PB) if there is a polytope: with u = K x_hat every point of the grid is inside."""
-    rows, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box_rows)
+def _closed_loop_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks (B), and (PB) if there is a polytope: with the fallback every point of the grid is inside.
+
+    All is counted from the resting point, at which c x has a value of its own at every time.
+    """
+    rows, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box)
     assert rows is not None
     L, K, D = rational(certificate.L), rational(certificate.K), rational(certificate.D)
+    x_c, u_c = rational(certificate.resting_state), rational(certificate.resting_input)
     errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
-    limits, faces = [Fraction(float(limit)) for limit in plant.u_max], None if polytope is None else polytope.rows
-    G = None if faces is None else rational(faces)
-    for j, row in enumerate(rational(plant.box_rows)):
-        allowed = 1 - Fraction(float(rows.remainder[j])) - root_above(quadratic([row], D))
+    half = [Fraction(float(each)) for each in plant.input_half]
+    faces = None if polytope is None else faces_of(polytope)
+    for j, row in enumerate(rational(plant.box)):
+        taken = Fraction(float(rows.remainder[j])) + root_above(quadratic([row], D))
         for i in range(len(rows.state)):
-            pushed = rational(rows.input[i, j])
-            image = add(rational(rows.state[i, j]), multiply(pushed, K))[0]
-            left = allowed - root_above(max(quadratic(pushed, error) for error in errors))
-            left -= ACTION_ROUNDING * weighted_size(pushed[0], limits)
-            if certificate.keeps_ellipsoid:
-                on_ellipsoid = left - root_above(quadratic([image], L))
+            moved, pushed = rational(rows.state[i, j]), rational(rows.input[i, j])
+            image = add(moved, multiply(pushed, K))[0]
+            least = taken + root_above(max(quadratic(pushed, error) for error in errors))
+            least += ACTION_ROUNDING * weighted_size(pushed[0], half)
+            at_rest = multiply(moved, transpose(x_c))[0][0] + multiply(pushed, transpose(u_c))[0][0]
+            low, high = (
+                Fraction(float(ends[j])) - at_rest if np.isfinite(ends[j]) else None for ends in plant.box_ends
+            )
+            if certificate.keeps_ellipsoid:  # symmetric limits
+                on_ellipsoid = 1 - least - root_above(quadratic([image], L))
                 yield scalar_condition(f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", on_ellipsoid)
-            if polytope is not None and G is not None:
-                multipliers = polytope.multipliers[len(G) + plant.m + i * k + j]
-                left -= reach(image, multipliers, G, widths)
+            if polytope is not None and faces is not None:
+                left = faces.left_of(image, len(faces.rows) + plant.m + i * k + j, low, high) - least
                 yield scalar_condition(f"(PB) |c x| + rho <= 1 - eta on the polytope at tau_{i} of row {j + 1}", left)
 
 

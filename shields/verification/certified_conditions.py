@@ -13,7 +13,7 @@ from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
 from shields.verification.between_samples import between_conditions
 from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
-from shields.verification.polytope_conditions import polytope_conditions
+from shields.verification.polytope_conditions import faces_of, polytope_conditions
 from shields.verification.rational_matrix import (
     Matrix,
     add,
@@ -36,6 +36,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
     conditions = [flag("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)]
     if not fits:
         return conditions
+    if certificate.keeps_ellipsoid and (not plant.is_symmetric or certificate.resting_state.any()):
+        return [*conditions, flag("S: an ellipsoid is kept only around zero, within symmetric limits", False)]
     conditions += _multiplier_conditions(certificate)
     if all(condition.holds for condition in conditions):
         conditions += _bound_conditions(certificate, plant)
@@ -77,6 +79,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     required = _with_declared(required, plant.remainder_bound, weight)
     bound, D = rational(plant.disturbance.shape_matrix), certificate.D
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
+    bound = _sum_bound(bound, _restlessness(certificate, plant), weight)
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(D), bound))
     identity = rational(np.eye(plant.p))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
@@ -92,6 +95,18 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     yield matrix_condition(
         "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape_matrix), first)
     )
+
+
+def _restlessness(certificate: Certificate, plant: LinearPlant) -> Matrix:
+    """Returns the shape r r' of what the resting point lacks of an equilibrium, r = A x_c + B u_c - x_c."""
+    x_c, u_c = (rational(point)[0] for point in (certificate.resting_state, certificate.resting_input))
+    r = [
+        sum((a * x for a, x in zip(row, x_c, strict=True)), Fraction(0))
+        + sum((b * u for b, u in zip(pushed, u_c, strict=True)), Fraction(0))
+        - x
+        for row, pushed, x in zip(rational(plant.A), rational(plant.B), x_c, strict=True)
+    ]
+    return [[a * b for b in r] for a in r]
 
 
 def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
@@ -150,8 +165,10 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
     if not certificate.keeps_ellipsoid and certificate.polytope is not None:
-        for i, row in enumerate(certificate.polytope.rows):
-            yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", 1 - quadratic(rational(row), L))
+        faces = faces_of(certificate.polytope)
+        for i, row in enumerate(faces.rows if faces else ()):
+            ends = [abs(end) for end in (faces.low[i], faces.high[i]) if end is not None]
+            yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", min(ends) ** 2 - quadratic([row], L))
         return
     BK, D, s = multiply(B, K), certificate.D, certificate.rounding
     D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,50 +29,124 @@ _ROOT_DIGITS = 128
 
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (P) and (PU): the polytope is in the box, invariant under u = K x_hat, which respects the input limits.
+    """Checks (P) and (PU): the polytope is in the box, invariant under the fallback, which respects the input limits.
 
-    With r = g (A+BK) - lambda G the next |g x+| is at most sum |lambda| + sum_k |r_k| w_k + s + d, where s bounds the
-    root of g BK Sigma (BK)' g' for all error sets, and d that of g D g' and what rounding the action does.
+    All is counted from the resting point, where the fallback is u = K x_hat. With r = g (A+BK) - lambda G the next g x+
+    is at most sum_i max(lambda_i high_i, lambda_i low_i) + sum_k |r_k| w_k + s + d, where s bounds the root of g BK
+    Sigma (BK)' g' for all error sets, and d that of g D g' and what rounding the action does; from below likewise.
     """
-    rows, box = polytope.rows, plant.box_rows
+    rows, box = polytope.rows, plant.box
     images = len(rows) + plant.m + len(box) * (plant.between_samples or 0)
     fits = polytope.multipliers.shape == (images, len(rows))
     yield flag("polytope: shapes", fits)
     if not fits:
         return
     leads = len(rows) >= len(box) and bool((rows[: len(box)] == box).all())
+    ends = (polytope.low[: len(box)], plant.box_low), (plant.box_high, polytope.high[: len(box)])
+    leads = leads and all(bool((least <= most).all()) for most, least in ends)
     yield flag("polytope: its first rows are those of the safe box", leads)
-    widths = half_widths(rational(box))
-    yield flag("polytope: the box bounds every state", widths is not None)
-    if not leads or widths is None:
+    if not leads:
         return
-    G, B, K = rational(rows), rational(plant.B), rational(certificate.K)
+    faces = faces_of(polytope)
+    yield flag("polytope: it bounds every state", faces is not None)
+    if faces is None:
+        return
+    G, B, K = faces.rows, rational(plant.B), rational(certificate.K)
     next_rows = multiply(G, add(rational(plant.A), multiply(B, K)))
     pushed, D = multiply(G, B), rational(certificate.D)
     errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
-    limits = [Fraction(float(limit)) for limit in plant.u_max]
-    multipliers = polytope.multipliers
+    half = [Fraction(float(each)) for each in plant.input_half]
     for i, image in enumerate(next_rows):
         s = root_above(max(quadratic([pushed[i]], error) for error in errors))
         d = root_above(quadratic([G[i]], D))
-        d += ACTION_ROUNDING * weighted_size(pushed[i], limits)
-        left = 1 - reach(image, multipliers[i], G, widths) - s - d
+        d += ACTION_ROUNDING * weighted_size(pushed[i], half)
+        left = faces.left_of(image, i, faces.low[i], faces.high[i]) - s - d
         yield scalar_condition(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
-    for i, (gain, limit) in enumerate(zip(K, limits, strict=True)):
-        rho = limit * root_above(max(error[i][i] for error in errors) / limit**2)
-        allowed = limit * (1 - ACTION_ROUNDING)
-        left = allowed - reach(gain, multipliers[len(rows) + i], G, widths) - rho
+    for i, (gain, limit) in enumerate(zip(K, half, strict=True)):
+        rho = limit * root_above(max(error[i][i] for error in errors) / limit**2) + ACTION_ROUNDING * limit
+        u_c = Fraction(float(certificate.resting_input[i]))
+        low, high = (Fraction(float(end[i])) - u_c for end in (plant.input_low, plant.input_high))
+        left = faces.left_of(gain, len(rows) + i, low, high) - rho
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
 
 
-def reach(image: list[Fraction], multipliers: np.ndarray, G: Matrix, widths: list[Fraction]) -> Fraction:
-    """Returns sum |lambda| + sum_k |r_k| w_k, which bounds |image x| on the polytope."""
-    rest, total = list(image), Fraction(0)
-    for index in np.flatnonzero(multipliers):
-        multiplier = Fraction(float(multipliers[index]))
-        total += abs(multiplier)
-        rest = [left - multiplier * entry for left, entry in zip(rest, G[index], strict=True)]
-    return total + weighted_size(rest, widths)
+class Faces(NamedTuple):
+    """A polytope around its center, in rational numbers.
+
+    Attributes:
+        rows: G.
+        low, high: Ends of the rows from the center; None where there is none.
+        multipliers, lower_multipliers: Those of the polytope.
+        widths: w, bounds of |x_k|.
+    """
+
+    rows: Matrix
+    low: list[Fraction | None]
+    high: list[Fraction | None]
+    multipliers: np.ndarray
+    lower_multipliers: np.ndarray
+    widths: list[Fraction]
+
+    def left_of(self, image: list[Fraction], number: int, low: Fraction | None, high: Fraction | None) -> Fraction:
+        """Returns the least distance of image x from two ends while x is in the polytope, as multipliers prove it.
+
+        Args:
+            image: The row, shape (n,).
+            number: Of its multipliers.
+            low, high: The ends; None where there is none.
+        """
+        distances = []
+        if high is not None:
+            distances.append(high - self._reach(image, self.multipliers[number], self.high, self.low))
+        if low is not None:
+            reached = self._reach([-entry for entry in image], -self.lower_multipliers[number], self.high, self.low)
+            distances.append(-low - reached)
+        return min(distances)
+
+    def _reach(
+        self, image: list[Fraction], multipliers: np.ndarray, above: list[Fraction | None], below: list[Fraction | None]
+    ) -> Fraction:
+        """Returns sum_i max(lambda_i high_i, lambda_i low_i) + sum_k |r_k| w_k, which bounds image x from above."""
+        rest, total = list(image), Fraction(0)
+        for index in np.flatnonzero(multipliers):
+            multiplier = Fraction(float(multipliers[index]))
+            end = above[index] if multiplier > 0 else below[index]
+            if end is None:  # the row does not bound it: without this multiplier more is left
+                continue
+            total += multiplier * end
+            rest = [left - multiplier * entry for left, entry in zip(rest, self.rows[index], strict=True)]
+        return total + weighted_size(rest, self.widths)
+
+
+def faces_of(polytope: Polytope) -> Faces | None:
+    """Returns a polytope around its center in rational numbers; None if its rows do not bound every state."""
+    rows, center = rational(polytope.rows), rational(polytope.center)[0]
+    reached = [sum((g * c for g, c in zip(row, center, strict=True)), Fraction(0)) for row in rows]
+    low, high = (
+        [Fraction(float(end)) - at if np.isfinite(end) else None for end, at in zip(ends, reached, strict=True)]
+        for ends in (polytope.low, polytope.high)
+    )
+    widths = widths_of(rows, low, high)
+    return widths and Faces(rows, low, high, polytope.multipliers, polytope.lower_multipliers, widths)
+
+
+def widths_of(rows: Matrix, low: list[Fraction | None], high: list[Fraction | None]) -> list[Fraction] | None:
+    """Returns bounds of |x_k| over low <= g_j x <= high; None if there are none.
+
+    They follow from the first rows with two ends that bound every state, C, of sizes |C x|_j <= s_j: x = (C'C)^-1 C' C
+    x, so that is a sum of absolute values of a row of this matrix times s. Adding rows keeps C'C definite.
+    """
+    chosen, sizes = [], []
+    n, widths = len(rows[0]), None
+    for row, lo, hi in zip(rows, low, high, strict=True):
+        if lo is None or hi is None:
+            continue
+        size = max(-lo, hi)
+        chosen.append([entry / size for entry in row] if size != 1 else row)
+        sizes.append(size)
+        if len(chosen) >= n and (widths := half_widths(chosen)) is not None:
+            return widths
+    return None
 
 
 def half_widths(box: Matrix) -> list[Fraction] | None:

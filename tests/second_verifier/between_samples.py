@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, ctx, fmpq
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
@@ -22,7 +22,7 @@ from tests.second_verifier.exact import (
     number,
     reach_of,
 )
-from tests.second_verifier.polytope import box_extents
+from tests.second_verifier.polytope import Inside, extents
 
 
 def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -34,22 +34,23 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     yield is_so("between samples: the certificate has the plant's grid", is_claimed)
     if grid is None or plant.continuous_model is None or points is None or not is_claimed:
         return
-    (k, n), m, polytope = plant.box_rows.shape, plant.m, certificate.polytope
+    (k, n), m, polytope = plant.box.shape, plant.m, certificate.polytope
     kept = (grid.state.shape, grid.input.shape, grid.remainder.shape) == ((points, k, n), (points, k, m), (k,))
     if kept:
-        first = np.concatenate([grid.state[0] - plant.box_rows, grid.input[0]], axis=1)
+        first = np.concatenate([grid.state[0] - plant.box, grid.input[0]], axis=1)
         kept = bool(np.isfinite(grid.remainder).all()) and not np.count_nonzero(first)
     yield is_so("between samples: the grid has all its points and begins with the safe box", kept)
-    widths = box_extents(matrix(plant.box_rows))
+    ends = [[number(end) if np.isfinite(end) else None for end in pair] for pair in plant.box_ends.T]
+    widths = extents(matrix(plant.box).tolist(), ends)
     yield is_so("between samples: the box bounds every state", widths is not None)
     if not kept or widths is None:
         return
     with ctx.workprec(PRECISION):
-        for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.u_max])):
+        for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.largest_input])):
             name = f"(G) what is between grid points is at most eta of row {j + 1}"
             yield ball_at_least_zero(name, arb(number(grid.remainder[j])) - least)
         if polytope is None or len(polytope.multipliers) == len(polytope.rows) + m + k * points:
-            yield from _gain_conditions(certificate, plant, widths)
+            yield from _gain_conditions(certificate, plant)
 
 
 def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
@@ -58,10 +59,10 @@ def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
     assert grid is not None
     assert model is not None
     assert points is not None
-    (k, _), m, dt = plant.box_rows.shape, plant.m, number(plant.dt)
+    (k, _), m, dt = plant.box.shape, plant.m, number(plant.dt)
     size = len(sizes)
     G = matrix(np.vstack([model, np.zeros((m, size))]))
-    box = matrix(np.hstack([plant.box_rows, np.zeros((k, m))]))
+    box = matrix(np.hstack([plant.box, np.zeros((k, m))]))
     rates = [
         G[i, i] + sum((abs(G[i, j]) * sizes[j] for j in range(size) if j != i), fmpq(0)) / sizes[i] for i in range(size)
     ]
@@ -70,7 +71,7 @@ def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
     for i in range(points + 1):
         true = arb_mat(box) * arb_mat(G * (dt * i / points)).exp()
         if i == points:  # the sampled plant itself
-            rows = matrix(plant.box_rows) * matrix(np.hstack([plant.A, plant.B]))
+            rows = matrix(plant.box) * matrix(np.hstack([plant.A, plant.B]))
         else:
             rows = matrix(np.hstack([grid.state[i], grid.input[i]]))
         bend = true * arb_mat(G * G)
@@ -84,29 +85,29 @@ def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
     return [error + square * growth * bend for error, bend in zip(errors, bends, strict=True)]
 
 
-def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[Any]) -> Iterator[Condition]:
+def _gain_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (B), and (PB) if there is a polytope."""
-    grid, polytope, (k, n) = plant.grid_rows, certificate.polytope, plant.box_rows.shape
+    grid, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box)
     assert grid is not None
     L, K, D = matrix(certificate.L), matrix(certificate.K), matrix(certificate.D)
     errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
-    limits = [number(limit) for limit in plant.u_max]
-    G = None if polytope is None else matrix(polytope.rows).tolist()
+    rest = matrix(np.concatenate([certificate.resting_state, certificate.resting_input])).transpose()
+    half = [number(each) for each in plant.input_half]
+    inside = None if polytope is None else Inside.of(polytope)
     for i, (state, pushed) in enumerate(zip(grid.state, grid.input, strict=True)):
         for j in range(k):
             push = matrix(pushed[j])
             image = matrix(state[j]) + push * K
-            rest = 1 - number(grid.remainder[j])
-            rest -= FLOAT32 * reach_of(push, limits)
-            left = arb(rest) - arb(form(matrix(plant.box_rows[j]), D)).sqrt()
-            left -= arb(max(form(push, error) for error in errors)).sqrt()
+            taken = arb(number(grid.remainder[j]) + FLOAT32 * reach_of(push, half))
+            taken += arb(form(matrix(plant.box[j]), D)).sqrt()
+            taken += arb(max(form(push, error) for error in errors)).sqrt()
             where = f"tau_{i} of row {j + 1}"
             if certificate.keeps_ellipsoid:
                 name = f"(B) |c x| + rho <= 1 - eta on S at {where}"
-                yield ball_at_least_zero(name, left - arb(form(image, L)).sqrt())
-            if polytope is not None and G is not None:
-                given = polytope.multipliers[len(polytope.rows) + plant.m + i * k + j]
-                used = [(int(index), number(given[index])) for index in np.flatnonzero(given)]
-                over = image - sum((value * fmpq_mat([G[index]]) for index, value in used), fmpq_mat(1, n))
-                reach = sum((abs(value) for _, value in used), reach_of(over, widths))
-                yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left - arb(reach))
+                yield ball_at_least_zero(name, 1 - taken - arb(form(image, L)).sqrt())
+            if polytope is not None and inside is not None:
+                at_rest = (matrix(np.concatenate([state[j], pushed[j]])) * rest)[0, 0]
+                ends = [number(end[j]) - at_rest if np.isfinite(end[j]) else None for end in plant.box_ends]
+                which = len(polytope.rows) + plant.m + i * k + j
+                left = inside.distance(image.tolist()[0], which, *ends) - taken
+                yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left)

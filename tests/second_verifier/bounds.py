@@ -11,7 +11,7 @@ from flint import arb, ctx, fmpq
 
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
-from shields.certificate import Updates
+from shields.certificate import Certificate
 from shields.verification.conditions import Condition
 from tests.second_verifier.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number
 
@@ -31,21 +31,24 @@ class Part(NamedTuple):
     size: float
 
 
-def bound_conditions(D: Any, updates: Updates | None, plant: LinearPlant) -> Iterator[Condition]:
+def bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks D, the plant's own sets, and N of a contract, against what the plant declares.
 
     Args:
-        D: Exact shape of the certificate's disturbance set, (n, n).
-        updates: What a contract adds to the proofs, if there is one.
+        certificate: The certificate.
         plant: The plant.
     """
+    D, updates = matrix(certificate.D), certificate.updates
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
     own = matrix(plant.disturbance.shape_matrix)
     ball = _part(number(plant.gamma) * identity(plant.n), weight)
     declared = [_declared(bound, weight) for bound in (plant.disturbance_bound, plant.remainder_bound)]
     disturbed = [ball, _noise(plant.process_noise, weight), *declared]
     yield _holds_sum("D: the plant's holds the disturbance and the process noise", own, disturbed)
-    yield definite("D: the certificate's holds the plant's", D - own)
+    x_c, u_c = (matrix(each).transpose() for each in (certificate.resting_state, certificate.resting_input))
+    moved = matrix(plant.A) * x_c + matrix(plant.B) * u_c - x_c  # zero at an equilibrium
+    both = [_part(own, weight), _part(moved * moved.transpose(), weight)]
+    yield _holds_sum("D: the certificate's holds the plant's", D, both)
     sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.sensor_bound, quantizer)]
     if updates is None:
         yield _holds_sum("N: holds the sensor noise", matrix(plant.sensor_error.shape_matrix), sensed)

@@ -25,7 +25,7 @@ from tests.second_verifier.exact import (
     matrix,
     number,
 )
-from tests.second_verifier.polytope import polytope_conditions
+from tests.second_verifier.polytope import Inside, polytope_conditions
 
 
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -34,12 +34,15 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield is_so("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)
     if not fits:
         return
+    if certificate.keeps_ellipsoid and not (plant.is_symmetric and not certificate.resting_state.any()):
+        yield is_so("S: an ellipsoid is kept only around zero, within symmetric limits", False)
+        return
     ranges = list(_range_conditions(certificate))
     yield from ranges
     if not all(condition.holds for condition in ranges):
         return
     D = matrix(certificate.D)
-    yield from bound_conditions(D, certificate.updates, plant)
+    yield from bound_conditions(certificate, plant)
     yield from _error_conditions(certificate, D, plant)
     yield from _safe_set_conditions(certificate, D, plant)
     if certificate.polytope is not None:
@@ -116,8 +119,10 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
     if certificate.polytope is not None and not certificate.keeps_ellipsoid:
-        for i, row in enumerate(certificate.polytope.rows):
-            yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", 1 - form(matrix(row), L))
+        inside = Inside.of(certificate.polytope)
+        for i, row in enumerate(certificate.polytope.rows if inside else ()):
+            nearest = min(abs(end) for end in inside.ends[i] if end is not None)
+            yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", nearest * nearest - form(matrix(row), L))
         return
     for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))

@@ -27,46 +27,92 @@ from tests.second_verifier.exact import (
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (P) and (PU) without the code of the first engine; what cannot be stated is left out."""
-    r, (k, n) = len(polytope.rows), plant.box_rows.shape
+    r, (k, n) = len(polytope.rows), plant.box.shape
     images = r + plant.m + k * (plant.between_samples or 0)
     fits = polytope.multipliers.shape == (images, r)
     yield is_so("polytope: shapes", fits)
     if not fits:
         return
-    leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box_rows.ravel(), strict=True))
+    leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box.ravel(), strict=True))
+    leads = leads and not (polytope.low[:k] < plant.box_low).any() and not (polytope.high[:k] > plant.box_high).any()
     yield is_so("polytope: its first rows are those of the safe box", leads)
-    widths = box_extents(matrix(plant.box_rows))
-    yield is_so("polytope: the box bounds every state", widths is not None)
-    if not leads or widths is None:
+    if not leads:
         return
-    G, B, K = matrix(polytope.rows), matrix(plant.B), matrix(certificate.K)
-    D = matrix(certificate.D)
-    closed = matrix(plant.A) + B * K
-    Lambda = matrix(polytope.multipliers[: r + plant.m])
-    rest = fmpq_mat((G * closed).tolist() + K.tolist()) - Lambda * G
-    bounds = [
-        sum((abs(Lambda[i, j]) for j in np.flatnonzero(polytope.multipliers[i]).tolist()), fmpq(0))
-        + sum((abs(rest[i, j]) * widths[j] for j in range(n)), fmpq(0))
-        for i in range(r + plant.m)
-    ]
-    u_max = [number(limit) for limit in plant.u_max]
+    inside = Inside.of(polytope)
+    yield is_so("polytope: it bounds every state", inside is not None)
+    if inside is None:
+        return
+    B, K, D = matrix(plant.B), matrix(certificate.K), matrix(certificate.D)
+    images, gains = (inside.G * (matrix(plant.A) + B * K)).tolist(), K.tolist()
     errors = [matrix(proof.Sigma) for proof in certificate.proofs]
-    images, gains = [mapped(B * K, Sigma) for Sigma in errors], [mapped(K, Sigma) for Sigma in errors]
+    half = [number(each) for each in plant.input_half]
     with ctx.workprec(PRECISION):
-        for i in range(r):
-            row = fmpq_mat([G.tolist()[i]])
-            largest = max(form(row, image) for image in images)
-            rounding = reach_of(row * B, u_max) * FLOAT32
-            left = arb(1 - bounds[i] - rounding) - arb(largest).sqrt() - arb(form(row, D)).sqrt()
+        for i, image in enumerate(images):
+            row = fmpq_mat([inside.G.tolist()[i]])
+            largest = max(form(row, mapped(B * K, Sigma)) for Sigma in errors)
+            left = inside.distance(image, i, *inside.ends[i]) - arb(reach_of(row * B, half) * FLOAT32)
+            left -= arb(largest).sqrt() + arb(form(row, D)).sqrt()
             yield ball_at_least_zero(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
-        for i in range(plant.m):
-            largest = max(gain[i, i] for gain in gains)
-            left = arb(u_max[i] * (1 - FLOAT32) - bounds[r + i]) - arb(largest).sqrt()
+        for i, gain in enumerate(gains):
+            largest = max(mapped(K, Sigma)[i, i] for Sigma in errors)
+            ends = [number(end[i]) - number(certificate.resting_input[i]) for end in plant.input_ends]
+            left = inside.distance(gain, r + i, *ends) - arb(FLOAT32 * half[i]) - arb(largest).sqrt()
             yield ball_at_least_zero(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
 
 
+class Inside:
+    """What is known of x in a polytope, counted from its center.
+
+    Attributes:
+        G: Its rows.
+        ends: Low and high end of each row; None for open ones.
+        widths: Bounds of |x_i|.
+    """
+
+    @classmethod
+    def of(cls, polytope: Polytope) -> Inside | None:
+        """Returns it, or None if some state is not bounded."""
+        inside = cls()
+        inside.G = matrix(polytope.rows)
+        at_center = (inside.G * matrix(polytope.center).transpose()).tolist()
+        inside.ends = [
+            [number(end) - value if np.isfinite(end) else None for end in pair]
+            for pair, (value,) in zip(zip(polytope.low, polytope.high, strict=True), at_center, strict=True)
+        ]
+        inside._upper, inside._lower = polytope.multipliers, polytope.lower_multipliers
+        inside.widths = extents(inside.G.tolist(), inside.ends)
+        return None if inside.widths is None else inside
+
+    def distance(self, image: list[Any], which: int, low: Any, high: Any) -> Any:
+        """Returns a ball around how far image x stays from two ends, by the multipliers of this number."""
+        found = []
+        if high is not None:
+            found.append(high - self._most(image, self._upper[which]))
+        if low is not None:  # of the mirrored image the mirrored multipliers
+            found.append(-low - self._most([-each for each in image], -self._lower[which]))
+        return arb(min(found))
+
+    def _most(self, image: list[Any], multipliers: np.ndarray) -> Any:
+        used = [(j, number(multipliers[j])) for j in np.flatnonzero(multipliers).tolist()]
+        used = [(j, value) for j, value in used if self.ends[j][int(value > 0)] is not None]
+        over = fmpq_mat([image]) - sum((value * fmpq_mat([self.G.tolist()[j]]) for j, value in used), fmpq_mat(1, len(image)))
+        return sum((value * self.ends[j][int(value > 0)] for j, value in used), reach_of(over, self.widths))
+
+
+def extents(rows: list[Any], ends: list[Any]) -> list[Any] | None:
+    """Returns bounds of |x_i| by the first rows with two ends that bound all states; None if there are none."""
+    kept = []
+    for row, (low, high) in zip(rows, ends, strict=True):
+        if low is None or high is None:
+            continue
+        kept.append([each / max(-low, high) for each in row])
+        if len(kept) >= len(row) and (found := box_extents(fmpq_mat(kept))) is not None:
+            return found
+    return None
+
+
 def box_extents(box: Any) -> list[Any] | None:
-    """Returns bounds of |x_i| in the box; None if it does not bound all."""
+    """Returns bounds of |x_i| where |box x| <= 1; None if it does not bound all."""
     if box.rank() < box.ncols():
         return None
     # x = (C'C)^-1 C' (C x), and |C x| <= 1 entry by entry.

@@ -135,7 +135,7 @@ def test_polytope_of_samples_alone_is_refused_at_times_between_them():
     multipliers = np.concatenate([without.polytope.multipliers, np.zeros((8 * len(plant.box_rows), len(rows)))])
     closed = plant.grid_rows.state + plant.grid_rows.input @ without.K
     multipliers[len(rows) + m :] = np.linalg.lstsq(rows.T, closed.reshape(-1, plant.n).T, rcond=None)[0].T
-    polytope = replace(without.polytope, multipliers=multipliers)
+    polytope = replace(without.polytope, multipliers=multipliers, lower_multipliers=None)
     claimed = replace(without, polytope=polytope, between_samples=8, fingerprint=plant.fingerprint)
     broken = {condition.name[:4] for condition in verify(claimed, plant).conditions if not condition.holds}
     assert "(PB)" in broken

@@ -12,7 +12,16 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import own_error_state, read_only
-from shields.runtime.set_test import SMALLEST_RADIUS, RowsBetween, SetTest, ball, judged_shapes, rows_between, supports
+from shields.runtime.set_test import (
+    SMALLEST_RADIUS,
+    RowsBetween,
+    SetTest,
+    ball,
+    closed,
+    judged_shapes,
+    rows_between,
+    supports,
+)
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -24,10 +33,10 @@ BLOCK = 1_000_000
 class PlanTest:
     """Whether a plan u_0..u_{j-1} is certified (docs/lookahead.md).
 
-    With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if |c c_i| + rho_i(c) <= 1 for the rows c of the box and i =
-    1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j + E(Sigma_pred,j) lies in
-    S by the one-step test's condition; of a certificate with a polytope P, |g c_j| + rho_j(g) <= 1 for the rows g of P,
-    which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the one-step test.
+    With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if low + rho_i(c) <= c c_i <= high - rho_i(c) for the rows c of
+    the box and i = 1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j +
+    E(Sigma_pred,j) lies in S by the one-step test's condition; of a certificate with a polytope P, the same of g c_j
+    for the rows g of P, which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the one-step test.
 
     Its methods take estimates x_hat of E environments, shape (E, n), the tightening of the error shape of each, and P
     plans for each, shape (E, P, N, m) [physical units].
@@ -68,7 +77,10 @@ class PlanTest:
 
     @own_error_state  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN if unknown."""
+        """Returns the largest distance of row c_j from the middle of its ends, (E, N, r), and |T G c_j|, (E, N), that pass.
+
+        Both are NaN if unknown.
+        """
         size = np.abs(estimates)
         rounding = (size @ self._row_rounding).reshape(tightening.row_limits.shape)
         row_limits = tightening.row_limits - rounding - self._margin
@@ -95,25 +107,28 @@ class PlanTest:
             return np.concatenate([self.certified(estimates[e], tightening.some(e), plans[e]) for e in parts])
         row_limits, radius = self.limits_at(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
+        values -= self.prediction.middle[:, None, None]
         within = np.abs(values) <= row_limits.transpose(1, 2, 0)[..., None]
-        inside = np.all(within[:, : len(self.prediction.plant.box_rows)], axis=1)
+        inside = np.all(within[:, : len(self.prediction.plant.box)], axis=1)
         kept = np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
         if not self.prediction.ends:
             kept &= np.all(within, axis=1)
         kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
         if tightening.between.size:
             kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
-        allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
+        plant = self.prediction.plant
+        allowed = np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1)
         return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
 
     @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
-        """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
-        rows, extents = self.prediction.rows[: len(self.prediction.plant.box_rows)], np.sqrt(np.diag(error_shape))
+        """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between the ends for all rows: x is in the box then."""
+        count, extents = len(self.prediction.plant.box), np.sqrt(np.diag(error_shape))
+        rows, middle = self.prediction.rows[:count], self.prediction.middle[:count]
         rounding = float(self.prediction.rounding[0])
         reach = supports(rows, error_shape, rounding * (np.abs(rows) @ extents) ** 2)
-        reach = reach + np.abs(rows @ estimate) + rounding * (np.abs(rows) @ np.abs(estimate))
-        return bool((reach <= 1.0 - self._margin).all())
+        reach = reach + np.abs(rows @ estimate - middle) + rounding * (np.abs(rows) @ np.abs(estimate))
+        return bool((reach <= self.prediction.half[:count] - self._margin).all())
 
 
 class Prediction:
@@ -131,10 +146,11 @@ class Prediction:
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
             its others. Those of the box are closer where it counts between samples, too (`RowsBetween`).
+        middle, half: Of the ends of these rows, shape (r,); the half is less by the rounding of both.
         grid: What is asked between samples.
         powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
-        size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
+        size_forced: sum_{i<j} |A|^i |B| |u| for the largest |u| within the limits, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
         cone: The root of S, shape (n, n); of shape (0, n) where plans end in P.
         ends: Whether c_j + E(Sigma_pred,j) lies in S, for N lengths of a plan; none where plans end in P, whose rows
@@ -145,7 +161,13 @@ class Prediction:
         plant, n, m = first.plant, first.plant.n, first.plant.m
         self.plant, self.steps, between = plant, steps, rows_between(plant)
         self.cone, ends_in = first.root[: first.cone], first.root[first.cone :]
-        self.rows = np.concatenate([between.at_samples, ends_in[len(between.at_samples) :]])
+        k = len(between.at_samples)
+        self.rows = np.concatenate([between.at_samples, ends_in[k:]])
+        low, high = closed(between.low_at_samples, between.high_at_samples)
+        middle, half = first.middle[k : len(ends_in)], first.half[k : len(ends_in)]
+        self.middle = read_only(np.concatenate([0.5 * (low + high), middle]))
+        rounding = first.rounding * np.abs(self.middle[:k])
+        self.half = read_only(np.concatenate([0.5 * (high - low) - rounding, half]))
         powers, sizes = [np.eye(n)], [np.eye(n)]
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
@@ -156,7 +178,7 @@ class Prediction:
         for j in range(steps):
             forced[j, :, : j + 1] = effects[j::-1].transpose(1, 0, 2)
         self.forced = read_only(forced.reshape(steps, n, steps * m))
-        pushes = np.array([size @ np.abs(plant.B) @ plant.u_max for size in sizes[:-1]])
+        pushes = np.array([size @ np.abs(plant.B) @ plant.largest_input for size in sizes[:-1]])
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = tuple(End.after(j + 1, self) for j in range(steps)) if first.cone else ()
@@ -173,7 +195,7 @@ class Prediction:
 
 
 class PlanGrid:
-    """The rows of the grid in every step of a plan, i = 0..N-1: |row (A_tau c_i + B_tau u_i)| + rho_i <= 1.
+    """The rows of the grid in every step of a plan, i = 0..N-1: row (A_tau c_i + B_tau u_i) +- rho_i is between ends.
 
     There are none, g = 0, where the box counts at samples alone.
 
@@ -184,6 +206,7 @@ class PlanGrid:
     Attributes:
         free: Rows on x_hat, shape (N, g, n).
         forced: Rows on a plan, shape (N, g, N m).
+        middle: Of the ends of these rows, shape (g,).
     """
 
     def __init__(self, prediction: Prediction, test: RowsBetween) -> None:
@@ -196,17 +219,20 @@ class PlanGrid:
             forced[i, :, i * m : (i + 1) * m] += test.input
         self.forced = read_only(forced)
         pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
-        self._pushed = read_only(pushed + np.abs(test.input) @ prediction.plant.u_max)
+        self._pushed = read_only(pushed + np.abs(test.input) @ prediction.plant.largest_input)
+        low, high = closed(test.low, test.high)
+        self.middle = read_only(0.5 * (low + high))
+        self._half = read_only(0.5 * (high - low) - float(self._rounding[0]) * np.abs(self.middle))
         D = prediction.plant.disturbance.shape_matrix
         own = _supports(self.free, self._size, D[None], self._rounding[:, None])[0]
         self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
         self._arriving = test.disturbed
 
     def row_limits(self, shapes: np.ndarray) -> np.ndarray:
-        """Returns 1 - rho_i less the rounding that does not depend on the estimate, (E, N, g), of shapes (E, n, n)."""
+        """Returns half the range less rho_i and rounding that is no estimate's, (E, N, g), for shapes (E, n, n)."""
         rounding = self._rounding[:, None]
         reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
-        return 1.0 - reach * (1.0 + rounding) - rounding * self._pushed
+        return self._half - reach * (1.0 + rounding) - rounding * self._pushed
 
     def keeps(self, estimates: np.ndarray, row_limits: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
         """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P).
@@ -219,6 +245,7 @@ class PlanGrid:
         left = row_limits - rounding.reshape(count, steps, g)
         values = (self.forced.reshape(steps * g, -1) @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         values += (self.free.reshape(-1, n) @ estimates.T)[..., None]
+        values -= np.tile(self.middle, steps)[:, None, None]
         inside = np.abs(values.reshape(steps, g, count, number)) <= left.transpose(1, 2, 0)[..., None] - margin
         return np.logical_and.accumulate(inside.all(axis=1), axis=0)
 
@@ -278,8 +305,8 @@ class Tightening(NamedTuple):
     """What errors and disturbances leave of the box and of S or P, for E error shapes.
 
     Attributes:
-        row_limits: 1 - rho_j(row) less the rounding that does not depend on the estimate, shape (E, N, r) for the rows
-            of the `Prediction`; NaN for an unusable shape.
+        row_limits: Half the range of a row less rho_j(row) and the rounding that does not depend on the estimate, shape
+            (E, N, r) for the rows of the `Prediction`; NaN for an unusable shape.
         weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
             |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
@@ -321,7 +348,7 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         weightings = np.empty((*radius.shape, 0, plant.n))
     radius = radius + np.where(usable, 0.0, np.nan)[:, None]
     return Tightening(
-        row_limits=1.0 - reach - pushed + np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)[:, None, None],
+        row_limits=prediction.half - reach - pushed + np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)[:, None, None],
         weighting=np.where(np.isnan(radius)[..., None, None], 0.0, weightings),
         radius=radius,
         between=between,

@@ -16,6 +16,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.validation import own_error_state, read_only
+from shields.certificate import Fallback
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
 from shields.runtime.set_test import SetTest
 from shields.verification import ACTION_ROUNDING
@@ -65,7 +66,7 @@ class Planner:
 
     Args:
         first: The one-step test.
-        gain: K, shape (m, n).
+        fallback: The certificate's: the regulators have gains of their own around the same resting point.
         horizon: Largest length N of a plan.
         margin: By which plans must pass the test.
 
@@ -74,9 +75,10 @@ class Planner:
         horizon: N.
     """
 
-    def __init__(self, first: SetTest, gain: np.ndarray, horizon: int, margin: float) -> None:
+    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
-        self._plant = first.plant
+        self._plant, self._fallback, gain = first.plant, fallback, fallback.gain
+        self._rest = read_only(np.concatenate(fallback[1:]))
         braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
         self._gains = np.array([gain if braking is None else braking, gain])
         loops = [closed_loop(first.plant, gain if each is None else each, horizon) for each in (unlimited, gain)]
@@ -103,7 +105,7 @@ class Planner:
         beginnings[:, :2] = self._continued(estimates, proposed)
         beginnings[:, 2:, 0] = proposed[:, None]
         beginnings[:, 2, 1:] = stored[:, 1:]
-        candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 1, 0]])
+        candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 1, 0]])
         return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
 
     @own_error_state  # what is not finite passes no test
@@ -112,8 +114,9 @@ class Planner:
 
         A single estimate, shape (n,), and proposal, (m,), give plans without the first axis.
         """
-        inputs = np.concatenate([estimates, proposed], axis=-1) @ self._loops
-        plans = expressible(inputs.reshape(*inputs.shape[:-1], 2, self.horizon, -1), self._plant.u_max)
+        inputs = (np.concatenate([estimates, proposed], axis=-1) - self._rest) @ self._loops
+        inputs = inputs.reshape(*inputs.shape[:-1], 2, self.horizon, -1) + self._fallback.resting_input
+        plans = expressible(inputs, self._plant)
         plans[..., 0, :] = proposed[..., None, :]
         return plans
 
@@ -135,7 +138,7 @@ class Planner:
         tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
-        candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 0, 1]])
+        candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
             needed = plans.lengths == 0
@@ -162,14 +165,14 @@ class Planner:
         The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
         as every shorter length besides.
         """
-        limits, (row_limits, radius) = self._plant.u_max, self.test.limits_at(estimates, tightening)
+        row_limits, radius = self.test.limits_at(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
         for e, u in enumerate(proposed):
             last = tightening.weighting[e, -1], float(radius[e, -1])
             found = self._program.solve(estimates[e], row_limits[e], *last, tightening.between[e], u)
             if found is not None:
-                tried[e] = expressible(found, limits)
-                if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():
+                tried[e] = expressible(found, self._plant)
+                if (np.abs(found[0] - u) <= AS_PROPOSED * self._plant.input_half).all():
                     tried[e, 0, 0] = u
         return self._best(estimates, tightening, tried, proposed)
 
@@ -177,7 +180,7 @@ class Planner:
 class PlanProgram:
     """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows, and one cone for an end in S.
 
-    Variables are the inputs in units of their limits. A solver is set up once, with the pattern of the problem; then
+    Variables are the inputs from the middle of their limits, in units of half the range. A solver is set up once, with the pattern of the problem; then
     vectors and the entries of the cone are updated, so that a solution depends on its own data alone. Whoever solves
     takes the solver away, or sets another one up if somebody has it: threads share none.
 
@@ -190,13 +193,19 @@ class PlanProgram:
     def __init__(self, prediction: Prediction) -> None:
         plant, length = prediction.plant, prediction.steps
         self._m, self._length = plant.m, length
-        self._limits, self._weights = plant.u_max, (plant.u_max / plant.u_max.max()) ** 2
-        scale = np.tile(plant.u_max, length)
+        self._half, self._weights = plant.input_half, (plant.input_half / plant.input_half.max()) ** 2
+        self._middle, scale = plant.input_middle, np.tile(plant.input_half, length)
         self._free = prediction.powers[1:]
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
-        self._C = prediction.rows[: len(plant.box_rows)]
+        self._C = prediction.rows[: len(plant.box)]
         self._G = prediction.rows[:0] if prediction.ends else prediction.rows
+        steady = np.tile(self._middle, length)
+        self._pushed = read_only(prediction.forced @ steady)
+        middle, grid = prediction.middle, prediction.grid
+        middles = [np.tile(middle[: len(self._C)], length - 1), middle[: len(self._G)], np.tile(grid.middle, length)]
+        middles[2] = middles[2] - (grid.forced @ steady).ravel()
+        self._middles = read_only(np.concatenate(middles))
         self._between = prediction.grid.free.reshape(-1, plant.n)
         between = (prediction.grid.forced * scale).reshape(-1, len(scale))
         rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end, between])
@@ -241,24 +250,24 @@ class PlanProgram:
 
         Args:
             estimate: x_hat, shape (n,).
-            row_limits: Largest |row c_j| for j = 1..N, shape (N, r).
+            row_limits: Largest distance of row c_j from its middle for j = 1..N, shape (N, r).
             weighting: T G of the last step, shape (n, n), or (0, n) for an end in P.
             radius: Largest |T G c_j| of the last step.
-            between: Largest values of the rows of the grid in every step, shape (N, g).
+            between: Largest distances of the rows of the grid from their middles in every step, shape (N, g).
             proposed: Shape (m,).
 
         Raises:
             ValueError: If an argument has another shape: that is no failure of the solver.
         """
-        centers = self._free @ estimate
+        centers = self._free @ estimate + self._pushed
         moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
         left = [row_limits[:-1, : len(self._C)].ravel(), row_limits[-1, : len(self._G)], between.ravel()]
-        drift, allowed = np.concatenate(moved), np.concatenate(left) - self._margin
+        drift, allowed = np.concatenate(moved) - self._middles, np.concatenate(left) - self._margin
         ones = np.ones(2 * self._length * self._m)
         cone = np.concatenate([[radius - self._end_margin], weighting @ centers[-1]])[: self._cone]
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
         q = np.zeros(self._length * self._m)
-        q[: self._m] = -2.0 * self._weights * proposed / self._limits
+        q[: self._m] = -2.0 * self._weights * (proposed - self._middle) / self._half
         A = np.concatenate([self._linear, -(weighting @ self._end).ravel()])[self._order]
         if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
             return None
@@ -272,7 +281,7 @@ class PlanProgram:
         except BaseException:  # whatever a solver does wrong (its panics are no Exceptions): another plan, or none
             return None
         usable = plan.shape == (self._length * self._m,) and np.isfinite(plan).all()
-        return plan.reshape(self._length, self._m) * self._limits if usable else None
+        return plan.reshape(self._length, self._m) * self._half + self._middle if usable else None
 
     def _set_up(self) -> Any:
         """Returns a solver with the pattern of the problem."""
@@ -293,13 +302,13 @@ class PlanProgram:
 
 def regulator(plant: LinearPlant, input_weight: float = INPUT_WEIGHT) -> np.ndarray | None:
     """Returns the gain, shape (m, n), of a linear-quadratic regulator; None if there is none."""
-    return lqr_gain(plant.A, plant.B, plant.weight, input_weight * np.diag(plant.u_max**-2.0))
+    return lqr_gain(plant.A, plant.B, plant.weight, input_weight * np.diag(plant.input_half**-2.0))
 
 
 def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
     """Returns the matrix, shape (n + m, steps m), that takes a row (x_hat, u_0) to u_0, u_1 = gain c_1, gain c_2, ...
 
-    The centers are those of the inputs without limits.
+    All of them from a resting point. The centers are those of the inputs without limits.
     """
     center, inputs = np.hstack([plant.A, plant.B]), [np.eye(plant.n + plant.m)[plant.n :]]
     for _ in range(steps - 1):
@@ -309,11 +318,14 @@ def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
 
 
 @own_error_state  # what is not finite passes no test
-def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Returns plans that go on with u_j = gain c_j, saturated and expressible, where a beginning is NaN.
+def completed(
+    plant: LinearPlant, fallback: Fallback, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray
+) -> np.ndarray:
+    """Returns plans that go on with u_j = u_c + gain (c_j - x_c), saturated and expressible, where a beginning is NaN.
 
     Args:
         plant: Gives A, B and the limits.
+        fallback: Gives the resting point.
         estimates: x_hat, shape (E, n).
         beginnings: Inputs of P plans, shape (E, P, N, m), NaN where they are not given.
         gains: Shape (P, m, n).
@@ -324,13 +336,14 @@ def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray,
     flat = missing.reshape(steps, -1)
     some, every = np.any(flat, axis=1), np.all(flat, axis=1)
     turned, A, B = gains.swapaxes(1, 2), plant.A.T, plant.B.T
+    constants = np.array([fallback.with_gain(gain).constant for gain in gains])[:, None]
     centers = np.repeat(estimates[None], number, axis=0)
     for j in range(steps):
         u = plans[j]
         if some[j]:
-            gained = np.minimum(np.maximum(centers @ turned, -plant.u_max), plant.u_max)
+            gained = np.minimum(np.maximum(centers @ turned + constants, plant.input_low), plant.input_high)
             u = plans[j] = gained if every[j] else np.where(missing[j], gained, u)
         if j + 1 < steps:
             centers = centers @ A + u @ B
-    plans = np.where(missing, expressible(plans, plant.u_max), plans)
+    plans = np.where(missing, expressible(plans, plant), plans)
     return np.ascontiguousarray(plans.transpose(2, 1, 0, 3))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.validation import as_numbers
+from shields.certificate import Fallback
 from shields.runtime.backup_plans.plan_search import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.set_test import PredictedErrors, ReachableSets, SetTest, norms
@@ -27,7 +28,7 @@ class Lookahead:
 
     Args:
         test: The one-step test.
-        gain: K, shape (m, n).
+        fallback: The certificate's.
         horizon: Longest plan, in steps.
         margin: By which plans must pass their test.
 
@@ -35,9 +36,9 @@ class Lookahead:
         planner: Finds the plans.
     """
 
-    def __init__(self, test: SetTest, gain: np.ndarray, horizon: int, margin: float) -> None:
+    def __init__(self, test: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
         self._test, self._margin = test, margin
-        self.planner = Planner(test, gain, horizon, margin)
+        self.planner = Planner(test, fallback, horizon, margin)
 
     def keep(
         self, decided: Decision, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
@@ -127,6 +128,6 @@ class Lookahead:
         if numbers is None or numbers.ndim != 2 or numbers.shape[1] != plant.m or len(numbers) > len(stored):
             return stored
         numbers = numbers.copy()  # read once
-        if (np.abs(numbers) <= plant.u_max).all():
+        if ((plant.input_low <= numbers) & (numbers <= plant.input_high)).all():
             stored[: len(numbers)] = numbers
         return stored

@@ -32,7 +32,7 @@ def test_rows_stay_what_they_are_when_a_plant_is_replaced():
 
 
 def test_limits_around_an_operating_point_become_the_largest_symmetric_ones():
-    plant = LinearPlant.around(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
+    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
     np.testing.assert_allclose(1.0 / plant.box_rows, [[2.0]])
     np.testing.assert_allclose(plant.u_max, [2.0])
     np.testing.assert_allclose(plant.to_deviation([21.5]), [1.5])
@@ -64,20 +64,20 @@ def test_rows_of_two_states_that_cannot_be_limits_or_are_an_array_are_taken(rows
 
 def test_a_number_stands_for_a_vector_of_one_entry():
     limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = LinearPlant.around(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
-    assert plant.fingerprint == LinearPlant.around(**ROOM, **limits).fingerprint
+    plant = LinearPlant(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
+    assert plant.fingerprint == LinearPlant(**ROOM, **limits).fingerprint
     np.testing.assert_allclose(plant.to_deviation(21.5, "output"), [1.5])
     np.testing.assert_allclose(plant.from_deviation(2.0, "input"), [12.0])
 
 
 def test_output_is_converted_by_the_output_matrix():
-    plant = replace(LinearPlant.around(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
+    plant = replace(LinearPlant(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
     np.testing.assert_allclose(plant.to_deviation([41.0], "output"), [1.0])
     np.testing.assert_allclose(plant.from_deviation([1.0], "output"), [41.0])
 
 
 def test_deviations_obey_the_equations_of_the_plant():
-    plant = LinearPlant.around(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
+    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
     physical = plant.A @ [23.0] + plant.B @ [11.0]
     moved = plant.A @ plant.to_deviation([23.0]) + plant.B @ plant.to_deviation([11.0], "input")
     np.testing.assert_allclose(plant.from_deviation(moved), physical)
@@ -85,13 +85,13 @@ def test_deviations_obey_the_equations_of_the_plant():
 
 def test_constant_of_the_model_makes_a_point_an_equilibrium():
     settings = ROOM | {"operating_input": [4.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = LinearPlant.around(**settings, offset=[1.2])
+    plant = LinearPlant(**settings, offset=[1.2])
     np.testing.assert_allclose(plant.u_max, [4.0])
 
 
 def test_model_of_deviations_has_its_operating_point_wherever_it_was_linearized():
     settings = ROOM | {"operating_state": [21.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = LinearPlant.around(**settings)
+    plant = LinearPlant(**settings)
     np.testing.assert_allclose(1.0 / plant.box_rows, [[3.0]])
     np.testing.assert_allclose(plant.to_deviation([22.0]), [1.0])
 
@@ -107,6 +107,6 @@ def test_operating_point_belongs_to_the_fingerprint_and_zero_is_none():
 def test_one_sided_limits_leave_the_other_side_free():
     settings = {"state_limits": ([0.0, -np.inf], [np.inf, 3.0]), "input_limits": (-1.0, 1.0)}
     point = {"operating_state": [1.0, 1.0], "operating_input": [0.4]}
-    plant = LinearPlant.around(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
+    plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
     np.testing.assert_allclose(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
     np.testing.assert_allclose(plant.u_max, [0.6])

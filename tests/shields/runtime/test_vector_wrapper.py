@@ -52,7 +52,7 @@ def test_error_shapes_that_the_environment_forgets_and_meets_again_change_nothin
 )
 def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
     decided = Decision(np.array([[1.0, 3.0]]), np.array([True, False]), *np.zeros((4, 2)))
-    actions = overridden(np.array([[1], [1]], given), decided, np.array([4.0]))
+    actions = overridden(np.array([[1], [1]], given), decided, TRUCKS["4000 kg"])
     assert actions.dtype == kept
     np.testing.assert_array_equal(actions, [[0.25], [1.0]])
 
