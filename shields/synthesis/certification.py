@@ -13,12 +13,19 @@ import numpy as np
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import as_flag, own_error_state, shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
-from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
+from shields.synthesis.design_problem import (
+    CandidateDesign,
+    DesignProblem,
+    Rest,
+    SymmetricLimits,
+    design_problem,
+)
 from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import (
@@ -26,11 +33,19 @@ from shields.synthesis.invariant_polytope import (
     feedback_of,
     grid_in_closed_loop,
     invariant_polytope,
+    points_of_box,
     share_in_polytope,
+    share_of_points,
 )
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
-from shields.synthesis.polytope_gain import ellipsoid_margin, gains_of_larger_polytopes, most_tolerant_gain
+from shields.synthesis.polytope_gain import (
+    ellipsoid_margin,
+    gains_of_larger_polytopes,
+    most_tolerant_gain,
+    regulators,
+)
+from shields.synthesis.resting_point import at_operating_point, farthest_from_limits, improved, limits_around
 from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
@@ -46,6 +61,10 @@ _BETWEEN_MARGIN, _MOST_BOXES = 1e-3, 8
 _DIGITS, _SHOWN_DIGITS = 12, 6
 # The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by.
 _INSIDE = 1.0 - 1e-9
+# Points of the box by which resting points are compared.
+_POINTS_OF_REST_LOG2 = 12
+# What an equilibrium lacks is computed with an error of at most this, relative to its terms.
+_OF_REST = 1e-14
 # What helps where float64 has too few digits.
 _MORE_DIGITS = (
     "give states units in which the half-widths of the box are of similar size, and leave out rows of the box that are "
@@ -117,6 +136,10 @@ def synthesize(
             f"None, got {shown(contract)}"
         )
     report = progress or (lambda line: None)
+    if not plant.is_symmetric or np.linalg.matrix_rank(plant.box_rows) < plant.n:
+        if safe_set == "ellipsoid":
+            raise ValueError("only a polytope is sought where limits are not symmetric, or not all states have any")
+        return _around_resting_point(plant, contract, report, candidates, search_gain=search_gain)
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if safe_set == "ellipsoid":
         known = [each.without_polytope() for each in known if each.keeps_ellipsoid]
@@ -125,6 +148,68 @@ def synthesize(
         return largest
     found = (with_largest_polytope if search_gain else with_polytope)(largest, plant, report)
     return max([found, *(with_polytope(each, plant, report) for each in others)], key=_polytope_share)
+
+
+def _around_resting_point(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    candidates: Sequence[Certificate],
+    *,
+    search_gain: bool,
+) -> Certificate:
+    """Returns a verified certificate of a polytope for limits that are not symmetric about the operating point.
+
+    The gain is sought within symmetric limits around the equilibrium that is farthest from all limits; where the share
+    of the box is known, a better resting point then, and with `search_gain` a better gain.
+
+    Raises:
+        Infeasible: If none is found.
+    """
+    progress("resting point")
+    rest, known = farthest_from_limits(plant), [each for each in candidates if carried_over(each, plant, contract)]
+    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    shapes = np.array([proof.Sigma for proof in _proofs(errors)])
+    points = points_of_box(plant, _POINTS_OF_REST_LOG2)
+
+    def share(K: np.ndarray, at: Rest) -> float:
+        return share_of_points(Feedback(K, shapes, _disturbance_around(plant, at), at), plant, points)
+
+    tried = [(K, rest) for K in _gains_around(plant, problem, progress)]
+    if points is not None:
+        shares = [share(*each) for each in tried]
+        tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
+        K = tried[0][0]
+        progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
+        better = improved(plant, rest, lambda at: share(K, at))
+        if search_gain:
+            feedback = Feedback(K, shapes, _disturbance_around(plant, better), better)
+            tried = [(each, better) for each in gains_of_larger_polytopes(feedback, plant, progress)] + tried
+        tried = [*tried[:-len(shares)], (K, better), *tried[-len(shares):]]
+    for K, at in tried:
+        found = certify_polytope(plant, K, contract, progress, at)
+        if found is not None:
+            return max([found, *known], key=_polytope_share)
+    if known:
+        return max(known, key=_polytope_share)
+    raise infeasibility(problem, polytope=True)
+
+
+def _gains_around(plant: LinearPlant, problem: DesignProblem, progress: Progress) -> Iterator[np.ndarray]:
+    """Yields gains, shape (m, n), for symmetric limits around a point.
+
+    Those of the largest ellipsoid, of the largest tolerated radii, and of regulators.
+    """
+    found = largest_set(problem, _SLACKS[0], lambda stage, design: progress(_progress_text(stage, design)))
+    if found is not None:
+        yield problem.to_physical(found.L, with_best_gain(problem, found).K)[1]
+    progress("gain that tolerates most")
+    start = max_margin_gain(problem, problem.covering_error_shape)
+    if start is not None:
+        yield problem.to_physical(start.L, start.K)[1]
+        yield problem.to_physical(start.L, most_tolerant_gain(problem, start).K)[1]
+    for K in regulators(plant):
+        yield K
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -237,6 +322,7 @@ def certify_polytope(
     K: np.ndarray,
     contract: ChannelContract | None = None,
     progress: Progress = lambda line: None,
+    rest: Rest | None = None,
 ) -> Certificate | None:
     """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
 
@@ -247,28 +333,43 @@ def certify_polytope(
         K: Gain, shape (m, n) [input per state].
         contract: Channel contract; with one, the error sets depend on the age of the newest sample.
         progress: Called with a line of text now and then.
+        rest: The point around which it is sought; the operating point by default.
 
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
-    problem, errors = design_problem(plant, contract)
+    rest = at_operating_point(plant) if rest is None else rest
+    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     K, proofs = exact.rounded(K, _DIGITS, axis=1), _proofs(errors)
-    D = inflated(plant.disturbance.shape_matrix)
+    feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
     try:
-        polytope = invariant_polytope(Feedback(K, np.array([proof.Sigma for proof in proofs]), D), plant, progress)
-        L = largest_box_ellipsoid(polytope.rows)
-        L = _in_digits(L * (_INSIDE / ((polytope.rows @ L) * polytope.rows).sum(axis=1).max()))
+        polytope = invariant_polytope(feedback, plant, progress)
+        faces = polytope.F
+        L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
+        L = _in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
         certificate = Certificate(
             L=L,
             K=K,
             proofs=proofs,
             polytope=polytope,
-            **_of_the_problem(plant, problem, errors),
+            resting_state=rest.state,
+            resting_input=rest.input,
+            **_of_the_problem(plant, problem, errors) | {"D": feedback.D},
             provenance=_provenance(plant, L, _volume(plant, L)),
         )
         return _verified_polytope(certificate, plant, progress)
     except (Infeasible, ArithmeticError, ValueError, CertificateError):  # numbers that a linear program cannot hold
         return None
+
+
+def _disturbance_around(plant: LinearPlant, rest: Rest) -> np.ndarray:
+    """Returns D with what a resting point lacks of an equilibrium, shape (n, n)."""
+    missing = plant.A @ rest.state + plant.B @ rest.input - rest.state
+    D = plant.disturbance.shape_matrix
+    if missing.any():
+        missing = np.abs(missing) + _OF_REST * (np.abs(plant.A) @ np.abs(rest.state) + np.abs(rest.state))
+        D = outer_sum(D, plant.n * np.diag(missing**2), plant.relative_weight)
+    return inflated(D)
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -338,7 +439,7 @@ def _nearby(
     Raises:
         Infeasible: If the plant has no error set, or the state leaves every box between two samples.
     """
-    problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
+    problem, errors = design_problem(plant, contract, _within(plant, tightened))
     near = None
     if start is not None and (shares := start.proofs[-1].shares) is not None:
         lx, le, ld = shares.tolist()
@@ -459,7 +560,7 @@ def _found_certificate(
         tightened: The boxes that sets were sought in so far, rows (k, n), and one more; empty for the plant's own.
     """
     progress("error set")
-    problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
+    problem, errors = design_problem(plant, contract, _within(plant, tightened))
     failure, slack = None, 0.0
     reached: tuple[str, CandidateDesign | None] = "start", None
 
@@ -499,6 +600,11 @@ def _found_certificate(
     raise failure or infeasibility(problem, polytope=False)
 
 
+def _within(plant: LinearPlant, tightened: tuple[np.ndarray, ...]) -> SymmetricLimits:
+    """Returns the limits within which a set is sought: the last of the boxes so far, or the plant's own."""
+    return SymmetricLimits(tightened[-1] if tightened else plant.box_rows, plant.u_max)
+
+
 def _tightened_box(
     certificate: Certificate, plant: LinearPlant, tightened: tuple[np.ndarray, ...]
 ) -> np.ndarray | None:
@@ -508,13 +614,13 @@ def _tightened_box(
         Infeasible: If it still does after several boxes.
     """
     grid = grid_in_closed_loop(feedback_of(certificate), plant)
-    if not len(grid.left):
+    if not len(grid.high):
         return None
-    reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / np.maximum(grid.left, 1e-300)
+    reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / np.maximum(grid.high, 1e-300)
     over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
     if over.max() <= 1.0 - 0.1 * _BETWEEN_MARGIN:
         return None
-    if len(tightened) == _MOST_BOXES or grid.left.min() <= 0.0:
+    if len(tightened) == _MOST_BOXES or grid.high.min() <= 0.0:
         raise _leaves_between_samples(float(over.max() - 1.0))
     return (tightened[-1] if tightened else plant.box_rows) * np.maximum(over / (1.0 - _BETWEEN_MARGIN), 1.0)[:, None]
 
@@ -633,8 +739,10 @@ def _provenance(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, A
 
 
 def _volume(plant: LinearPlant, L: np.ndarray) -> float:
-    """Returns the volume of an ellipsoid in units of the largest one in the safe box."""
-    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box_rows), L)) ** 0.5)
+    """Returns the volume of an ellipsoid in units of the largest one in the safe box; NaN where that is unbounded."""
+    if np.linalg.matrix_rank(plant.box) < plant.n:
+        return math.nan
+    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box), L)) ** 0.5)
 
 
 def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
@@ -653,7 +761,7 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
         L: Shape of the set, (n, n).
         volume: Volume of the set in units of the largest ellipsoid in the safe box.
     """
-    sizes = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
+    sizes = ({} if math.isnan(volume) else {"volume_of_box_ellipsoid": volume}) | share_of_box(plant, L)
     description: dict[str, Any] = {
         name: float(exact.rounded(size, _SHOWN_DIGITS)) if isinstance(size, float) else size
         for name, size in sizes.items()

@@ -35,6 +35,30 @@ _NOTHING_LEFT = 1e-9
 _FLATTEST = 1e7
 
 
+class Rest(NamedTuple):
+    """The point at which the fallback input rests: x_c = A x_c + B u_c.
+
+    Attributes:
+        state: x_c, shape (n,).
+        input: u_c, shape (m,).
+    """
+
+    state: np.ndarray
+    input: np.ndarray
+
+
+class SymmetricLimits(NamedTuple):
+    """Limits |c_j z| <= 1 and |v_i| <= u_max_i of states and inputs from a resting point.
+
+    Attributes:
+        box_rows: c, shape (k, n), of full column rank.
+        u_max: Shape (m,).
+    """
+
+    box_rows: np.ndarray
+    u_max: np.ndarray
+
+
 class ScaledGrid(NamedTuple):
     """The g rows |state z + input u| + disturbed <= 1 of the box at times between samples; none without a grid.
 
@@ -139,21 +163,22 @@ class CandidateDesign:
 
 
 def design_problem(
-    plant: LinearPlant, contract: ChannelContract | None = None, box_rows: np.ndarray | None = None
+    plant: LinearPlant, contract: ChannelContract | None = None, limits: SymmetricLimits | None = None
 ) -> tuple[DesignProblem, ErrorSet]:
     """Returns the scaled design problem, and the error set with its shapes a little larger than the environment's.
 
     Args:
         plant: The plant.
         contract: Channel contract, if there is one.
-        box_rows: Rows of a box inside the plant's in which the set is sought, shape (k, n); the plant's own by default.
+        limits: Limits inside the plant's within which the set is sought; the plant's own by default.
 
     Raises:
         Infeasible: If the plant has no error set, its safe box is unbounded, or far too wide for times between samples.
     """
-    free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
+    limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
+    free = plant.n - int(np.linalg.matrix_rank(limits.box_rows))
     if free:
-        without = [name for name, column in zip(plant.state_names, plant.box_rows.T, strict=True) if not column.any()]
+        without = [name for name, column in zip(plant.state_names, limits.box_rows.T, strict=True) if not column.any()]
         among = f" (of {', '.join(without)})" if without else ""
         raise Infeasible(
             f"the safe box leaves {free} of {plant.n} directions unbounded{among}: add rows to box with generous "
@@ -161,7 +186,7 @@ def design_problem(
             "S",
             free,
         )
-    flatness = float(np.linalg.cond(plant.box_rows * plant.half_widths))
+    flatness = float(np.linalg.cond(limits.box_rows * plant.half_widths))
     if flatness > _FLATTEST:
         raise Infeasible(
             f"the safe box is flat, {flatness:.0e} times longer in one direction than in another that is no axis: add "
@@ -183,7 +208,7 @@ def design_problem(
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
     shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
-    return _scaled(plant, shapes, plant.box_rows if box_rows is None else box_rows), errors
+    return _scaled(plant, shapes, limits), errors
 
 
 def _inflated(errors: ErrorSet) -> ErrorSet:
@@ -192,12 +217,13 @@ def _inflated(errors: ErrorSet) -> ErrorSet:
     return replace(errors, Sigma=INFLATION * errors.Sigma, ages=ages)
 
 
-def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box_rows: np.ndarray) -> DesignProblem:
-    """Returns the design problem for error sets (k, n, n) and a box (k, n), in which it finds the largest ellipsoid."""
+def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimits) -> DesignProblem:
+    """Returns the design problem for error sets (k, n, n), in the largest ellipsoid within the limits."""
+    box_rows, u_max = limits
     box = largest_box_ellipsoid(box_rows)
     T = np.linalg.cholesky(box)
     D = plant.disturbance.shape_matrix
-    step = plant.B * (float(ACTION_ROUNDING) * plant.u_max)
+    step = plant.B * (float(ACTION_ROUNDING) * plant.input_half)
     rounding = plant.m * step @ step.T
     weight = np.linalg.inv(box)
     ratio = np.vdot(weight, rounding) / max(float(np.vdot(weight, D)), 1e-30)
@@ -206,18 +232,18 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box_rows: np.ndarray) 
     D_u = (1.0 + s) * D + (1.0 + 1.0 / s) * rounding
     return DesignProblem(
         A=inverse @ plant.A @ T,
-        B=inverse @ plant.B @ np.diag(plant.u_max),
+        B=inverse @ plant.B @ np.diag(u_max),
         C=box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
         error_shapes=inverse @ error_shapes @ inverse.T,
-        grid=_scaled_grid(plant, T),
+        grid=_scaled_grid(plant, T, u_max),
         transform=T,
-        u_max=plant.u_max,
+        u_max=u_max,
         rounding=s,
     )
 
 
-def _scaled_grid(plant: LinearPlant, transform: np.ndarray) -> ScaledGrid:
+def _scaled_grid(plant: LinearPlant, transform: np.ndarray, u_max: np.ndarray) -> ScaledGrid:
     """Returns the plant's rows between samples in scaled coordinates z = T^-1 x and u / u_max."""
     try:
         grid = plant.grid_rows
@@ -227,14 +253,14 @@ def _scaled_grid(plant: LinearPlant, transform: np.ndarray) -> ScaledGrid:
         too_long = "(B) the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
         raise Infeasible(too_long, "B", 1.0) from error
     state, pushed, _ = grid
-    left, disturbed = left_between_samples(plant, grid, plant.disturbance.shape_matrix)
-    left = np.maximum(left, _NOTHING_LEFT)
-    rows, inputs = state @ transform / left[..., None], pushed * plant.u_max / left[..., None]
+    taken, disturbed = taken_between_samples(plant, grid, plant.disturbance.shape_matrix)
+    left = np.maximum(1.0 - taken, _NOTHING_LEFT)
+    rows, inputs = state @ transform / left[..., None], pushed * u_max / left[..., None]
     return ScaledGrid(rows.reshape(-1, plant.n), inputs.reshape(-1, plant.m), (disturbed / left).ravel())
 
 
-def left_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what the rows of the box may reach at the times of a plant's grid, and what disturbances do of that.
+def taken_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what is not left of the rows of the box at the times of a plant's grid, and what disturbances take.
 
     Args:
         plant: The plant.
@@ -242,9 +268,9 @@ def left_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> t
         D: Shape of the disturbance set, (n, n).
 
     Returns:
-        1 - eta less the rounding of actions, shape (N, k), and the supports rho of the disturbance, (k,)
+        eta and the rounding of actions, shape (N, k), and the supports rho of the disturbance, (k,)
         (docs/shield_proof.md, "Between the samples").
     """
-    rounding = float(ACTION_ROUNDING) * (np.abs(grid.input) @ plant.u_max)
-    squares = np.einsum("ji,ik,jk->j", plant.box_rows, D, plant.box_rows)
-    return 1.0 - grid.remainder - rounding, np.sqrt(np.maximum(squares, 0.0))
+    rounding = float(ACTION_ROUNDING) * (np.abs(grid.input) @ plant.input_half)
+    squares = np.einsum("ji,ik,jk->j", plant.box, D, plant.box)
+    return grid.remainder + rounding, np.sqrt(np.maximum(squares, 0.0))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
@@ -21,7 +21,7 @@ from ncs_gym.plants.linear_plant import inputs_under_way
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
-from shields.synthesis.design_problem import left_between_samples
+from shields.synthesis.design_problem import Rest, taken_between_samples
 from shields.verification import ACTION_ROUNDING
 
 # The search takes at most so long [s], of its thread's own time: what else a machine does decides no certificate.
@@ -30,6 +30,8 @@ LONGEST_SEARCH = 60.0
 _MARGIN = 1e-6
 # A row counts as implied by others up to this: a thousandth of the margin.
 _IMPLIED = 1e-9
+# The ends of one row that are open.
+_OPEN = np.array([-math.inf]), np.array([math.inf])
 # Where fewer rows than this share of the most are left of a search that has too many, it goes on.
 _LEAST_PRUNED = 0.9
 # Significant digits of rows and multipliers; what a row lacks by that is far below the margin.
@@ -43,22 +45,64 @@ _MOST_STEPS = 3000
 
 
 class Feedback(NamedTuple):
-    """The fallback u = K x_hat with what disturbs it.
+    """The fallback u = u_c + K (x_hat - x_c) with what disturbs it.
 
     Attributes:
         K: The gain, shape (m, n).
         errors: Shapes of the sets of the estimation error, (l, n, n).
         D: Shape of the disturbance set, (n, n).
+        rest: x_c and u_c, shapes (n,) and (m,).
     """
 
     K: np.ndarray
     errors: np.ndarray
     D: np.ndarray
+    rest: Rest
 
 
 def feedback_of(certificate: Certificate) -> Feedback:
     """Returns the fallback of a certificate."""
-    return Feedback(certificate.K, certificate.error_shapes, certificate.D)
+    rest = Rest(certificate.resting_state, certificate.resting_input)
+    return Feedback(certificate.K, certificate.error_shapes, certificate.D, rest)
+
+
+class Faces(NamedTuple):
+    """Rows with two ends, low <= g z <= high, around z = 0; an end that is open is infinite.
+
+    Attributes:
+        rows: Shape (r, n).
+        low, high: Shape (r,).
+    """
+
+    rows: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def some(self, chosen: Any) -> Faces:
+        """Returns some of them, given by their numbers or a mask."""
+        return Faces(*(part[chosen] for part in self))
+
+    def followed_by(self, others: Faces) -> Faces:
+        """Returns these and then others."""
+        return Faces(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Returns whether points, shape (count, n), lie between the ends of all rows, shape (count,)."""
+        values = points @ self.rows.T
+        return ((self.low <= values) & (values <= self.high)).all(axis=1)
+
+
+def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces:
+    """Returns rows with ends in units of half their range, or of the distance of the only end.
+
+    Raises:
+        Infeasible: If z = 0 is not inside.
+    """
+    if not ((low < 0.0) & (high > 0.0)).all():
+        raise _none("errors and disturbances alone leave one of its faces; smaller bounds leave room")
+    both = np.isfinite(low) & np.isfinite(high)
+    half = np.where(both, 0.5 * high - 0.5 * low, np.minimum(-low, high))
+    return Faces(rows / half[:, None], low / half, high / half)
 
 
 def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
@@ -73,20 +117,20 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
         Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
     step = _ClosedLoop(feedback, plant)
-    return _rounded(step, invariant_rows(step.first_rows(), step.predecessor, len(plant.box_rows), progress))
+    return _rounded(step, invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress))
 
 
-def invariant_rows(
-    rows: np.ndarray,
-    predecessor: Callable[[np.ndarray], np.ndarray],
+def invariant_faces(
+    faces: Faces,
+    predecessor: Callable[[Faces], Faces],
     kept: int,
     progress: Callable[[str], object] = lambda line: None,
-) -> np.ndarray:
-    """Returns the rows of the largest polytope in another one whose states stay in it, shape (r, n).
+) -> Faces:
+    """Returns the faces of the largest polytope in another one whose states stay in it.
 
     Args:
-        rows: Of the other one, |row z| <= 1, shape (k, n), in coordinates of similar size.
-        predecessor: Of a row, shape (n,), what states fulfil exactly if the next ones fulfil the row for sure.
+        faces: Of the other one, in coordinates of similar size.
+        predecessor: Of a row, what states fulfil exactly if the next ones fulfil the row for sure.
         kept: So many of the first rows stay even where others imply them; such rows are not followed then.
         progress: Called with a line of text now and then.
 
@@ -97,29 +141,31 @@ def invariant_rows(
         raise _none(
             f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
         )
-    rows, _ = _without_implied(rows, kept)
+    faces, _ = _without_implied(faces, kept)
     deadline, following = time.thread_time() + LONGEST_SEARCH, 0
-    while following < len(rows):
-        if following < kept and _largest(np.delete(rows, following, axis=0), rows[following])[0] <= 1.0 + _IMPLIED:
+    while following < len(faces.rows):
+        row = faces.some(slice(following, following + 1))
+        if following < kept and not _cuts(faces.some(np.arange(len(faces.rows)) != following), row).any():
             following += 1
             continue
-        if len(rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
-            rows, following = _without_implied(rows, kept, following)
-            if len(rows) > _LEAST_PRUNED * MOST_ROWS:
+        if len(faces.rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
+            faces, following = _without_implied(faces, kept, following)
+            if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
                 raise _too_many()
         if time.thread_time() > deadline:
             raise _none(f"its search took longer than {LONGEST_SEARCH:g} s, less with fewer states or longer steps")
         if following % 50 == 0:
-            progress(f"polytope: {len(rows)} rows")
-        row = predecessor(rows[following])
-        if _largest(rows, row)[0] > 1.0 + _IMPLIED:
-            rows = np.concatenate([rows, row[None]])
+            progress(f"polytope: {len(faces.rows)} rows")
+        row = predecessor(row)
+        low, high = _cuts(faces, row)
+        if low or high:
+            faces = faces.followed_by(row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1]))
         following += 1
-    progress(f"polytope: which of {len(rows)} rows count")
-    rows = _without_implied(rows, kept)[0]
-    if len(rows) > MOST_ROWS:
+    progress(f"polytope: which of {len(faces.rows)} rows count")
+    faces = _without_implied(faces, kept)[0]
+    if len(faces.rows) > MOST_ROWS:
         raise _too_many()
-    return rows
+    return faces
 
 
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
@@ -133,12 +179,14 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
 
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
     """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`."""
-    rows = plant.box_rows
+    rows = plant.box
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n
-    if inputs_under_way(plant) or not is_product:
+    if inputs_under_way(plant) or not is_product or not np.isfinite(plant.box_ends).all():
         return None
     points = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(log2) - 1.0
-    return points / np.abs(rows).sum(axis=0)
+    order = np.abs(rows).argmax(axis=0)  # the row of each state
+    values = 0.5 * (plant.box_low + plant.box_high)[order] + 0.5 * (plant.box_high - plant.box_low)[order] * points
+    return values / rows.sum(axis=0)
 
 
 def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) -> float:
@@ -155,13 +203,18 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
     step, total = _ClosedLoop(feedback, plant), len(points)
     if np.abs(np.linalg.eigvals(step.next)).max() >= 1.0:
         return 0.0
+    points = (points - feedback.rest.state) / step.widths
+    least, most = points.min(axis=0), points.max(axis=0)
     try:
-        rows = step.first_rows()
+        faces = step.first_faces()
         for _ in range(_MOST_STEPS):
-            points = points[(np.abs(points @ (rows / step.widths).T) <= 1.0).all(axis=1)]
-            rows = step.predecessor(rows)
-            rows = rows[np.abs(rows).sum(axis=1) > 1.0]  # the others hold in all of the box
-            if not (len(rows) and len(points)):
+            points = points[faces.holds(points)]
+            faces = step.predecessor(faces)
+            up, down = np.maximum(faces.rows, 0.0), np.minimum(faces.rows, 0.0)
+            # The others hold in all of the box.
+            cuts = (up @ most + down @ least > faces.high) | (up @ least + down @ most < faces.low)
+            faces = faces.some(cuts)
+            if not (len(faces.rows) and len(points)):
                 return len(points) / total
     except Infeasible:
         pass
@@ -169,90 +222,108 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
 
 
 class ClosedLoopGrid(NamedTuple):
-    """What u = K x_hat makes of x at the times of a plant's grid; the g rows are ordered by time, then by box row.
+    """What the fallback makes of x - x_c at the times of a plant's grid; g rows ordered by time, then by box row.
 
     Attributes:
         images: c (A_tau + B_tau K), shape (g, n).
-        left: What |image x| may be so that |c x| stays below 1 - eta for all errors and disturbances, shape (g,).
+        low, high: Between what image (x - x_c) may be so that c x stays within its ends, less eta, for all errors and
+            disturbances, shape (g,).
     """
 
     images: np.ndarray
-    left: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
 def grid_in_closed_loop(feedback: Feedback, plant: LinearPlant) -> ClosedLoopGrid:
     """Returns the rows of docs/shield_proof.md, "Between the samples"; none for a plant without a grid."""
     if plant.grid_rows is None:
-        return ClosedLoopGrid(np.empty((0, plant.n)), np.empty(0))
-    (K, errors, D), (state, pushed, _) = feedback, plant.grid_rows
-    answer, (left, disturbed) = pushed @ K, left_between_samples(plant, plant.grid_rows, D)
+        return ClosedLoopGrid(np.empty((0, plant.n)), np.empty(0), np.empty(0))
+    (K, errors, D, rest), (state, pushed, _) = feedback, plant.grid_rows
+    answer, (taken, disturbed) = pushed @ K, taken_between_samples(plant, plant.grid_rows, D)
     reach = np.sqrt(np.einsum("...i,lij,...j->l...", answer, errors, answer).max(axis=0))
-    return ClosedLoopGrid((state + answer).reshape(-1, plant.n), (left - disturbed - reach).ravel())
+    least, at_rest = taken + disturbed + reach, state @ rest.state + pushed @ rest.input
+    low, high = plant.box_low - at_rest + least, plant.box_high - at_rest - least
+    return ClosedLoopGrid((state + answer).reshape(-1, plant.n), low.ravel(), high.ravel())
 
 
 class _ClosedLoop:
-    """What one step makes of rows, in units of the safe box."""
+    """What one step makes of rows, in units of the safe box and from the resting point."""
 
     def __init__(self, feedback: Feedback, plant: LinearPlant) -> None:
         self._plant, self._feedback = plant, feedback
-        self._K, self._errors, self._D = feedback
+        self._K, self._errors, self._D, self.rest = feedback
         self.widths = plant.half_widths
         self.next = plant.A + plant.B @ self._K
 
-    def first_rows(self) -> np.ndarray:
-        """Returns the rows of the box and of the input limits, in units of the box.
+    def first_faces(self) -> Faces:
+        """Returns the faces of the box, of the input limits and on the grid.
 
         Raises:
-            Infeasible: If errors of the estimate alone take an input beyond its limit.
+            Infeasible: If errors of the estimate alone take an input beyond its limit, or the rest is not inside.
         """
-        allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _MARGIN) - self._reach(self._K)
-        if (allowed <= 0.0).any():
+        plant, (x_c, u_c) = self._plant, self.rest
+        reached = plant.box @ x_c
+        box = in_half_ranges(plant.box, plant.box_low - reached, plant.box_high - reached)
+        taken = plant.input_half * (float(ACTION_ROUNDING) + _MARGIN) + self._reach(self._K)
+        low, high = plant.input_low - u_c + taken, plant.input_high - u_c - taken
+        if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
-        rows, (images, left) = np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]), self._on_grid()
-        if (left <= 0.0).any():
+        inputs, grid = in_half_ranges(self._K, low, high), grid_in_closed_loop(self._feedback, plant)
+        low, high = grid.low + _MARGIN, grid.high - _MARGIN
+        if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none("errors and disturbances alone leave the box between two samples; smaller bounds leave room")
-        return np.concatenate([rows, images / left[:, None]]) * self.widths
+        faces = box.followed_by(inputs).followed_by(in_half_ranges(grid.images, low, high))
+        return faces._replace(rows=faces.rows * self.widths)
 
-    def _on_grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what u = K x_hat makes of x at the times of the grid, rows (g, n), and what |row x| may be, (g,)."""
-        grid = grid_in_closed_loop(self._feedback, self._plant)
-        return grid.images, grid.left - _MARGIN
-
-    def predecessor(self, rows: np.ndarray) -> np.ndarray:
-        """Returns what states have to fulfil so that the next ones fulfil a row, shape (n,), or rows, (k, n).
-
-        All are in units of the box.
+    def predecessor(self, faces: Faces) -> Faces:
+        """Returns what states have to fulfil so that the next ones fulfil rows.
 
         Raises:
             Infeasible: If errors and disturbances alone leave a row.
         """
-        physical = rows / self.widths
+        physical = faces.rows / self.widths
         pushed = physical @ self._plant.B
-        left = 1.0 - _MARGIN - self._reach(pushed @ self._K) - np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
-        left = left - float(ACTION_ROUNDING) * (np.abs(pushed) @ self._plant.u_max)
-        if (left <= 0.0).any():
-            raise _none("errors and disturbances alone leave one of its faces; smaller bounds leave room")
-        return (physical @ self.next) * self.widths / left[..., None]
+        taken = _MARGIN + self._reach(pushed @ self._K) + np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
+        taken = taken + float(ACTION_ROUNDING) * (np.abs(pushed) @ self._plant.input_half)
+        return in_half_ranges((physical @ self.next) * self.widths, faces.low + taken, faces.high - taken)
 
     def _reach(self, rows: np.ndarray) -> np.ndarray:
         """Returns the largest support over the error sets of rows, shape (..., n) in physical units."""
         squares = np.einsum("...i,kij,...j->k...", rows, self._errors, rows)
         return np.sqrt(np.maximum(squares, 0.0)).max(axis=0)
 
-    def in_physical_units(self, rows: np.ndarray) -> np.ndarray:
-        """Returns rows in physical units, rounded; the rows of the box are those of the plant to the last bit."""
-        rounded = exact.rounded(rows, _DIGITS, axis=1) / self.widths
-        box = self._plant.box_rows
-        return np.concatenate([box, rounded[len(box) :]])
+    def in_physical_units(self, faces: Faces) -> Faces:
+        """Returns faces in physical units, rounded, as the plant's state has them.
 
-    def multipliers(self, rows: np.ndarray) -> np.ndarray:
-        """Returns what writes rows after one step, of the gain and on the grid as sums of rows, (r + m + g, r)."""
-        scaled, limits, gains = rows * self.widths, self._plant.u_max, slice(len(rows), len(rows) + self._plant.m)
-        images = np.concatenate([rows @ self.next, self._K / limits[:, None], self._on_grid()[0]]) * self.widths
-        found = np.array([_largest(scaled, image)[1] for image in images])
+        The rows of the box are those of the plant to the last bit, and so are their ends.
+        """
+        plant, count = self._plant, len(self._plant.box)
+        rows = exact.rounded(faces.rows, _DIGITS, axis=1) / self.widths
+        reached = rows @ self.rest.state
+        low, high = (
+            np.where(np.isfinite(ends), exact.rounded(np.where(np.isfinite(ends), ends, 0.0), _DIGITS) + reached, ends)
+            for ends in (faces.low, faces.high)
+        )
+        own = Faces(plant.box, plant.box_low, plant.box_high)
+        return own.followed_by(Faces(rows, low, high).some(slice(count, None)))
+
+    def multipliers(self, faces: Faces) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what writes rows after one step, of the gain and on the grid as sums of rows, (r + m + g, r) each.
+
+        The first bound them from above, the second from below.
+        """
+        rows, limits = faces.rows, self._plant.input_half
+        gains = slice(len(rows), len(rows) + self._plant.m)
+        reached = rows @ self.rest.state
+        own = Faces(rows * self.widths, faces.low - reached, faces.high - reached)
+        grid = grid_in_closed_loop(self._feedback, self._plant).images
+        images = np.concatenate([rows @ self.next, self._K / limits[:, None], grid]) * self.widths
+        found = np.array([[bound.multipliers for bound in _extremes(own, image)] for image in images])
         found[np.abs(found) < 1e-13] = 0.0
-        found[gains] *= limits[:, None]
-        return exact.rounded(found, _DIGITS + 2, axis=1)
+        found[gains] *= limits[:, None, None]
+        lower, upper = exact.rounded(found, _DIGITS + 2, axis=2).swapaxes(0, 1)
+        return upper, lower
 
 
 def _none(reason: str) -> Infeasible:
@@ -263,31 +334,76 @@ def _too_many() -> Infeasible:
     return _none(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
 
 
-def _largest(rows: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray]:
-    """Returns max row z over |rows z| <= 1, and the multipliers, shape (r,), that prove it; infinite if unbounded."""
+class _Bound(NamedTuple):
+    """An extreme value of row z in a polytope, infinite if there is none, with the multipliers (r,) that prove it."""
+
+    value: float
+    multipliers: np.ndarray
+
+
+def _extremes(faces: Faces, row: np.ndarray) -> tuple[_Bound, _Bound]:
+    """Returns the least and the largest row z, shape (n,), in a polytope; of a symmetric one they are each other's."""
+    largest = _largest(faces, row)
+    if np.array_equal(-faces.low, faces.high):
+        return _Bound(-largest.value, largest.multipliers), largest
+    least = _largest(faces, -row)
+    return _Bound(-least.value, -least.multipliers), largest
+
+
+def _largest(faces: Faces, row: np.ndarray) -> _Bound:
+    above, below = np.isfinite(faces.high), np.isfinite(faces.low)
     found = linprog(
         -row,
-        A_ub=np.concatenate([rows, -rows]),
-        b_ub=np.ones(2 * len(rows)),
+        A_ub=np.concatenate([faces.rows[above], -faces.rows[below]]),
+        b_ub=np.concatenate([faces.high[above], -faces.low[below]]),
         bounds=(None, None),
         method="highs",
         options=_SOLVER,
     )
+    multipliers = np.zeros(len(faces.rows))
     if found.status != 0:
-        return math.inf, np.zeros(len(rows))
+        return _Bound(math.inf, multipliers)
     prices = -found.ineqlin.marginals
-    return -found.fun, prices[: len(rows)] - prices[len(rows) :]
+    multipliers[above] += prices[: np.count_nonzero(above)]
+    multipliers[below] -= prices[np.count_nonzero(above) :]
+    return _Bound(-found.fun, multipliers)
 
 
-def _without_implied(rows: np.ndarray, kept: int, count: int = 0) -> tuple[np.ndarray, int]:
-    """Returns rows without those that the others imply, and how many of the first `count` stay; the `kept` first do."""
-    for i in range(len(rows) - 1, kept - 1, -1):
-        others = np.delete(rows, i, axis=0)
-        if _largest(others, rows[i])[0] <= 1.0 + _IMPLIED:
-            rows, count = others, count - (i < count)
-    return rows, count
+def _cuts(faces: Faces, row: Faces) -> np.ndarray:
+    """Returns whether the low and the high end of one row cut anything off a polytope, shape (2,)."""
+    least, largest = _extremes(faces, row.rows[0])
+    low, high = float(row.low[0]), float(row.high[0])
+    # An open end cuts nothing, even off what is unbounded.
+    cuts_low, cuts_high = low > -math.inf and least.value < low - _IMPLIED, largest.value > high + _IMPLIED
+    return np.array([cuts_low, high < math.inf and cuts_high])
 
 
-def _rounded(step: _ClosedLoop, rows: np.ndarray) -> Polytope:
-    physical = step.in_physical_units(rows)
-    return Polytope(rows=physical, multipliers=step.multipliers(physical))
+def _without_implied(faces: Faces, kept: int, count: int = 0) -> tuple[Faces, int]:
+    """Returns faces without those that the others imply, and how many of the first `count` rows stay.
+
+    The `kept` first stay as they are. Of a row that only cuts with one end the other one is opened.
+    """
+    for i in range(len(faces.rows) - 1, kept - 1, -1):
+        others, row = faces.some(np.arange(len(faces.rows)) != i), faces.some(slice(i, i + 1))
+        low, high = _cuts(others, row)
+        if not (low or high):
+            faces, count = others, count - (i < count)
+        elif not (low and high):
+            ends = faces.low.copy(), faces.high.copy()
+            ends[int(low)][i] = _OPEN[int(low)][0]
+            faces = Faces(faces.rows, *ends)
+    return faces, count
+
+
+def _rounded(step: _ClosedLoop, faces: Faces) -> Polytope:
+    physical = step.in_physical_units(faces)
+    upper, lower = step.multipliers(physical)
+    rest = step.rest.state
+    return Polytope(
+        rows=physical.rows,
+        low=physical.low,
+        high=physical.high,
+        center=rest,
+        multipliers=upper,
+        lower_multipliers=lower,
+    )

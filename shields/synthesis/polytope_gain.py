@@ -53,12 +53,10 @@ def gains_of_larger_polytopes(
         """Returns the share of the box that a gain, its entries in one row, does not keep."""
         return 1.0 - share_of_points(feedback._replace(K=entries.reshape(plant.m, plant.n)), plant, points)
 
-    efforts = (effort * np.diag(plant.u_max**-2.0) for effort in _INPUT_WEIGHTS)
-    regulators = (lqr_gain(plant.A, plant.B, plant.weight, effort) for effort in efforts)
-    gains = [K.ravel() for K in (feedback.K, *regulators) if K is not None]
+    gains = [K.ravel() for K in (feedback.K, *regulators(plant))]
     losses = [lost(entries) for entries in gains]
     best = gains[int(np.argmin(losses))]
-    units = np.diag((plant.u_max[:, None] / plant.half_widths).ravel())
+    units = np.diag((plant.input_half[:, None] / plant.half_widths).ravel())
     for change in _CHANGES:
         progress(f"gain of the polytope: {100.0 * (1.0 - min(losses)):.1f} % of the box")
         simplex = best + change * np.concatenate([np.zeros((1, len(units))), units])
@@ -70,6 +68,13 @@ def gains_of_larger_polytopes(
     for k in np.argsort(losses, kind="stable"):
         if losses[k] < losses[0]:
             yield gains[k].reshape(plant.m, plant.n)
+
+
+def regulators(plant: LinearPlant) -> list[np.ndarray]:
+    """Returns the gains, shape (m, n), of linear-quadratic regulators that use more and more of the inputs."""
+    efforts = (effort * np.diag(plant.input_half**-2.0) for effort in _INPUT_WEIGHTS)
+    found = (lqr_gain(plant.A, plant.B, plant.weight, effort) for effort in efforts)
+    return [K for K in found if K is not None]
 
 
 class TolerantGain(NamedTuple):

@@ -31,12 +31,14 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
     """
     if not (np.isfinite(L).all() and np.linalg.eigvalsh(L)[0] > 0.0):
         return {"share_of_box_unknown": "the set is flat in float64"}
+    if not plant.is_symmetric and (len(plant.box) != plant.n or not np.isfinite(plant.box_ends).all()):
+        return {"share_of_box_unknown": "the volume of limits with two ends that are no box is not computed"}
     stored = inputs_under_way(plant)
     if not stored:
-        share = _share(plant.box_rows, L)
-        return {"share_of_box_unknown": _reason(plant.box_rows)} if share is None else {"share_of_box": share}
+        share = _share(plant.box, L)
+        return {"share_of_box_unknown": _reason(plant.box)} if share is None else {"share_of_box": share}
     kept = plant.n - stored
-    rows = plant.box_rows[plant.box_rows[:, :kept].any(axis=1)]
+    rows = plant.box[plant.box[:, :kept].any(axis=1)]
     if rows[:, kept:].any() or np.linalg.matrix_rank(rows[:, :kept]) < kept:
         return {"share_of_box_unknown": "the box of the states depends on inputs under way, or is unbounded"}
     share = _share(rows[:, :kept], np.linalg.inv(np.linalg.inv(L)[:kept, :kept]))

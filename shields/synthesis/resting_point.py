@@ -1,0 +1,143 @@
+"""The point at which a fallback input rests, for plants whose limits are not symmetric about their operating point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import null_space
+from scipy.optimize import linprog
+
+from ncs_gym import LinearPlant, exact
+from ncs_gym.plants.lqr import lqr_gain
+from shields.errors import Infeasible
+from shields.synthesis.design_problem import Rest, SymmetricLimits
+
+# Significant digits of a resting point, in units of the limits: what differs between processors is beyond them.
+_DIGITS = 12
+# The search for a better point takes steps of these sizes along every direction of the equilibria, in units of the
+# distance at which some limit is reached, as long as one of them helps.
+_STEPS = (0.4, 0.2, 0.1, 0.05, 0.02)
+_MOST_TURNS = 6
+# How far a state without a limit is taken to go while a gain is sought, next to where a regulator lets it go.
+_GENEROUS = 2.0
+_STEPS_OF_REACH = 400
+
+
+def at_operating_point(plant: LinearPlant) -> Rest:
+    """Returns the operating point itself, zero: where fallbacks of plants with symmetric limits rest."""
+    return Rest(np.zeros(plant.n), np.zeros(plant.m))
+
+
+def equilibria(plant: LinearPlant) -> np.ndarray:
+    """Returns directions (x, u) with x = A x + B u, shape (n + m, q), in which every limit is about 1 away."""
+    scale = np.concatenate([plant.half_widths, plant.input_half])
+    balance = np.hstack([plant.A - np.eye(plant.n), plant.B]) / plant.half_widths[:, None]
+    return scale[:, None] * null_space(balance * scale)
+
+
+def _limit_rows(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the rows of all limits on (x, u), in units of half their range, and their ends."""
+    rows = np.zeros((len(plant.box) + plant.m, plant.n + plant.m))
+    rows[: len(plant.box), : plant.n] = plant.box
+    rows[len(plant.box) :, plant.n :] = np.diag(1.0 / plant.input_half)
+    return rows, *np.concatenate([plant.box_ends, plant.input_ends / plant.input_half], axis=1)
+
+
+def farthest_from_limits(plant: LinearPlant) -> Rest:
+    """Returns the equilibrium whose nearest limit is farthest away, in units of half its range, by a linear program.
+
+    Raises:
+        Infeasible: If no equilibrium is strictly within the limits.
+    """
+    directions, (rows, low, high) = equilibria(plant), _limit_rows(plant)
+    reached, ones = rows @ directions, np.ones((len(rows), 1))
+    faces = np.concatenate([np.hstack([reached, ones])[np.isfinite(high)], np.hstack([-reached, ones])[np.isfinite(low)]])
+    ends = np.concatenate([high[np.isfinite(high)], -low[np.isfinite(low)]])
+    size = directions.shape[1]
+    found = linprog(-np.eye(size + 1)[-1], A_ub=faces, b_ub=ends, bounds=[(None, None)] * size + [(None, 1.0)])
+    if found.status != 0 or not found.x[-1] > 0.0:
+        raise Infeasible("no equilibrium lies strictly within the limits of states and inputs", "S", 1.0)
+    return rest_at(plant, directions @ found.x[:-1])
+
+
+def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:
+    """Returns a point (x, u), shape (n + m,), in round numbers."""
+    scale = np.concatenate([plant.half_widths, plant.input_half])
+    rounded = np.array([float(exact.rounded(each / unit, _DIGITS)) * unit for each, unit in zip(point, scale, strict=True)])
+    return Rest(rounded[: plant.n], rounded[plant.n :])
+
+
+def distances(plant: LinearPlant, rest: Rest) -> np.ndarray:
+    """Returns how far a point is from the nearer end of every limit, in units of half its range, shape (k + m,)."""
+    rows, low, high = _limit_rows(plant)
+    values = rows @ np.concatenate(rest)
+    return np.minimum(values - low, high - values)
+
+
+def limits_around(plant: LinearPlant, rest: Rest) -> SymmetricLimits:
+    """Returns the largest symmetric limits around a point, with generous ones of states that have none.
+
+    Raises:
+        Infeasible: If the point is not strictly within the limits.
+    """
+    nearest = distances(plant, rest)
+    if not (nearest > 0.0).all():
+        raise Infeasible("the resting point is not strictly within the limits of states and inputs", "S", 1.0)
+    k = len(plant.box)
+    rows, u_max = plant.box / nearest[:k, None], plant.input_half * nearest[k:]
+    if np.linalg.matrix_rank(rows * plant.half_widths) < plant.n:
+        rows = np.concatenate([rows, _generous_rows(plant, rows, u_max)])
+    return SymmetricLimits(rows, u_max)
+
+
+def _generous_rows(plant: LinearPlant, rows: np.ndarray, u_max: np.ndarray) -> np.ndarray:
+    """Returns rows that limit every state which no row limits alone, (j, n), about to where a regulator lets it go.
+
+    Where that is not known, to the half-widths of the plant.
+    """
+    free = np.flatnonzero([not any(np.count_nonzero(row) == 1 and row[i] != 0.0 for row in rows) for i in range(plant.n)])
+    weight = rows.T @ rows
+    K = lqr_gain(plant.A, plant.B, weight + 1e-9 * np.trace(weight) * np.eye(plant.n), np.diag(u_max**-2.0))
+    reach = plant.half_widths
+    if K is not None:
+        # States from which the regulator keeps all rows and inputs are within sum_j |(A+BK)^j| of what is seen of them.
+        seen, power, reached = np.vstack([rows, K / u_max[:, None]]), np.eye(plant.n), []
+        for _ in range(_STEPS_OF_REACH):
+            reached.append(seen @ power)
+            power = (plant.A + plant.B @ K) @ power
+        stacked = np.concatenate(reached)
+        if np.linalg.matrix_rank(stacked / np.maximum(np.abs(stacked).max(axis=0), 1e-300)) == plant.n:
+            reach = np.array([_farthest(stacked, i) for i in range(plant.n)])
+    widths = np.where(np.isfinite(reach), _GENEROUS * reach, plant.half_widths)
+    return np.diag(1.0 / widths)[free]
+
+
+def _farthest(rows: np.ndarray, i: int) -> float:
+    """Returns the largest x_i with |rows x| <= 1, by a linear program; infinite where there is none."""
+    unit = 1.0 / np.maximum(np.abs(rows).max(axis=0), 1e-300)
+    scaled = rows * unit
+    found = linprog(-np.eye(len(unit))[i], A_ub=np.concatenate([scaled, -scaled]), b_ub=np.ones(2 * len(rows)), bounds=(None, None))
+    return -found.fun * float(unit[i]) if found.status == 0 else np.inf
+
+
+def improved(plant: LinearPlant, rest: Rest, share: Callable[[Rest], float]) -> Rest:
+    """Returns an equilibrium with a larger share of the box, by a search along one direction after the other.
+
+    Args:
+        plant: The plant.
+        rest: Where it begins.
+        share: Of the box that is kept from a resting point.
+    """
+    directions, best, most = equilibria(plant), rest, share(rest)
+    for step in _STEPS:
+        for _ in range(_MOST_TURNS):
+            before = most
+            for direction in directions.T:
+                for sign in (1.0, -1.0):
+                    tried = rest_at(plant, np.concatenate(best) + sign * step * direction)
+                    if (distances(plant, tried) > 0.0).all() and (found := share(tried)) > most:
+                        best, most = tried, found
+            if most == before:
+                break
+    return best
