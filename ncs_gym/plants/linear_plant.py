@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -76,6 +77,8 @@ _KINDS = {
     "sensor noise": ("the sensors measure without noise", "sensor_bound or measurement_noise_cov"),
     "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
 }
+# Arguments of the constructor about limits, of which `box` is a field, too.
+_LIMITS = "state_limits", "input_limits", "output_limits", "box", "u_max", "offset"
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
 # Stands for a space at which no line ends.
@@ -107,6 +110,12 @@ def with_limits_as_published(kind: Kind) -> Kind:
             )
         construct(self, **limits.fields_of(arguments))
 
+    taken = dict(inspect.signature(construct).parameters)
+    published = {name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in _LIMITS}
+    first = {name: taken.pop(name) for name in ("self", "A", "B", "dt")}
+    taken = {name: taken[name].replace(default=None) if name in ("input_ends",) else taken[name] for name in taken}
+    taken.pop("box")
+    __init__.__signature__ = inspect.Signature([*(first | published | taken).values()])  # pyright: ignore
     constructor.__init__ = __init__
     return kind
 
@@ -176,9 +185,9 @@ class LinearPlant(ReadOnlyArrays):
 
     A: np.ndarray
     B: np.ndarray
+    dt: float
     box: np.ndarray
     input_ends: np.ndarray
-    dt: float
     box_ends: np.ndarray = FILLED_IN_LATER
     gamma: float = 0.0
     H: np.ndarray = FILLED_IN_LATER
@@ -208,14 +217,14 @@ class LinearPlant(ReadOnlyArrays):
             A: ArrayLike,
             B: ArrayLike,
             dt: float,
-            box: ArrayLike | None = None,
-            u_max: ArrayLike | None = None,
             state_limits: tuple[ArrayLike, ArrayLike] | None = None,
             input_limits: tuple[ArrayLike, ArrayLike] | None = None,
             output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
+            box: ArrayLike | None = None,
+            u_max: ArrayLike | None = None,
             offset: ArrayLike | None = None,
-            box_ends: ArrayLike | None = None,
             input_ends: ArrayLike | None = None,
+            box_ends: ArrayLike | None = None,
             gamma: float = 0.0,
             H: ArrayLike | None = None,
             process_noise_cov: ArrayLike | None = None,

@@ -139,8 +139,8 @@ def _limits_exceeded(plant: LinearPlant) -> str:
     """Returns which limits of the safe box the disturbance of a single step exceeds, as the rest of a sentence."""
     reached = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, plant.nominal_disturbance.shape_matrix, plant.box_rows))
     return "".join(
-        f"; the disturbance of one step alone reaches {size:.3g} times the limit {row_limit(plant, row)}"
-        for row, size in zip(plant.box_rows, reached, strict=True)
+        f"; the disturbance of one step alone reaches {size:.3g} times the limit {row_limit(plant, j)}"
+        for j, size in enumerate(reached.tolist())
         if size >= 1.0
     )
 
@@ -206,8 +206,8 @@ def _widenings(plant: LinearPlant) -> list[_Change]:
     changes.append(_Change("box", "the safe box", rows(slice(None))))
     if len(plant.box_rows) > 1:
         changes += [
-            _Change(f"box_row_{j + 1}", f"the limit {row_limit(plant, row)}", rows(slice(j, j + 1)))
-            for j, row in enumerate(plant.box_rows)
+            _Change(f"box_row_{j + 1}", f"the limit {row_limit(plant, j)}", rows(slice(j, j + 1)))
+            for j in range(len(plant.box_rows))
         ]
     return changes
 

