@@ -177,8 +177,8 @@ APPLIED = "input_committed"
 class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
-    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits": plant.input_ends}`;
-    `SB3VecEnv` needs `info_keys=("input_committed",)`. `train` does so with the hyperparameter
+    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits":
+    plant.input_ends}`; `SB3VecEnv` needs `info_keys=("input_committed",)`. `train` does so with the hyperparameter
     `stored_action="applied"`.
 
     Args:

@@ -29,7 +29,7 @@ from scipy.stats import qmc
 
 import ncs_gym  # noqa: F401  (registers the environments)
 from shields import Infeasible, synthesize
-from shields.synthesis.invariant_polytope import invariant_rows
+from shields.synthesis.invariant_polytope import Faces, in_half_ranges, invariant_faces
 from shields.verification import ACTION_ROUNDING
 
 IDS = ("TruckTrailerCruise", "BatchReactor", "Pendulum", "CartPole")
@@ -60,13 +60,12 @@ def case_of(name: str) -> Case:
 
 
 def ours(case: Case) -> np.ndarray:
-    def predecessor(row: np.ndarray) -> np.ndarray:
-        left = 1.0 - RESERVE - np.abs(row) @ case.W
-        if left <= 0.0:
-            raise Infeasible("disturbances alone leave one of its faces", "P", 0.0)
-        return row @ case.A / left
+    def predecessor(faces: Faces) -> Faces:
+        taken = RESERVE + np.abs(faces.rows) @ case.W
+        return in_half_ranges(faces.rows @ case.A, faces.low + taken, faces.high - taken)
 
-    rows = invariant_rows(case.rows, predecessor, case.A.shape[0])
+    ones = np.ones(len(case.rows))
+    rows = invariant_faces(Faces(case.rows, -ones, ones), predecessor, case.A.shape[0]).rows
     return np.concatenate([rows, -rows])
 
 

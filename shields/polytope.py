@@ -52,8 +52,7 @@ class Polytope(ReadOnlyArrays):
     lower_multipliers: np.ndarray = FILLED_IN_LATER
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if shapes do not fit, numbers are not finite, rows are too many, or P has no inside.
-        """
+        """Raises CertificateError if shapes do not fit, numbers are not finite, or the center is not inside."""
         try:
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
@@ -97,7 +96,7 @@ class Polytope(ReadOnlyArrays):
 
     @cached_property
     def widths(self) -> np.ndarray:
-        """Bounds of |x_i - c_i| in P, shape (n,), as far as floats tell: infinite where rows with two ends give none."""
+        """Bounds of |x_i - c_i| in P as floats tell, shape (n,); infinite where rows with two ends give none."""
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
         rows, reached = self.rows[bounded], self.rows[bounded] @ self.center
         sizes = np.maximum(self.high[bounded] - reached, reached - self.low[bounded])

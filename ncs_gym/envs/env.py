@@ -95,7 +95,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
     | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
-    | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in units of half its range; positive is violated |
+    | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in halves of its range; positive is violated |
     | `worst_constraint_values` | `(k,)` | - | the largest since the last step, also between samples if they count |
     | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |

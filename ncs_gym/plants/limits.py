@@ -7,6 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ncs_gym import exact
+from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_numbers, as_setting, as_vector, shown
 
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
@@ -144,7 +148,9 @@ def _in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> R
     half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.minimum(-low, high))
     symmetric = -low == high
     low, high = np.where(symmetric, -1.0, low / half), np.where(symmetric, 1.0, high / half)
-    return Rows((1.0 / half)[:, None] * rows, np.where(low < -1e300, -np.inf, low), np.where(high > 1e300, np.inf, high))
+    return Rows(
+        (1.0 / half)[:, None] * rows, np.where(low < -1e300, -np.inf, low), np.where(high > 1e300, np.inf, high)
+    )
 
 
 def _state_rows(limits: Any, center: np.ndarray) -> Rows:
@@ -274,7 +280,9 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     if missing:
         raise TypeError(f"LinearPlant needs limits: give {', and '.join(' or '.join(names[:2]) for names in missing)}")
     fields = dict(arguments)
-    published = {name: fields.pop(name, None) for name in ("u_max", "state_limits", "input_limits", "output_limits", "offset")}
+    published = {
+        name: fields.pop(name, None) for name in ("u_max", "state_limits", "input_limits", "output_limits", "offset")
+    }
     A, B = as_setting(fields.get("A")), as_setting(fields.get("B"))
     if A is None or B is None or A.ndim != 2 or B.ndim != 2 or len(A) != A.shape[1] or len(B) != len(A) or not B.size:
         return fields | {"box": 1.0, "input_ends": (-1.0, 1.0)}  # A or B is wrong
@@ -312,6 +320,67 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     if given:
         rows = _joined(given)
         if not len(rows.rows):
-            raise ValueError("state_limits and output_limits are all infinite: give at least one finite limit of a state")
+            raise ValueError(
+                "state_limits and output_limits are all infinite: give at least one finite limit of a state"
+            )
         fields |= {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
+    bound = fields.get("disturbance_bound")
+    if isinstance(bound, (tuple, list)) and len(bound) == 3 and np.ndim(as_numbers(bound[0])) == 2:
+        fields |= _around_middle_of_disturbance(A, B, bound, fields, (state, applied))
     return fields
+
+
+def _around_middle_of_disturbance(
+    A: np.ndarray, B: np.ndarray, bound: Any, fields: dict[str, Any], point: tuple[np.ndarray, np.ndarray]
+) -> dict[str, Any]:
+    """Returns the fields that change where a disturbance d = E w has two different ends, low <= w <= high.
+
+    Deviations are counted from (x, u) then with x = A x + B u + E (low + high) / 2, of such points that nearest to the
+    operating point in units of the limits; around it the disturbance is symmetric. What the point lacks of an
+    equilibrium by rounding is added to the bound.
+
+    Raises:
+        ValueError: If the bound is none, or no such point lies within the limits.
+    """
+    from scipy.linalg import null_space  # takes long to import
+
+    (n, m), name = B.shape, "disturbance_bound"
+    E = as_matrix(bound[0], (n, None), f"{name}: E of d = E w")
+    low, high = sides(bound[1:], E.shape[1], f"{name}: (E, low, high)")
+    half, middle = 0.5 * (high - low), 0.5 * (low + high)
+    declared = as_bound((E, half), n, name)
+    if not middle.any():
+        return {name: declared}
+    rows = as_box_rows(fields["box"], n)
+    ends = as_row_ends(fields.get("box_ends"), len(rows))
+    inputs = as_input_ends(fields["input_ends"], m)
+    reach = 0.5 * (inputs[1] - inputs[0])
+    balance = np.hstack([np.eye(n) - A, -B * reach])
+    found = np.linalg.lstsq(balance, E @ middle)[0]
+    directions = null_space(balance)
+    sizes = np.vstack([np.hstack([rows, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
+    found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
+    x, u = found[:n], reach * found[n:]
+    missing = exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))
+    terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(middle) + np.abs(x)
+    if not (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
+        raise ValueError(
+            f"{name}: no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} "
+            "per step, whatever the input: give symmetric ends around zero"
+        )
+    ends, inputs = ends - rows @ x, inputs - u[None]
+    if not ((ends[0] < 0.0) & (ends[1] > 0.0)).all() or not ((inputs[0] < 0.0) & (inputs[1] > 0.0)).all():
+        raise ValueError(
+            f"{name}: the middle of this disturbance moves the operating point to {shown((point[0] + x).tolist())} "
+            f"with input {shown((point[1] + u).tolist())}, which is not strictly within the limits"
+        )
+    lacking = np.diag(n * np.square(2.0 * np.abs(missing)))
+    weight = rows.T @ rows + np.eye(n) * np.trace(rows.T @ rows) / n
+    return {
+        name: Ellipsoid(outer_sum(declared.shape_matrix, lacking, weight)),
+        "box": rows,
+        "box_ends": ends,
+        "input_ends": inputs,
+        "operating_state": point[0] + x,
+        "operating_input": point[1] + u,
+    }

@@ -126,10 +126,11 @@ class LinearPlant(ReadOnlyArrays):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
     All of it is in deviations from an operating point, (0, 0) unless given, except the limits of the constructor, which
-    are absolute. A and B are a model of deviations, as linearization gives; of a model in absolute coordinates, x+ = A x
-    + B u + c, give c as `offset`: then the operating point has to be an equilibrium. What is declared of the uncertainties adds
-    up: `disturbance_bound`, `sensor_bound` and `initial_bound` bound d, v and the error of the first estimate in the
-    plant's units, each a number r (a ball), half-widths per entry (a box), an `Ellipsoid`, or a pair (E, w) for d = E w
+    are absolute. A and B are a model of deviations, as linearization gives; of a model in absolute coordinates,
+    x+ = A x + B u + c, give c as `offset`: then the operating point has to be an equilibrium.
+
+    What is declared of the uncertainties adds up: `disturbance_bound`, `sensor_bound` and `initial_bound` bound d, v
+    and the error of the first estimate in the plant's units, each a number r (a ball), half-widths per entry (a box), an `Ellipsoid`, or a pair (E, w) for d = E w
     with |w_i| <= w_i; 0 says on purpose that there is none. Covariances are the other way in: they describe Gaussian
     noise that is *truncated*, so that the bounds, and every certificate, hold the fraction 1 - delta of it alone. Of
     noise with a datasheet's covariance a fraction delta of all samples lies outside.
@@ -158,7 +159,8 @@ class LinearPlant(ReadOnlyArrays):
         measurement_noise_cov: R, shape (p, p), truncated at chi2_{p,1-delta}; zero by default.
         initial_cov: P0 of the first estimate, shape (n, n), truncated alike; zero by default.
         delta: Probability mass that the truncation of each Gaussian removes, in [1e-12, 0.999].
-        disturbance_bound: Of further disturbances d; kept as an `Ellipsoid`.
+        disturbance_bound: Of further disturbances d; kept as an `Ellipsoid`. A triple (E, low, high) for d = E w with
+            low <= w <= high moves the operating point to where the middle of w rests: deviations are counted from it.
         sensor_bound: Of further sensor noise v; kept as an `Ellipsoid`.
         initial_bound: Of a further error of the first estimate; kept as an `Ellipsoid`.
         remainder: What the model leaves out of the process that really moves, part of d (`ncs_gym.linear_model`); None
@@ -293,7 +295,8 @@ class LinearPlant(ReadOnlyArrays):
             if not isinstance(self.remainder, Remainder):
                 raise ValueError(f"remainder must be a Remainder, got {shown(self.remainder)}")
             as_bound(self.remainder.bound, self.n, "remainder")
-            model = {name: getattr(self, name) for name in ("A", "B", "box", "box_ends", "input_ends", "dt")}
+            model = {name: getattr(self, name) for name in ("A", "B")}
+            model |= {"box": np.vstack([self.box.T, self.box_ends]), "u_max": self.input_ends, "dt": self.dt}
             self._set("remainder", self.remainder.of_model(model))
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
@@ -637,13 +640,13 @@ class LinearPlant(ReadOnlyArrays):
     def digest(self) -> str:
         """Returns what the fingerprint would be if it were computed now."""
         digest = hashlib.sha256()
-        matrices = {"A": self.A, "B": self.B, "C": self.box, "H": self.H, "u_max": self.input_high}
+        matrices = {"A": self.A, "B": self.B, "C": self.box, "H": self.H, "u_max": self.input_ends[1]}
         names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
         for name, array in (matrices | {name: getattr(self, name) for name in names}).items():
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
         if not self.is_symmetric:  # symmetric ones keep the fingerprint they always had
-            digest.update(self.box_ends.astype("<f8").tobytes() + self.input_low.astype("<f8").tobytes())
+            digest.update(self.box_ends.astype("<f8").tobytes() + self.input_ends[0].astype("<f8").tobytes())
         if self.error_gain is not None:
             digest.update(self.error_gain.astype("<f8").tobytes())
         for name in ("disturbance_bound", "sensor_bound", "initial_bound", "operating_state", "operating_input"):

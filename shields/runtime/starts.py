@@ -65,8 +65,8 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
 def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether all starts in an ellipsoid, or one state, shape (n,), lie in the safe box, in exact arithmetic.
 
-    E(P) does exactly if c_i P c_i' is at most the square of the nearer end for all rows. Where the box counts between samples, they have to lie in a
-    smaller one, in which disturbances cannot leave it.
+    E(P) does exactly if c_i P c_i' is at most the square of the nearer end for all rows. Where the box counts between
+    samples, they have to lie in a smaller one, in which disturbances cannot leave it.
     """
     between = rows_between(plant)
     return _between(between.at_samples, between.low_at_samples, between.high_at_samples, initial)

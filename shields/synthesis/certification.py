@@ -43,6 +43,7 @@ from shields.synthesis.polytope_gain import (
     ellipsoid_margin,
     gains_of_larger_polytopes,
     most_tolerant_gain,
+    needs_of,
     regulators,
 )
 from shields.synthesis.resting_point import at_operating_point, farthest_from_limits, improved, limits_around
@@ -175,17 +176,20 @@ def _around_resting_point(
     def share(K: np.ndarray, at: Rest) -> float:
         return share_of_points(Feedback(K, shapes, _disturbance_around(plant, at), at), plant, points)
 
-    tried = [(K, rest) for K in _gains_around(plant, problem, progress)]
+    tried = []
+    for K in _gains_around(plant, problem, progress):
+        needs = needs_of(Feedback(K, shapes, _disturbance_around(plant, rest), rest), plant)
+        tried.append((K, rest if needs is None else farthest_from_limits(plant, needs)))
     if points is not None:
         shares = [share(*each) for each in tried]
         tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
-        K = tried[0][0]
+        K, rest = tried[0]
         progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
         better = improved(plant, rest, lambda at: share(K, at))
         if search_gain:
             feedback = Feedback(K, shapes, _disturbance_around(plant, better), better)
             tried = [(each, better) for each in gains_of_larger_polytopes(feedback, plant, progress)] + tried
-        tried = [*tried[:-len(shares)], (K, better), *tried[-len(shares):]]
+        tried = [*tried[: -len(shares)], (K, better), *tried[-len(shares) :]]
     for K, at in tried:
         found = certify_polytope(plant, K, contract, progress, at)
         if found is not None:
@@ -208,8 +212,7 @@ def _gains_around(plant: LinearPlant, problem: DesignProblem, progress: Progress
     if start is not None:
         yield problem.to_physical(start.L, start.K)[1]
         yield problem.to_physical(start.L, most_tolerant_gain(problem, start).K)[1]
-    for K in regulators(plant):
-        yield K
+    yield from regulators(plant)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:

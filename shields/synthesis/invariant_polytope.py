@@ -22,6 +22,7 @@ from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
 from shields.synthesis.design_problem import Rest, taken_between_samples
+from shields.synthesis.resting_point import units_of_states
 from shields.verification import ACTION_ROUNDING
 
 # The search takes at most so long [s], of its thread's own time: what else a machine does decides no certificate.
@@ -117,7 +118,11 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
         Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
     step = _ClosedLoop(feedback, plant)
-    return _rounded(step, invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress))
+    faces = invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress)
+    if step.has_free_states:  # how far they go is known now: in units of that numbers round well
+        step.widths = step.widths * _extents(faces)
+        faces = invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress)
+    return _rounded(step, faces)
 
 
 def invariant_faces(
@@ -159,7 +164,9 @@ def invariant_faces(
         row = predecessor(row)
         low, high = _cuts(faces, row)
         if low or high:
-            faces = faces.followed_by(row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1]))
+            faces = faces.followed_by(
+                row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1])
+            )
         following += 1
     progress(f"polytope: which of {len(faces.rows)} rows count")
     faces = _without_implied(faces, kept)[0]
@@ -253,7 +260,8 @@ class _ClosedLoop:
     def __init__(self, feedback: Feedback, plant: LinearPlant) -> None:
         self._plant, self._feedback = plant, feedback
         self._K, self._errors, self._D, self.rest = feedback
-        self.widths = plant.half_widths
+        self.widths = units_of_states(plant, self.rest)
+        self.has_free_states = self.widths is not plant.half_widths
         self.next = plant.A + plant.B @ self._K
 
     def first_faces(self) -> Faces:
@@ -367,6 +375,13 @@ def _largest(faces: Faces, row: np.ndarray) -> _Bound:
     multipliers[above] += prices[: np.count_nonzero(above)]
     multipliers[below] -= prices[np.count_nonzero(above) :]
     return _Bound(-found.fun, multipliers)
+
+
+def _extents(faces: Faces) -> np.ndarray:
+    """Returns how far every coordinate reaches in a polytope, shape (n,); 1 where it has no end."""
+    found = [[bound.value for bound in _extremes(faces, row)] for row in np.eye(faces.rows.shape[1])]
+    extents = np.abs(found).max(axis=1)
+    return np.where(np.isfinite(extents), extents, 1.0)
 
 
 def _cuts(faces: Faces, row: Faces) -> np.ndarray:

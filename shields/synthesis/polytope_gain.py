@@ -27,6 +27,8 @@ _POINTS_LOG2 = 13
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
 # over no more steps than the second number.
 _LEFT_OVER, _MOST_STEPS = 1e-7, 4000
+# No limit counts as less needed than this, in units of half its range.
+_SMALLEST_NEED = 1e-3
 # Digits of a tolerated factor: a search takes the same steps on every processor.
 _DIGITS = 9
 
@@ -148,6 +150,26 @@ def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool
     used[len(problem.C) :] += _reach(np.concatenate([inputs, pushed @ K]), problem.error_shapes)
     used[len(used) - len(disturbed) :] += disturbed
     return float(exact.rounded(1.0 / max(float(used.max()), 1e-300), _DIGITS))
+
+
+def needs_of(feedback: Feedback, plant: LinearPlant) -> np.ndarray | None:
+    """Returns how far errors and disturbances take the limits from rest under a gain, in units of half their range.
+
+    Shape (k + m,), of the rows of the box and of the inputs, as `polytope_margin` adds them up; None if it is too slow.
+    """
+    K, errors, D, _ = feedback
+    closed_loop = plant.A + plant.B @ K
+    radius = float(np.abs(np.linalg.eigvals(closed_loop)).max()) if np.isfinite(closed_loop).all() else np.inf
+    steps = np.inf if radius >= 1.0 else np.log(_LEFT_OVER) / np.log(max(radius, 1e-3))
+    if steps > _MOST_STEPS:
+        return None
+    inputs = K / plant.input_half[:, None]
+    moved, needs = np.concatenate([plant.box, inputs]), np.zeros(len(plant.box) + plant.m)
+    for _ in range(int(steps) + plant.n):
+        needs += _reach(moved @ (plant.B @ K), errors) + _reach(moved, D[None])
+        moved = moved @ closed_loop
+    needs[len(plant.box) :] += _reach(inputs, errors)
+    return np.maximum(needs, _SMALLEST_NEED)
 
 
 def _reach(rows: np.ndarray, shapes: np.ndarray) -> np.ndarray:

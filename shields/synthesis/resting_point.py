@@ -44,18 +44,23 @@ def _limit_rows(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return rows, *np.concatenate([plant.box_ends, plant.input_ends / plant.input_half], axis=1)
 
 
-def farthest_from_limits(plant: LinearPlant) -> Rest:
-    """Returns the equilibrium whose nearest limit is farthest away, in units of half its range, by a linear program.
+def farthest_from_limits(plant: LinearPlant, needs: np.ndarray | None = None) -> Rest:
+    """Returns the equilibrium whose nearest limit is farthest away, by a linear program.
+
+    Args:
+        plant: The plant.
+        needs: What distances from the limits are in units of, shape (k + m,), > 0; half the range by default.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
     """
     directions, (rows, low, high) = equilibria(plant), _limit_rows(plant)
-    reached, ones = rows @ directions, np.ones((len(rows), 1))
-    faces = np.concatenate([np.hstack([reached, ones])[np.isfinite(high)], np.hstack([-reached, ones])[np.isfinite(low)]])
-    ends = np.concatenate([high[np.isfinite(high)], -low[np.isfinite(low)]])
+    reached, needed = rows @ directions, np.ones((len(rows), 1)) if needs is None else needs[:, None]
+    above, below = np.isfinite(high), np.isfinite(low)
+    faces = np.concatenate([np.hstack([reached, needed])[above], np.hstack([-reached, needed])[below]])
+    ends = np.concatenate([high[above], -low[below]])
     size = directions.shape[1]
-    found = linprog(-np.eye(size + 1)[-1], A_ub=faces, b_ub=ends, bounds=[(None, None)] * size + [(None, 1.0)])
+    found = linprog(-np.eye(size + 1)[-1], A_ub=faces, b_ub=ends, bounds=[(None, None)] * (size + 1))
     if found.status != 0 or not found.x[-1] > 0.0:
         raise Infeasible("no equilibrium lies strictly within the limits of states and inputs", "S", 1.0)
     return rest_at(plant, directions @ found.x[:-1])
@@ -64,7 +69,9 @@ def farthest_from_limits(plant: LinearPlant) -> Rest:
 def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:
     """Returns a point (x, u), shape (n + m,), in round numbers."""
     scale = np.concatenate([plant.half_widths, plant.input_half])
-    rounded = np.array([float(exact.rounded(each / unit, _DIGITS)) * unit for each, unit in zip(point, scale, strict=True)])
+    rounded = np.array(
+        [float(exact.rounded(each / unit, _DIGITS)) * unit for each, unit in zip(point, scale, strict=True)]
+    )
     return Rest(rounded[: plant.n], rounded[plant.n :])
 
 
@@ -91,12 +98,26 @@ def limits_around(plant: LinearPlant, rest: Rest) -> SymmetricLimits:
     return SymmetricLimits(rows, u_max)
 
 
+def units_of_states(plant: LinearPlant, rest: Rest) -> np.ndarray:
+    """Returns the size of each state, shape (n,): the plant's half-widths, or if some are free of `limits_around`.
+
+    Raises:
+        Infeasible: If the point is not strictly within the limits.
+    """
+    if np.linalg.matrix_rank(plant.box * plant.half_widths) == plant.n:
+        return plant.half_widths
+    rows = limits_around(plant, rest).box_rows
+    return np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)))
+
+
 def _generous_rows(plant: LinearPlant, rows: np.ndarray, u_max: np.ndarray) -> np.ndarray:
     """Returns rows that limit every state which no row limits alone, (j, n), about to where a regulator lets it go.
 
     Where that is not known, to the half-widths of the plant.
     """
-    free = np.flatnonzero([not any(np.count_nonzero(row) == 1 and row[i] != 0.0 for row in rows) for i in range(plant.n)])
+    free = np.flatnonzero(
+        [not any(np.count_nonzero(row) == 1 and row[i] != 0.0 for row in rows) for i in range(plant.n)]
+    )
     weight = rows.T @ rows
     K = lqr_gain(plant.A, plant.B, weight + 1e-9 * np.trace(weight) * np.eye(plant.n), np.diag(u_max**-2.0))
     reach = plant.half_widths
@@ -117,7 +138,9 @@ def _farthest(rows: np.ndarray, i: int) -> float:
     """Returns the largest x_i with |rows x| <= 1, by a linear program; infinite where there is none."""
     unit = 1.0 / np.maximum(np.abs(rows).max(axis=0), 1e-300)
     scaled = rows * unit
-    found = linprog(-np.eye(len(unit))[i], A_ub=np.concatenate([scaled, -scaled]), b_ub=np.ones(2 * len(rows)), bounds=(None, None))
+    found = linprog(
+        -np.eye(len(unit))[i], A_ub=np.concatenate([scaled, -scaled]), b_ub=np.ones(2 * len(rows)), bounds=(None, None)
+    )
     return -found.fun * float(unit[i]) if found.status == 0 else np.inf
 
 

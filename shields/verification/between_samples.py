@@ -49,7 +49,7 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     fits = fits and bool((rows.state[0] == plant.box).all()) and not rows.input[0].any()
     yield flag("between samples: the grid has all its points and begins with the safe box", fits)
     ends = ([Fraction(float(end)) if np.isfinite(end) else None for end in side] for side in plant.box_ends)
-    widths = widths_of(rational(plant.box), *ends)
+    widths = widths_of(rational(plant.box), *ends, k)
     yield flag("between samples: the box bounds every state", widths is not None)
     if not fits or widths is None:
         return
@@ -75,7 +75,7 @@ def _closed_loop_conditions(certificate: Certificate, plant: LinearPlant) -> Ite
     x_c, u_c = rational(certificate.resting_state), rational(certificate.resting_input)
     errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
     half = [Fraction(float(each)) for each in plant.input_half]
-    faces = None if polytope is None else faces_of(polytope)
+    faces = None if polytope is None else faces_of(polytope, k)
     for j, row in enumerate(rational(plant.box)):
         taken = Fraction(float(rows.remainder[j])) + root_above(quadratic([row], D))
         for i in range(len(rows.state)):

@@ -165,7 +165,7 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
     if not certificate.keeps_ellipsoid and certificate.polytope is not None:
-        faces = faces_of(certificate.polytope)
+        faces = faces_of(certificate.polytope, len(plant.box))
         for i, row in enumerate(faces.rows if faces else ()):
             ends = [abs(end) for end in (faces.low[i], faces.high[i]) if end is not None]
             yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", min(ends) ** 2 - quadratic([row], L))

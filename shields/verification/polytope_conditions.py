@@ -47,7 +47,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     yield flag("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return
-    faces = faces_of(polytope)
+    faces = faces_of(polytope, len(box))
     yield flag("polytope: it bounds every state", faces is not None)
     if faces is None:
         return
@@ -93,7 +93,8 @@ class Faces(NamedTuple):
         Args:
             image: The row, shape (n,).
             number: Of its multipliers.
-            low, high: The ends; None where there is none.
+            low: The lower end; None where there is none.
+            high: The upper end, likewise.
         """
         distances = []
         if high is not None:
@@ -118,35 +119,39 @@ class Faces(NamedTuple):
         return total + weighted_size(rest, self.widths)
 
 
-def faces_of(polytope: Polytope) -> Faces | None:
-    """Returns a polytope around its center in rational numbers; None if its rows do not bound every state."""
+def faces_of(polytope: Polytope, box_rows: int) -> Faces | None:
+    """Returns a polytope around its center in rational numbers; None if its rows do not bound every state.
+
+    Args:
+        polytope: The polytope.
+        box_rows: So many of its first rows are those of the safe box.
+    """
     rows, center = rational(polytope.rows), rational(polytope.center)[0]
     reached = [sum((g * c for g, c in zip(row, center, strict=True)), Fraction(0)) for row in rows]
     low, high = (
         [Fraction(float(end)) - at if np.isfinite(end) else None for end, at in zip(ends, reached, strict=True)]
         for ends in (polytope.low, polytope.high)
     )
-    widths = widths_of(rows, low, high)
+    widths = widths_of(rows, low, high, box_rows)
     return widths and Faces(rows, low, high, polytope.multipliers, polytope.lower_multipliers, widths)
 
 
-def widths_of(rows: Matrix, low: list[Fraction | None], high: list[Fraction | None]) -> list[Fraction] | None:
+def widths_of(
+    rows: Matrix, low: list[Fraction | None], high: list[Fraction | None], first: int
+) -> list[Fraction] | None:
     """Returns bounds of |x_k| over low <= g_j x <= high; None if there are none.
 
-    They follow from the first rows with two ends that bound every state, C, of sizes |C x|_j <= s_j: x = (C'C)^-1 C' C
-    x, so that is a sum of absolute values of a row of this matrix times s. Adding rows keeps C'C definite.
+    They follow from the first rows, or else from all, that have two ends: of these C x is |C x|_j <= s_j.
     """
-    chosen, sizes = [], []
-    n, widths = len(rows[0]), None
-    for row, lo, hi in zip(rows, low, high, strict=True):
-        if lo is None or hi is None:
-            continue
-        size = max(-lo, hi)
-        chosen.append([entry / size for entry in row] if size != 1 else row)
-        sizes.append(size)
-        if len(chosen) >= n and (widths := half_widths(chosen)) is not None:
-            return widths
-    return None
+    ends = zip(rows, low, high, strict=True)
+    chosen = [
+        (j, [entry / max(-lo, hi) for entry in row])
+        for j, (row, lo, hi) in enumerate(ends)
+        if lo is not None and hi is not None
+    ]
+    leading = [row for j, row in chosen if j < first]
+    widths = half_widths(leading) if leading else None
+    return half_widths([row for _, row in chosen]) if widths is None and chosen else widths
 
 
 def half_widths(box: Matrix) -> list[Fraction] | None:

@@ -41,7 +41,7 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
         kept = bool(np.isfinite(grid.remainder).all()) and not np.count_nonzero(first)
     yield is_so("between samples: the grid has all its points and begins with the safe box", kept)
     ends = [[number(end) if np.isfinite(end) else None for end in pair] for pair in plant.box_ends.T]
-    widths = extents(matrix(plant.box).tolist(), ends)
+    widths = extents(matrix(plant.box).tolist(), ends, k)
     yield is_so("between samples: the box bounds every state", widths is not None)
     if not kept or widths is None:
         return
@@ -93,7 +93,7 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
     rest = matrix(np.concatenate([certificate.resting_state, certificate.resting_input])).transpose()
     half = [number(each) for each in plant.input_half]
-    inside = None if polytope is None else Inside.of(polytope)
+    inside = None if polytope is None else Inside.of(polytope, k)
     for i, (state, pushed) in enumerate(zip(grid.state, grid.input, strict=True)):
         for j in range(k):
             push = matrix(pushed[j])

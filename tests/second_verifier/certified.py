@@ -119,7 +119,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
     if certificate.polytope is not None and not certificate.keeps_ellipsoid:
-        inside = Inside.of(certificate.polytope)
+        inside = Inside.of(certificate.polytope, len(plant.box))
         for i, row in enumerate(certificate.polytope.rows if inside else ()):
             nearest = min(abs(end) for end in inside.ends[i] if end is not None)
             yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", nearest * nearest - form(matrix(row), L))

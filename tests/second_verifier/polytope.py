@@ -27,7 +27,7 @@ from tests.second_verifier.exact import (
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (P) and (PU) without the code of the first engine; what cannot be stated is left out."""
-    r, (k, n) = len(polytope.rows), plant.box.shape
+    r, k = len(polytope.rows), len(plant.box)
     images = r + plant.m + k * (plant.between_samples or 0)
     fits = polytope.multipliers.shape == (images, r)
     yield is_so("polytope: shapes", fits)
@@ -38,7 +38,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     yield is_so("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return
-    inside = Inside.of(polytope)
+    inside = Inside.of(polytope, k)
     yield is_so("polytope: it bounds every state", inside is not None)
     if inside is None:
         return
@@ -70,7 +70,7 @@ class Inside:
     """
 
     @classmethod
-    def of(cls, polytope: Polytope) -> Inside | None:
+    def of(cls, polytope: Polytope, box_rows: int) -> Inside | None:
         """Returns it, or None if some state is not bounded."""
         inside = cls()
         inside.G = matrix(polytope.rows)
@@ -80,7 +80,7 @@ class Inside:
             for pair, (value,) in zip(zip(polytope.low, polytope.high, strict=True), at_center, strict=True)
         ]
         inside._upper, inside._lower = polytope.multipliers, polytope.lower_multipliers
-        inside.widths = extents(inside.G.tolist(), inside.ends)
+        inside.widths = extents(inside.G.tolist(), inside.ends, box_rows)
         return None if inside.widths is None else inside
 
     def distance(self, image: list[Any], which: int, low: Any, high: Any) -> Any:
@@ -95,18 +95,18 @@ class Inside:
     def _most(self, image: list[Any], multipliers: np.ndarray) -> Any:
         used = [(j, number(multipliers[j])) for j in np.flatnonzero(multipliers).tolist()]
         used = [(j, value) for j, value in used if self.ends[j][int(value > 0)] is not None]
-        over = fmpq_mat([image]) - sum((value * fmpq_mat([self.G.tolist()[j]]) for j, value in used), fmpq_mat(1, len(image)))
+        over = fmpq_mat([image]) - sum(
+            (value * fmpq_mat([self.G.tolist()[j]]) for j, value in used), fmpq_mat(1, len(image))
+        )
         return sum((value * self.ends[j][int(value > 0)] for j, value in used), reach_of(over, self.widths))
 
 
-def extents(rows: list[Any], ends: list[Any]) -> list[Any] | None:
-    """Returns bounds of |x_i| by the first rows with two ends that bound all states; None if there are none."""
-    kept = []
-    for row, (low, high) in zip(rows, ends, strict=True):
-        if low is None or high is None:
-            continue
-        kept.append([each / max(-low, high) for each in row])
-        if len(kept) >= len(row) and (found := box_extents(fmpq_mat(kept))) is not None:
+def extents(rows: list[Any], ends: list[Any], first: int) -> list[Any] | None:
+    """Returns bounds of |x_i| by the first rows that have two ends, or else by all; None if there are none."""
+    for count in (first, len(rows)):
+        some = zip(rows[:count], ends[:count], strict=True)
+        kept = [[each / max(-pair[0], pair[1]) for each in row] for row, pair in some if None not in pair]
+        if kept and (found := box_extents(fmpq_mat(kept))) is not None:
             return found
     return None
 

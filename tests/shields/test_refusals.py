@@ -23,6 +23,7 @@ from shields.json_documents import document_of
 from shields.paper import synthesize as paper_synthesis
 from shields.paper.algorithm import kappa_rho_grid, search_grid
 from shields.paper.bounds import covariance_bound, safety_margin, state_error_bound, uplink_error_bound
+from shields.synthesis.certification import certify
 from tests.certificates import certificate_of
 from tests.plants import named, servo, small
 
@@ -45,6 +46,11 @@ def kept(name="stable", safe_set="ellipsoid"):
 def synthesized(box):
     noise = {"gamma": 1e-4, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
     return synthesize(LinearPlant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
+
+
+def free_plant():
+    """One of two states has no limit."""
+    return LinearPlant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=[1.0, np.inf], u_max=1.0, dt=0.1, gamma=1e-4)
 
 
 def with_proofs(name, **changes):
@@ -79,10 +85,9 @@ REFUSED = [
         )
         for name in ("disturbance_bound", "sensor_bound", "initial_bound")
     ),
-    (lambda: synthesized([[0.5, 0.0]]), Infeasible, "unbounded"),
     (lambda: paper_synthesis(truck_trailer(box=[[0.5, 0.0]])), Infeasible, "unbounded"),
     (
-        lambda: synthesized([1.0, np.inf]),
+        lambda: certify(free_plant(), np.eye(2), np.ones((1, 2))),
         Infeasible,
         r"leaves 1 of 2 directions unbounded \(of x2\): add rows to box with generous limits",
     ),

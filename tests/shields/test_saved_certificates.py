@@ -64,11 +64,12 @@ def test_search_ends_with_no_more_rows_than_a_polytope_may_have(monkeypatch):
     angles = np.linspace(0.0, np.pi, 21, endpoint=False)
     rows = np.column_stack([np.cos(angles), np.sin(angles)])
 
-    def predecessor(row):
-        return rows[-1] if np.array_equal(row, rows[-2]) else 0.5 * row
+    def predecessor(face):
+        return face._replace(rows=rows[-1:] if np.array_equal(face.rows, rows[-2:-1]) else 0.5 * face.rows)
 
+    faces = invariant_polytope.Faces(rows[:-1], -np.ones(20), np.ones(20))
     with pytest.raises(Infeasible, match="more than 20 rows"):
-        invariant_polytope.invariant_rows(rows[:-1], predecessor, 2)
+        invariant_polytope.invariant_faces(faces, predecessor, 2)
 
 
 @pytest.mark.slow

@@ -36,7 +36,8 @@ class PlanTest:
     With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if low + rho_i(c) <= c c_i <= high - rho_i(c) for the rows c of
     the box and i = 1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j +
     E(Sigma_pred,j) lies in S by the one-step test's condition; of a certificate with a polytope P, the same of g c_j
-    for the rows g of P, which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the one-step test.
+    for the rows g of P, which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the
+    one-step test.
 
     Its methods take estimates x_hat of E environments, shape (E, n), the tightening of the error shape of each, and P
     plans for each, shape (E, P, N, m) [physical units].
@@ -77,7 +78,7 @@ class PlanTest:
 
     @own_error_state  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest distance of row c_j from the middle of its ends, (E, N, r), and |T G c_j|, (E, N), that pass.
+        """Returns the largest |row c_j - middle|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass.
 
         Both are NaN if unknown.
         """
@@ -122,7 +123,7 @@ class PlanTest:
 
     @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
-        """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between the ends for all rows: x is in the box then."""
+        """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between all ends, which proves that x is in the box."""
         count, extents = len(self.prediction.plant.box), np.sqrt(np.diag(error_shape))
         rows, middle = self.prediction.rows[:count], self.prediction.middle[:count]
         rounding = float(self.prediction.rounding[0])
@@ -348,7 +349,10 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         weightings = np.empty((*radius.shape, 0, plant.n))
     radius = radius + np.where(usable, 0.0, np.nan)[:, None]
     return Tightening(
-        row_limits=prediction.half - reach - pushed + np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)[:, None, None],
+        row_limits=prediction.half
+        - reach
+        - pushed
+        + np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)[:, None, None],
         weighting=np.where(np.isnan(radius)[..., None, None], 0.0, weightings),
         radius=radius,
         between=between,

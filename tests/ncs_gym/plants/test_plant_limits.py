@@ -64,7 +64,11 @@ def test_limits_that_are_symmetric_but_for_rounding_are_the_short_form():
 def test_values_of_a_constraint_are_distances_beyond_the_nearer_end_in_units_of_half_the_range():
     limits = {"state_limits": ([-1.0, -2.0], [3.0, np.inf]), "u_max": 1.0}
     plant = LinearPlant(**MODEL | limits, output_limits=[([1.0, 1.0], -np.inf, 4.0)])
-    for x, expected in ([0.0, 0.0], [-0.5, -1.0, -1.0]), ([4.0, -3.0], [0.5, 0.5, -0.75]), ([-1.5, 6.0], [0.25, -4.0, 0.125]):
+    for x, expected in (
+        ([0.0, 0.0], [-0.5, -1.0, -1.0]),
+        ([4.0, -3.0], [0.5, 0.5, -0.75]),
+        ([-1.5, 6.0], [0.25, -4.0, 0.125]),
+    ):
         np.testing.assert_allclose(plant.constraint_values(np.array(x)), expected)
         np.testing.assert_allclose(plant.constraint_values(np.array([x, x]).T), np.array([expected] * 2).T)
 

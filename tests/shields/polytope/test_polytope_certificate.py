@@ -227,8 +227,16 @@ def test_box_of_more_rows_than_a_polytope_has_says_so():
     angles = np.arange(401) * np.pi / 401
     rows = np.column_stack([np.cos(angles), np.sin(angles)])
     with pytest.raises(Infeasible, match="the safe box alone has 401 rows, and it would need 400 at most"):
-        search.invariant_rows(rows, lambda row: 0.5 * row, len(rows))
-    assert len(search.invariant_rows(rows[:400:50], lambda row: 0.5 * row, 8)) == 8
+        search.invariant_faces(faces(rows), halved, len(rows))
+    assert len(search.invariant_faces(faces(rows[:400:50]), halved, 8).rows) == 8
+
+
+def faces(rows):
+    return search.Faces(rows, -np.ones(len(rows)), np.ones(len(rows)))
+
+
+def halved(given):
+    return given._replace(rows=0.5 * given.rows)
 
 
 def chain(masses, dt):
