@@ -130,10 +130,11 @@ class LinearPlant(ReadOnlyArrays):
     x+ = A x + B u + c, give c as `offset`: then the operating point has to be an equilibrium.
 
     What is declared of the uncertainties adds up: `disturbance_bound`, `sensor_bound` and `initial_bound` bound d, v
-    and the error of the first estimate in the plant's units, each a number r (a ball), half-widths per entry (a box), an `Ellipsoid`, or a pair (E, w) for d = E w
-    with |w_i| <= w_i; 0 says on purpose that there is none. Covariances are the other way in: they describe Gaussian
-    noise that is *truncated*, so that the bounds, and every certificate, hold the fraction 1 - delta of it alone. Of
-    noise with a datasheet's covariance a fraction delta of all samples lies outside.
+    and the error of the first estimate in the plant's units, each a number r (a ball), half-widths per entry (a box),
+    an `Ellipsoid`, or a pair (E, w) for d = E w with |w_i| <= w_i; 0 says on purpose that there is none. Covariances
+    are the other way in: they describe Gaussian noise that is *truncated*, so that the bounds, and every certificate,
+    hold the fraction 1 - delta of it alone. Of noise with a datasheet's covariance a fraction delta of all samples lies
+    outside.
 
     Args:
         state_limits: Pair (low, high) around `operating_state`, each a number or shape (n,), infinite where there is no

@@ -123,7 +123,7 @@ class PlanTest:
 
     @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
-        """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between all ends, which proves that x is in the box."""
+        """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between all ends: x is in the box then."""
         count, extents = len(self.prediction.plant.box), np.sqrt(np.diag(error_shape))
         rows, middle = self.prediction.rows[:count], self.prediction.middle[:count]
         rounding = float(self.prediction.rounding[0])

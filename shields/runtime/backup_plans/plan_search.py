@@ -180,9 +180,9 @@ class Planner:
 class PlanProgram:
     """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows, and one cone for an end in S.
 
-    Variables are the inputs from the middle of their limits, in units of half the range. A solver is set up
-    once, with the pattern of the problem; then vectors and the entries of the cone are updated, so that a solution depends on its own data alone. Whoever solves
-    takes the solver away, or sets another one up if somebody has it: threads share none.
+    Variables are the inputs from the middle of their limits, in units of half the range. A solver is set up once, with
+    the pattern of the problem; then vectors and the entries of the cone are updated, so that a solution depends on its
+    own data alone. Whoever solves takes the solver away, or sets another one up if somebody has it: threads share none.
 
     Args:
         prediction: Of the plant.
