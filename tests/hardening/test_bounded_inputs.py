@@ -1,5 +1,6 @@
 """Small files and messages that would take memory or time without bound; each is refused before it is expanded."""
 
+import base64
 import io
 import json
 import os
@@ -292,6 +293,23 @@ def test_pickles_whose_parts_share_others_take_little_time_and_memory():
         require_moderate(pickled_data(pickle.dumps(shared)), parts_of)
     with little_memory(), pytest.raises(ValueError, match="aliases written out"):
         pickled_data(b"\x80\x03}" + pickle.dumps(keys, 3)[2:-1] + b"Ns.")  # None by these keys
+
+
+@pytest.mark.parametrize("operation", [b"}", b"]", b"\x8f", b"(", b"N"], ids=repr)
+def test_pickles_of_many_objects_are_refused_before_they_are_made(operation, write):
+    pytest.importorskip("stable_baselines3")
+    from agents import AgentError
+    from agents.normalization import read_statistics
+    from agents.sb3_zip import read_model
+
+    pickled = b"\x80\x04" + (8 << 20) * operation + b"."
+    entry = {":serialized:": base64.b64encode(pickled).decode()}
+    path = write("agent.zip", zipped({"data": [json.dumps({"policy_class": entry}).encode()]}))
+    assert path.stat().st_size < 1 << 16
+    with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
+        read_model(path)
+    with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
+        read_statistics(write("v.pkl", pickled))
 
 
 def test_settings_name_no_more_runs_and_processes_than_there_may_be():
