@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, PacketLog, TraceChannel, truck_trailer
+from ncs_gym import Ellipsoid, LinearPlant, PacketLog, Remainder, TraceChannel, truck_trailer
 from ncs_gym.reading import (
     LARGEST_DOCUMENT,
     LARGEST_HYPERPARAMS,
@@ -318,6 +318,17 @@ def test_settings_name_no_more_runs_and_processes_than_there_may_be():
     for changes in ({"seeds": 10**9}, {"jobs": 10**6}, {"episodes": 10**9}):
         with pytest.raises(ValueError, match="at most"):
             CompareSettings(**changes)
+
+
+@pytest.mark.parametrize("text", ["x" * 1001, "\x1b[2J", "two\nlines"], ids=["long", "escape", "lines"])
+def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
+    document = json.loads(json.dumps(truck_trailer().document))
+    for name in ("state_names", "state_units"):
+        changed = document | {"plant": document["plant"] | {name: ["x", text]}}
+        with pytest.raises(ValueError, match=f"{name} must be printable text of at most 1000 letters"):
+            LinearPlant.read(changed)
+    with pytest.raises(ValueError, match="the basis of a remainder must be printable text"):
+        Remainder(Ellipsoid(np.eye(2)), proved=False, basis=text)
 
 
 def test_key_file_is_a_file(endless, tmp_path):
