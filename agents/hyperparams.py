@@ -233,6 +233,8 @@ def _yaml(text: str) -> Any:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
+    except (ArithmeticError, AttributeError, LookupError) as error:  # from its constructors, as of "!!bool maybe"
+        raise ValueError(f"a value is none of its tag, {type(error).__name__}: {error}") from error
 
 
 def _parts_of_node(node: Any) -> list[Any]:

@@ -29,6 +29,8 @@ _EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "EMPTY_S
 # Most values in a key of a dictionary, shared ones counted wherever they stand: hashes take as long.
 _MOST_IN_KEYS = 1000
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+# Most operations of a pickle, each of which may make an object from one byte: statistics and spaces take hundreds.
+_MOST_OPERATIONS = 100_000
 
 
 @dataclass(frozen=True)
@@ -69,11 +71,13 @@ def pickled_data(data: bytes) -> Any:
         Numbers, texts, bytes, lists, tuples, dictionaries and sets; `Named` and `Made` for everything else.
 
     Raises:
-        ValueError: If it is no such pickle.
+        ValueError: If it is no such pickle, or has more than 100,000 operations.
     """
     try:
         machine = _Machine()
-        for opcode, argument, _ in pickletools.genops(data):
+        for number, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+            if number >= _MOST_OPERATIONS:
+                raise ValueError(f"it has more than {_MOST_OPERATIONS:,} operations")
             if opcode.name == "STOP":
                 return machine.pop()
             machine.do(opcode.name, argument)
@@ -88,6 +92,13 @@ def array_of(value: Any) -> np.ndarray:
     Raises:
         ValueError: If it stands for none.
     """
+    try:
+        return _array_of(value)
+    except (ArithmeticError, LookupError) as error:  # a number that is too large, an entry that is missing
+        raise ValueError(f"it has no array that is read here: {error}") from error
+
+
+def _array_of(value: Any) -> np.ndarray:
     if type(value) in (int, float):
         return np.array(value, dtype=np.float64)
     if isinstance(value, Made):

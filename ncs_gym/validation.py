@@ -19,8 +19,8 @@ LARGEST_NUMBER, SMALLEST_NUMBER = 1e75, 1e-75
 LARGEST_COUNT = 2**31 - 1
 # A sparse matrix with more entries, zeros included, is not expanded.
 MOST_EXPANDED = 10_000_000
-# Messages quote no more of a value than this many letters.
-MAX_QUOTED_LENGTH = 200
+# Messages quote no more of a value than this many letters, and names and phrases of plants have no more.
+MAX_QUOTED_LENGTH, LONGEST_TEXT = 200, 1000
 # Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
 FILLED_IN_LATER: Any = None
 
@@ -285,13 +285,21 @@ def as_names(value: Any, default: tuple[str, ...], name: str) -> tuple[str, ...]
     """Returns texts as a tuple of the length of `default`, which stands for none at all.
 
     Raises:
-        ValueError: If it is no sequence of texts, or of another length.
+        ValueError: If it is no sequence of texts, or of another length, or `require_short_text` raises it.
     """
     if not isinstance(value, (list, tuple)) or not all(isinstance(each, str) for each in value):
         raise ValueError(f"{name} must be a list of texts, got {shown(value)}")
+    for each in value:
+        require_short_text(each, name)
     if value and len(value) != len(default):
         raise ValueError(f"{name} must have {len(default)} entries, got {shown(value)}")
     return tuple(value) or default
+
+
+def require_short_text(text: str, name: str) -> None:
+    """Raises ValueError unless a text has at most `LONGEST_TEXT` letters, which a terminal prints as they are."""
+    if len(text) > LONGEST_TEXT or not text.isprintable():
+        raise ValueError(f"{name} must be printable text of at most {LONGEST_TEXT} letters, got {shown(text)}")
 
 
 def as_flag(value: Any, name: str) -> bool:

@@ -196,6 +196,9 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     if isinstance(value, torch.Tensor) and value.layout != torch.strided:
         raise ValueError(f"{name} must be a dense tensor, got one of {value.layout}: call to_dense()")
     try:
-        return np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers, got {type(value).__name__}") from error
+        array = np.asarray(value.detach().cpu().resolve_neg() if isinstance(value, torch.Tensor) else value)
+        if array.dtype.kind != "c":
+            return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's, of a tensor without numbers
+        raise ValueError(f"{name} must be numbers, got {type(value).__name__}: {error}") from error
+    raise ValueError(f"{name} must be real numbers, got {array.dtype}")

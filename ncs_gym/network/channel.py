@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import as_count, as_flag, as_number, read_only, shown
+from ncs_gym.validation import again_if_interrupted, as_count, as_flag, as_number, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -154,6 +154,7 @@ class Channel:
         arrives = f"What is not lost arrives {late} late" if self.longest_delay else "What is not lost arrives at once"
         return f"A sample is taken and sent {every}, {rounded}. {lost}. {arrives}."
 
+    @again_if_interrupted
     def quantize(self, measurement: np.ndarray) -> np.ndarray:
         """Returns the measurement, of any shape, rounded to multiples of the quantization step."""
         q = self.quantization_step

@@ -81,7 +81,8 @@ def quantized(channel: Any, space: spaces.Space, sample: Any) -> Any:
     if isinstance(space, spaces.Tuple):
         return tuple(quantized(channel, each, part) for each, part in zip(space.spaces, sample, strict=True))
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
-        rounded = channel.quantize(np.asarray(sample).T).T  # the last axis is that of environments
+        numbers = np.asarray(sample, dtype=np.float64)  # in a coarser type the number of steps would overflow
+        rounded = channel.quantize(numbers.T).T  # the last axis is that of environments
         return np.clip(rounded, space.low, space.high).astype(space.dtype)
     return sample
 

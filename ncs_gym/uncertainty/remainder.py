@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_flag, shown
+from ncs_gym.validation import as_flag, require_short_text, shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +41,7 @@ class Remainder:
         object.__setattr__(self, "proved", as_flag(self.proved, "proved"))
         if not isinstance(self.basis, str):
             raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
+        require_short_text(self.basis, "the basis of a remainder")
 
     def of_model(self, model: Mapping[str, np.ndarray]) -> Self:
         """Returns the same remainder, which from now on belongs to this model alone.

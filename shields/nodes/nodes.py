@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -414,21 +416,43 @@ async def run_controller(
     budget = 0.5 * clock.dt if budget is None else budget
     clock.start(loop.time())
     running: asyncio.Future[Any] | None = None
-    thread = ThreadPoolExecutor(1, "controller")
-    while not is_over():
-        step = node.step if node.episode != NO_EPISODE else clock.step_at(loop.time()) + 1
-        await asyncio.sleep(max(clock.time_of(step) - loop.time(), 0.0))
-        estimate = node.receive(loop.time())
-        if estimate is None:
+    asked: SimpleQueue[tuple[np.ndarray, Future[Any]] | None] = SimpleQueue()
+    # A daemon: no end of this process waits for a controller that does not return.
+    threading.Thread(target=_propose, args=(controller, asked), name="controller", daemon=True).start()
+    try:
+        while not is_over():
+            step = node.step if node.episode != NO_EPISODE else clock.step_at(loop.time()) + 1
+            await asyncio.sleep(max(clock.time_of(step) - loop.time(), 0.0))
+            estimate = node.receive(loop.time())
+            if estimate is None:
+                continue
+            proposed = None
+            if running is None or running.done():
+                answer: Future[Any] = Future()
+                asked.put((estimate, answer))
+                running = asyncio.wrap_future(answer)
+                await asyncio.wait([running], timeout=budget)
+                proposed = running.result() if running.done() and running.exception() is None else None
+            node.decide(proposed, ask=asks(node.loop))
+            on_step(node, proposed)
+    finally:
+        asked.put(None)
+
+
+def _propose(
+    controller: Callable[[np.ndarray], Any], asked: SimpleQueue[tuple[np.ndarray, Future[Any]] | None]
+) -> None:
+    """Calls a controller with one estimate after the other, until there is None in its place."""
+    while (given := asked.get()) is not None:
+        estimate, answer = given
+        if not answer.set_running_or_notify_cancel():
             continue
-        proposed = None
-        if running is None or running.done():
-            running = loop.run_in_executor(thread, controller, estimate)
-            await asyncio.wait([running], timeout=budget)
-            proposed = running.result() if running.done() and running.exception() is None else None
-        node.decide(proposed, ask=asks(node.loop))
-        on_step(node, proposed)
-    thread.shutdown(wait=False)
+        try:
+            proposed = controller(estimate)
+        except BaseException as error:
+            answer.set_exception(error)
+        else:
+            answer.set_result(proposed)
 
 
 def _decoded(wire: Wire, data: bytes, kinds: Sequence[Kind], refused: Counter[str]) -> Message | None:

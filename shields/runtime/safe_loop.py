@@ -235,7 +235,8 @@ class SafeLoop:
 
         Raises:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
-            ValueError: If what is given is no packet for this plant; nothing has changed then.
+            ValueError: If what is given is no packet for this plant, or there are echoes and no `echo_age`; nothing has
+                changed then.
             GuaranteeLostError: If the state is not proved safe and that is to be raised; all has been received then.
         """
         try:
@@ -248,6 +249,8 @@ class SafeLoop:
             )
         arrived = [as_packet(each, self._filter.plant.p) for each in given]
         heard = [as_echo(each) for each in echoes]
+        if heard and self._echo_age is None:
+            raise ValueError("echoes are compared with what was decided by SafeLoop(..., echo_age=...) alone")
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")

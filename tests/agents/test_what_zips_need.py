@@ -210,6 +210,33 @@ def test_what_are_no_statistics_is_one_sentence(data, tmp_path):
         read_statistics(tmp_path / "nowhere.pkl")
 
 
+class Forged:
+    """What is pickled as an array of a type that has no state."""
+
+    def __reduce__(self):
+        made = np.zeros(3).__reduce__()
+        return made[0], made[1], (*made[2][:2], ForgedType(), *made[2][3:])
+
+
+class ForgedType:
+    def __reduce__(self):
+        return np.dtype, ("f8", False, True), ()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("epsilon", 10**400), ("clip_obs", -(10**400)), ("obs_rms.mean", Forged())],
+    ids=["epsilon", "clip_obs", "mean"],
+)
+def test_numbers_that_are_none_in_a_file_of_statistics_are_one_sentence(name, value, tmp_path):
+    normalized = VecNormalize(env())
+    owner, _, own = name.rpartition(".")
+    setattr(getattr(normalized, owner) if owner else normalized, own, value)
+    (tmp_path / "v.pkl").write_bytes(pickle.dumps(normalized, protocol=4))
+    with pytest.raises(AgentError, match=r"has no statistics that VecNormalize\.save wrote"):
+        read_statistics(tmp_path / "v.pkl")
+
+
 def test_damaged_statistics_are_refused_or_finite(tmp_path):
     normalized = VecNormalize(env())
     normalized.reset()

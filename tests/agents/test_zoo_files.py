@@ -79,6 +79,15 @@ def test_value_that_json_has_not_is_named_with_its_key_and_file(entry, tmp_path)
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "value", ["!!bool maybe", "!!int ''", "!!float half", "!!timestamp now", "2001-99-99", "1" + ":1" * 400 + ".0"]
+)
+def test_value_that_is_none_of_its_tag_is_one_sentence(value, tmp_path):
+    with pytest.raises(ValueError, match=r"hyperparameters .*zoo\.yml are damaged: ") as caught:
+        read_hyperparams(file_of(tmp_path, f"  gamma: {value}\n"), CRUISE)
+    assert "\n" not in str(caught.value)
+
+
 def test_keys_of_the_zoo_itself_are_left_out_with_a_note(tmp_path):
     keys = "".join(f"  {name}: something\n" for name in RL_ZOO_KEYS)
     with pytest.warns(UserWarning, match="only rl-zoo3 reads that, it is left out here") as caught:

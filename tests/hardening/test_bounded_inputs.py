@@ -1,5 +1,6 @@
 """Small files and messages that would take memory or time without bound; each is refused before it is expanded."""
 
+import base64
 import io
 import json
 import os
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, PacketLog, TraceChannel, truck_trailer
+from ncs_gym import Ellipsoid, LinearPlant, PacketLog, Remainder, TraceChannel, truck_trailer
 from ncs_gym.reading import (
     LARGEST_DOCUMENT,
     LARGEST_HYPERPARAMS,
@@ -294,12 +295,40 @@ def test_pickles_whose_parts_share_others_take_little_time_and_memory():
         pickled_data(b"\x80\x03}" + pickle.dumps(keys, 3)[2:-1] + b"Ns.")  # None by these keys
 
 
+@pytest.mark.parametrize("operation", [b"}", b"]", b"\x8f", b"(", b"N"], ids=repr)
+def test_pickles_of_many_objects_are_refused_before_they_are_made(operation, write):
+    pytest.importorskip("stable_baselines3")
+    from agents import AgentError
+    from agents.normalization import read_statistics
+    from agents.sb3_zip import read_model
+
+    pickled = b"\x80\x04" + (8 << 20) * operation + b"."
+    entry = {":serialized:": base64.b64encode(pickled).decode()}
+    path = write("agent.zip", zipped({"data": [json.dumps({"policy_class": entry}).encode()]}))
+    assert path.stat().st_size < 1 << 16
+    with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
+        read_model(path)
+    with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
+        read_statistics(write("v.pkl", pickled))
+
+
 def test_settings_name_no_more_runs_and_processes_than_there_may_be():
     from experiments.settings import CompareSettings
 
     for changes in ({"seeds": 10**9}, {"jobs": 10**6}, {"episodes": 10**9}):
         with pytest.raises(ValueError, match="at most"):
             CompareSettings(**changes)
+
+
+@pytest.mark.parametrize("text", ["x" * 1001, "\x1b[2J", "two\nlines"], ids=["long", "escape", "lines"])
+def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
+    document = json.loads(json.dumps(truck_trailer().document))
+    for name in ("state_names", "state_units"):
+        changed = document | {"plant": document["plant"] | {name: ["x", text]}}
+        with pytest.raises(ValueError, match=f"{name} must be printable text of at most 1000 letters"):
+            LinearPlant.read(changed)
+    with pytest.raises(ValueError, match="the basis of a remainder must be printable text"):
+        Remainder(Ellipsoid(np.eye(2)), proved=False, basis=text)
 
 
 def test_key_file_is_a_file(endless, tmp_path):

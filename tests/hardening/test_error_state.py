@@ -22,6 +22,7 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
+from ncs_gym.network.packet_loss_and_delay import StackedChannels
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from shields.torch import SafeLayer
 from tests.certificates import certificate_of
@@ -169,3 +170,10 @@ def test_layers_project_whatever_numpy_is_told_to_raise(size):
     actions = torch.tensor([[size], [-1e-310], [0.7]], dtype=torch.float64, requires_grad=True)
     layer(actions, torch.tensor(np.tile(vector(size, 1.0, 1.0), (3, 1)))).sum().backward()
     assert torch.isfinite(actions.grad).all()
+
+
+@pytest.mark.parametrize("size", [*SIZES, 1e308])
+def test_channels_round_whatever_numpy_is_told_to_raise(size):
+    channel, value = Channel(quantization_step=10.0), vector(size, 1.0, -0.7)
+    rounded = channel.quantize(value)
+    np.testing.assert_array_equal(StackedChannels([channel, Channel()]).quantize(value), [rounded[0], value[1]])

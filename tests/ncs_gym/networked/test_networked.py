@@ -196,6 +196,27 @@ def test_quantized_floats_stay_in_their_space():
         assert np.isclose(seen / 0.3, np.rint(seen / 0.3), atol=1e-5)[np.abs(seen) < env.observation_space.high].all()
 
 
+@pytest.mark.parametrize(("dtype", "step"), [(np.float16, 1e-3), (np.float32, 1e-46)])
+def test_coarse_types_are_rounded_to_small_steps(dtype, step):
+    class Constant(gym.Env):
+        observation_space = gym.spaces.Box(-1000.0, 1000.0, (3,), dtype)
+        action_space = gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return np.zeros(3, dtype), {}
+
+        def step(self, action):
+            return np.array([100.0, -70.0, 0.0], dtype), 0.0, False, False, {}
+
+    env = Networked(Constant(), Channel(quantization_step=step))
+    env.reset(seed=0)
+    with np.errstate(all="raise"):
+        seen = env.step(0)[0]
+    assert seen.dtype == dtype
+    np.testing.assert_array_equal(seen, [100.0, -70.0, 0.0])
+
+
 def test_network_does_not_depend_on_what_the_environment_draws():
     ages = [
         [each[-1]["measurement_age"] for each in run(Networked(Counter(extra_draws=draws), LATE), 50, seed=4)]

@@ -1,9 +1,11 @@
 """The same loop over real sockets of two kinds, judged by what holds however busy the machine is."""
 
 import asyncio
+import concurrent.futures.thread
 import itertools
 import os
 import socket
+import threading
 
 import numpy as np
 import pytest
@@ -83,8 +85,6 @@ def test_loop_over_sockets_keeps_the_box_while_its_inputs_arrive(opened):
 
 
 def test_controller_that_takes_too_long_is_not_waited_for():
-    import threading
-
     release = threading.Event()
 
     def slow(estimate):
@@ -107,3 +107,21 @@ def test_a_controller_that_fails_is_replaced_by_the_fallback():
     node, _, reasons = asyncio.run(run(over_udp, broken))
     assert len(reasons) == STEPS
     assert node.decision.reason == "invalid"
+
+
+def test_no_end_of_the_process_waits_for_a_controller_that_does_not_return():
+    """What Python joins at its end are threads that are no daemons, and those of executors."""
+    release, threads = threading.Event(), []
+
+    def stuck(estimate):
+        threads.append(threading.current_thread())
+        release.wait(60.0)
+
+    asyncio.run(run(over_udp, stuck, budget=0.001))
+    (thread,) = threads
+    assert thread.is_alive()
+    assert thread.daemon
+    assert thread not in concurrent.futures.thread._threads_queues
+    release.set()
+    thread.join(10.0)
+    assert not thread.is_alive()

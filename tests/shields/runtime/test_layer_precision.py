@@ -93,3 +93,12 @@ def test_coarse_arrays_are_refused_as_tensors_are(setting):
         layer(proposals, estimates.numpy().astype(np.float16))
     whole = np.zeros(estimates.shape, np.int8)
     np.testing.assert_array_equal(layer(proposals, whole).numpy(), layer(proposals, whole.astype(float)).numpy())
+
+
+def test_what_are_no_real_numbers_is_refused(setting):
+    layer, estimates, proposals = setting
+    with pytest.raises(ValueError, match="estimates must be real numbers, got complex64"):
+        layer(proposals, estimates.to(torch.complex64))
+    with pytest.raises(ValueError, match="actions must be numbers, got Tensor"):
+        layer(proposals.to("meta"), estimates)
+    np.testing.assert_array_equal(layer(torch._neg_view(-proposals), estimates), layer(proposals, estimates))

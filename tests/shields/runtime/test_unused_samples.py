@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, truck_trailer
+from ncs_gym import Actuator, Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, truck_trailer
 from ncs_gym.processes.plant_step import PlantSimulation
 from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import ALARM, NOT_FINITE, UNKNOWN_START
@@ -72,6 +72,18 @@ def test_every_reason_is_named_once_and_apart():
         "episode is not that of the loop",
     ):
         assert sum(text in each for each in said) == 1
+
+
+def test_echoes_for_a_loop_that_compares_none_are_refused():
+    actuator = Actuator(1, PLANT.m)
+    loop = started(downlink=Channel(delay=1))
+    loop.step(0.0)
+    assert actuator.apply(0) == actuator.apply(1) == 0.0
+    assert actuator.echo.missing == 1
+    with pytest.raises(ValueError, match="echo_age"):
+        loop.receive(echoes=[actuator.echo])
+    loop.receive(echoes=[])
+    assert loop.guaranteed
 
 
 def test_one_sensor_of_two_without_a_reading_is_named_as_that():
