@@ -264,7 +264,7 @@ def load_sb3_zip(path: Path, env_id: str, vec_normalize: str | Path | None = Non
         path: The zip.
         env_id: Id of the environment.
         vec_normalize: File that `VecNormalize.save` wrote, of which numbers alone are read; "none" says that the agent
-            saw observations as they are; None, that the zip says so, and no such file lies beside it.
+            saw observations as they are; None, that the zip says so: those of off-policy algorithms never do.
 
     Raises:
         AgentError: If it cannot be read, is of an unknown algorithm, has settings that only unpickling would tell, does
@@ -323,19 +323,14 @@ def _normalization_for(
     if is_normalized is False:
         return None
     beside = statistics_beside(path)
-    if is_normalized or beside is not None:
+    known = f"{path} does not say whether VecNormalize normalized the observations that its agent saw"
+    if is_normalized:
+        known = f"the agent in {path} saw observations that VecNormalize normalized"
+    elif beside is not None:
         known = f"statistics of VecNormalize lie beside {path}"
-        if is_normalized:
-            known = f"the agent in {path} saw observations that VecNormalize normalized"
-        raise AgentError(
-            f"{known}: give --vec-normalize {beside or 'FILE'}, or --vec-normalize none if it saw them as they are"
-        )
-    warnings.warn(
-        f"{path} does not say whether VecNormalize normalized observations: they are taken as they are, give "
-        "--vec-normalize FILE otherwise",
-        stacklevel=3,
+    raise AgentError(
+        f"{known}: give --vec-normalize {beside or 'FILE'}, or --vec-normalize none if it saw them as they are"
     )
-    return None
 
 
 _PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")

@@ -49,7 +49,8 @@ class Infeasible(ValueError):
             `largest_gamma`, and as a fraction of the given one `disturbance_bound_factor`, `process_noise_cov_factor`
             and so on; the smallest feasible factors on the box, on each of its sides and on each input limit,
             changed alone: `box_factor`, `box_row_1_factor`, `u_max_1_factor`; where no change alone is enough,
-            `pair_factor`, that of the two changes in the message; under a channel contract also `max_age`. Method
+            `pair_factor`, that of the two changes in the message; `lost_in_exact_arithmetic`, the violation of a
+            candidate's condition where only exact verification failed; under a channel contract also `max_age`. Method
             "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`,
             `largest_noise_scale` and `largest_scale`, the largest uncertainty for which OP is feasible.
     """

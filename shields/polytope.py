@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from ncs_gym.plants.between_samples import MOST_POINTS
-from ncs_gym.plants.limits import as_row_ends
+from ncs_gym.plants.limits import as_row_ends, listed_ends
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     ReadOnlyArrays,
@@ -186,12 +186,8 @@ def polytope_content(polytope: Polytope) -> dict[str, Any]:
     content = {"rows": polytope.rows.tolist(), "multipliers": _pairs_of(polytope.multipliers)}
     if polytope.is_symmetric:
         return content
-    ends = {name: np.where(np.isfinite(each), each, None).tolist() for name, each in _ends_of(polytope).items()}
+    ends = {"low": listed_ends(polytope.low), "high": listed_ends(polytope.high)}
     return content | ends | {"lower_multipliers": _pairs_of(polytope.lower_multipliers)}
-
-
-def _ends_of(polytope: Polytope) -> dict[str, np.ndarray]:
-    return {"low": polytope.low, "high": polytope.high}
 
 
 def _pairs_of(multipliers: np.ndarray) -> list[list[list[Any]]]:

@@ -202,6 +202,13 @@ def as_row_ends(value: Any, rows: int, name: str = "box_ends", *, around_zero: b
     return np.stack([low, high])
 
 
+def listed_ends(ends: np.ndarray) -> list[Any]:
+    """Returns ends of any shape as nested lists for a file, in which None stands for an infinite one."""
+    if ends.ndim > 1:
+        return [listed_ends(each) for each in ends]
+    return [each if np.isfinite(each) else None for each in ends.tolist()]
+
+
 def _with_infinity(ends: Any, infinity: float) -> Any:
     """Returns ends that may be a file's, in which None stands for an infinite one."""
     return [infinity if each is None else each for each in ends] if isinstance(ends, list) else ends
@@ -325,7 +332,8 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
             )
         fields |= {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
     bound = fields.get("disturbance_bound")
-    if isinstance(bound, (tuple, list)) and len(bound) == 3 and np.ndim(as_numbers(bound[0])) == 2:
+    first = as_setting(bound[0]) if isinstance(bound, (tuple, list)) and len(bound) == 3 else None
+    if first is not None and first.ndim == 2:
         fields |= _around_middle_of_disturbance(A, B, bound, fields, (state, applied))
     return fields
 

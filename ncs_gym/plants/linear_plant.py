@@ -438,6 +438,7 @@ class LinearPlant(ReadOnlyArrays):
     def document(self) -> dict[str, Any]:
         """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
         content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
+        content["box_ends"] = limits.listed_ends(self.box_ends)
         if self.is_symmetric:
             del content["box_ends"], content["input_ends"]
             content["u_max"] = _as_json(self.u_max)
@@ -942,10 +943,11 @@ def _describe(plant: LinearPlant) -> str:
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
         "safe box": [row_limit(plant, j) for j in range(len(plant.box))],
         "input limits": [
-            _between(name, *ends, center, unit)
-            for name, *ends, center, unit in zip(
+            _between(name, low, high, center, unit)
+            for name, low, high, center, unit in zip(
                 plant.input_names,
-                *plant.input_ends.tolist(),
+                plant.input_low.tolist(),
+                plant.input_high.tolist(),
                 plant.operating_input.tolist(),
                 plant.input_units,
                 strict=True,
@@ -973,9 +975,7 @@ def _as_json(value: Any) -> Any:
         return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
     if isinstance(value, tuple):
         return list(value)
-    if isinstance(value, np.ndarray):  # an end of the box that is open is null
-        return value.tolist() if np.isfinite(value).all() else np.where(np.isfinite(value), value, None).tolist()
-    return value
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _from_json(value: Any) -> Any:
@@ -1013,8 +1013,8 @@ def row_limit(plant: LinearPlant, j: int) -> str:
     limited = np.flatnonzero(row).tolist()
     if len(limited) == 1:
         i = limited[0]
-        ends = sorted([low / row[i], high / row[i]])
-        return _between(plant.state_names[i], *ends, plant.operating_state[i], plant.state_units[i])
+        low, high = sorted([low / float(row[i]), high / float(row[i])])
+        return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
     if low == -high:
         terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
         return f"|{terms.removeprefix('+')}| <= 1"

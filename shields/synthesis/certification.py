@@ -64,6 +64,8 @@ _DIGITS, _SHOWN_DIGITS = 12, 6
 _INSIDE = 1.0 - 1e-9
 # Points of the box by which resting points are compared.
 _POINTS_OF_REST_LOG2 = 12
+# In the details of an `Infeasible`: a candidate was found that does not hold in exact arithmetic.
+_LOST = "lost_in_exact_arithmetic"
 # What an equilibrium lacks is computed with an error of at most this, relative to its terms.
 _OF_REST = 1e-14
 # What helps where float64 has too few digits.
@@ -173,25 +175,23 @@ def _around_resting_point(
     shapes = np.array([proof.Sigma for proof in _proofs(errors)])
     points = points_of_box(plant, _POINTS_OF_REST_LOG2)
 
-    def share(K: np.ndarray, at: Rest) -> float:
-        return share_of_points(Feedback(K, shapes, _disturbance_around(plant, at), at), plant, points)
+    def feedback(K: np.ndarray, at: Rest) -> Feedback:
+        return Feedback(K, shapes, _disturbance_around(plant, at), at)
 
     tried = []
     for K in _gains_around(plant, problem, progress):
-        needs = needs_of(Feedback(K, shapes, _disturbance_around(plant, rest), rest), plant)
-        tried.append((K, rest if needs is None else farthest_from_limits(plant, needs)))
-    if points is not None:
-        shares = [share(*each) for each in tried]
+        needs = needs_of(feedback(K, rest), plant)
+        tried.append(feedback(K, rest if needs is None else farthest_from_limits(plant, needs)))
+    if points is not None and tried:
+        shares = [share_of_points(each, plant, points) for each in tried]
         tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
-        K, rest = tried[0]
+        K, first = tried[0].K, tried[0].rest
         progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
-        better = improved(plant, rest, lambda at: share(K, at))
-        if search_gain:
-            feedback = Feedback(K, shapes, _disturbance_around(plant, better), better)
-            tried = [(each, better) for each in gains_of_larger_polytopes(feedback, plant, progress)] + tried
-        tried = [*tried[: -len(shares)], (K, better), *tried[-len(shares) :]]
-    for K, at in tried:
-        found = certify_polytope(plant, K, contract, progress, at)
+        better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
+        larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
+        tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
+    for each in tried:
+        found = certify_polytope(plant, each.K, contract, progress, each.rest)
         if found is not None:
             return max([found, *known], key=_polytope_share)
     if known:
@@ -204,7 +204,11 @@ def _gains_around(plant: LinearPlant, problem: DesignProblem, progress: Progress
 
     Those of the largest ellipsoid, of the largest tolerated radii, and of regulators.
     """
-    found = largest_set(problem, _SLACKS[0], lambda stage, design: progress(_progress_text(stage, design)))
+
+    def report(stage: str, design: CandidateDesign | None) -> None:
+        progress(_progress_text(stage, design))
+
+    found = largest_set(problem, _SLACKS[0], report)
     if found is not None:
         yield problem.to_physical(found.L, with_best_gain(problem, found).K)[1]
     progress("gain that tolerates most")
@@ -350,16 +354,10 @@ def certify_polytope(
         faces = polytope.F
         L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
         L = _in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
-        certificate = Certificate(
-            L=L,
-            K=K,
-            proofs=proofs,
-            polytope=polytope,
-            resting_state=rest.state,
-            resting_input=rest.input,
-            **_of_the_problem(plant, problem, errors) | {"D": feedback.D},
-            provenance=_provenance(plant, L, _volume(plant, L)),
-        )
+        others: dict[str, Any] = _of_the_problem(plant, problem, errors) | {"D": feedback.D}
+        others |= {"resting_state": rest.state, "resting_input": rest.input}
+        provenance = _provenance(plant, L, _volume(plant, L))
+        certificate = Certificate(L=L, K=K, proofs=proofs, polytope=polytope, provenance=provenance, **others)
         return _verified_polytope(certificate, plant, progress)
     except (Infeasible, ArithmeticError, ValueError, CertificateError):  # numbers that a linear program cannot hold
         return None
@@ -502,6 +500,12 @@ def _second_search(
     Raises:
         Infeasible: If there is none; with the bounds that would be feasible.
     """
+    if polytope and _LOST in infeasible.details:
+        progress("no ellipsoid holds in exact arithmetic: seeking a polytope")
+        try:
+            return _around_resting_point(plant, contract, progress, (), search_gain=False)
+        except Infeasible:
+            raise infeasible from None
     was_sought = "share_of_radii" in infeasible.details
     certificate = _with_closer_limits(plant, contract) if was_sought else None
     if certificate is None and polytope and (was_sought or infeasible.binding == "B"):
@@ -698,6 +702,7 @@ def _failed_verification(report: Report) -> Infeasible:
         f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {_MORE_DIGITS}",
         failed.name.split()[0].strip("():"),
         -failed.margin,
+        {_LOST: -failed.margin},
     )
 
 

@@ -90,7 +90,7 @@ class Faces(NamedTuple):
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Returns whether points, shape (count, n), lie between the ends of all rows, shape (count,)."""
         values = points @ self.rows.T
-        return ((self.low <= values) & (values <= self.high)).all(axis=1)
+        return np.all((self.low <= values) & (values <= self.high), axis=1)
 
 
 def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces:

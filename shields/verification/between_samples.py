@@ -48,8 +48,8 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     fits = fits and rows.remainder.shape == (k,) and bool(np.isfinite(rows.remainder).all())
     fits = fits and bool((rows.state[0] == plant.box).all()) and not rows.input[0].any()
     yield flag("between samples: the grid has all its points and begins with the safe box", fits)
-    ends = ([Fraction(float(end)) if np.isfinite(end) else None for end in side] for side in plant.box_ends)
-    widths = widths_of(rational(plant.box), *ends, k)
+    low, high = ([Fraction(float(end)) if np.isfinite(end) else None for end in side] for side in plant.box_ends)
+    widths = widths_of(rational(plant.box), low, high, k)
     yield flag("between samples: the box bounds every state", widths is not None)
     if not fits or widths is None:
         return

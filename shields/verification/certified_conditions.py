@@ -166,9 +166,9 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield matrix_condition("L > 0", L, strict=True)
     if not certificate.keeps_ellipsoid and certificate.polytope is not None:
         faces = faces_of(certificate.polytope, len(plant.box))
-        for i, row in enumerate(faces.rows if faces else ()):
-            ends = [abs(end) for end in (faces.low[i], faces.high[i]) if end is not None]
-            yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", min(ends) ** 2 - quadratic([row], L))
+        for i, (row, *pair) in enumerate(zip(faces.rows, faces.low, faces.high, strict=True) if faces else ()):
+            nearest = min(abs(end) for end in pair if end is not None)
+            yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", nearest**2 - quadratic([row], L))
         return
     BK, D, s = multiply(B, K), certificate.D, certificate.rounding
     D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))

@@ -133,7 +133,9 @@ def faces_of(polytope: Polytope, box_rows: int) -> Faces | None:
         for ends in (polytope.low, polytope.high)
     )
     widths = widths_of(rows, low, high, box_rows)
-    return widths and Faces(rows, low, high, polytope.multipliers, polytope.lower_multipliers, widths)
+    if widths is None:
+        return None
+    return Faces(rows, low, high, polytope.multipliers, polytope.lower_multipliers, widths)
 
 
 def widths_of(

@@ -107,17 +107,13 @@ def test_zip_that_says_that_it_saw_raw_observations_needs_no_statistics(tmp_path
         load_sb3_zip(tmp_path / "own.zip", CRUISE, tmp_path / "vecnormalize.pkl")
 
 
-def test_zip_that_does_not_tell_is_taken_as_it_is_with_a_warning(tmp_path):
+@pytest.mark.filterwarnings("error")
+def test_zip_that_does_not_tell_is_refused_until_the_user_says_what_its_agent_saw(tmp_path):
     model = trained(SAC, env())
     model.save(tmp_path / "own.zip")
-    with pytest.warns(UserWarning, match="does not say whether VecNormalize normalized observations"):
-        assert_acts_as(load_sb3_zip(tmp_path / "own.zip", CRUISE), model, OBSERVATIONS)
-
-
-@pytest.mark.filterwarnings("error")
-def test_no_warning_where_the_user_says_so(tmp_path):
-    trained(SAC, env()).save(tmp_path / "own.zip")
-    load_sb3_zip(tmp_path / "own.zip", CRUISE, "none")
+    with pytest.raises(AgentError, match=r"does not say whether VecNormalize .*: give --vec-normalize FILE, or --vec"):
+        load_sb3_zip(tmp_path / "own.zip", CRUISE)
+    assert_acts_as(load_sb3_zip(tmp_path / "own.zip", CRUISE, "none"), model, OBSERVATIONS)
 
 
 def test_statistics_of_rewards_alone_leave_observations_as_they_are(tmp_path):
