@@ -1,0 +1,380 @@
+"""Limits with two ends: certificates around a resting point, decisions by a conic solver, and attacks in every mode."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from functools import cache
+
+import cvxpy as cp
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, Ellipsoid, LinearPlant, contract_of
+from shields import Certificate, CertificateError, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, verify
+from tests.certificates import certificate_of
+from tests.second_verifier.verify import verify_again
+from tests.verdicts import broken
+
+QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
+# A safety filter's angle, -30 to 45 degrees (AMPyC); two tanks with two valves; a hill that only goes up.
+ANGLE = LinearPlant(
+    A=[[1.0, 0.1], [-0.045, 0.9]],
+    B=[[0.0], [0.1]],
+    dt=0.1,
+    state_limits=([-0.52, -0.52], [0.79, 0.52]),
+    input_limits=(-2.0, 1.0),
+    disturbance_bound=[0.002, 0.004],
+    **QUIET,
+)
+TANKS = LinearPlant.from_statespace(
+    ([[-0.1, 0.05], [0.0, -0.2]], [[0.1, 0.02], [0.03, 0.2]], np.eye(2), 0),
+    1.0,
+    state_limits=([0.0, 0.0], [16.0, 8.0]),
+    input_limits=([0.0, 0.0], [10.0, 8.0]),
+    output_limits=[([1.0, 1.0], -np.inf, 23.0)],
+    operating_state=[12.4, 5.0],
+    operating_input=[7.0, 3.0],
+    disturbance_bound=0.1,
+    **QUIET,
+)
+HILL = LinearPlant.from_statespace(
+    ([[-0.01]], [[1.32]], [[1.0]], 0),
+    0.1,
+    state_limits=(0.0, 40.0),
+    input_limits=(0.0, 1.0),
+    operating_state=20.0,
+    operating_input=0.17,
+    disturbance_bound=([[1.0]], [-0.06], [0.0]),
+    **QUIET,
+)
+PLANTS = {"angle": ANGLE, "tanks": TANKS, "hill": HILL}
+CHANNEL = Channel(loss=0.3, max_consecutive_losses=1, send_period=2)
+CONTRACT = contract_of(CHANNEL)
+
+
+@cache
+def certificate(name: str) -> Certificate:
+    return certificate_of(PLANTS[name], CONTRACT, "polytope")
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_both_engines_accept_it_with_the_same_margins(name):
+    plant, found = PLANTS[name], certificate(name)
+    ours, other = verify(found, plant), verify_again(found, plant)
+    assert ours.valid
+    assert other.valid
+    margins = {condition.name: condition.margin for condition in other.conditions}
+    shared = [condition for condition in ours.conditions if condition.name.startswith(("(P)", "(PU)", "(L)"))]
+    assert len(shared) >= 3
+    for condition in shared:
+        assert condition.margin == pytest.approx(margins[condition.name], rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_polytope_has_the_plants_ends_and_its_rest_is_an_equilibrium(name):
+    plant, found = PLANTS[name], certificate(name)
+    P, k = found.polytope, len(plant.box)
+    np.testing.assert_array_equal(P.rows[:k], plant.box)
+    np.testing.assert_array_equal([P.low[:k], P.high[:k]], plant.box_ends)
+    x, u = found.resting_state, found.resting_input
+    np.testing.assert_allclose(plant.A @ x + plant.B @ u, x, atol=1e-9)
+    assert (plant.constraint_values(x) < 0.0).all()
+    assert ((plant.input_low < u) & (u < plant.input_high)).all()
+    np.testing.assert_array_equal(P.center, x)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_file_keeps_it(name, tmp_path):
+    certificate(name).save(tmp_path / "c.json")
+    again = Certificate.load(tmp_path / "c.json")
+    assert again == certificate(name)
+    assert verify(again, PLANTS[name]).valid
+    assert "Infinity" not in (tmp_path / "c.json").read_text()
+
+
+def test_plant_in_deviations_from_another_point_has_the_same_polytope():
+    """Nothing depends on where deviations are counted from: the same limits, told from another equilibrium."""
+    model = {"A": [[0.5, 0.25], [0.0, 0.75]], "B": [[0.0], [0.25]], "dt": 0.5, "disturbance_bound": 0.01} | QUIET
+    limits = {"state_limits": ([-2.0, -4.0], [6.0, 4.0]), "input_limits": (-8.0, 8.0)}
+    here = LinearPlant(**model, **limits, operating_state=[0.0, 0.0], operating_input=[0.0])
+    there = LinearPlant(**model, **limits, operating_state=[0.5, 1.0], operating_input=[1.0])
+    found = [certificate_of(plant, safe_set="polytope") for plant in (here, there)]
+    rests = [plant.from_deviation(each.resting_state) for plant, each in zip((here, there), found, strict=True)]
+    np.testing.assert_allclose(*rests, atol=1e-4)
+    grid = np.stack(np.meshgrid(np.linspace(-2.2, 6.2, 60), np.linspace(-4.2, 4.2, 60)), axis=-1).reshape(-1, 2)
+    inside = [
+        each.polytope.gauge(grid - plant.operating_state) <= 1.0
+        for plant, each in zip((here, there), found, strict=True)
+    ]
+    assert np.mean(inside[0] != inside[1]) < 0.002
+    assert 0.3 < np.mean(inside[0]) < 1.0
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_share_of_the_box_is_that_of_random_points(name):
+    plant, found = PLANTS[name], certificate(name)
+    if "polytope_share_of_box" not in found.provenance:  # limits of sums: a box that is no product
+        assert name == "tanks"
+        return
+    low, high = np.sort(plant.box_ends / plant.box.sum(axis=1), axis=0)
+    points = np.random.default_rng(0).uniform(low, high, (20_000, plant.n))
+    P = found.polytope
+    inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
+    assert found.provenance["polytope_share_of_box"] == pytest.approx(inside.mean(), abs=0.02)
+    assert inside.mean() > 0.5
+
+
+def situations(shield, count, seed=0):
+    rng = np.random.default_rng(seed)
+    P, plant = shield.certificate.polytope, shield.plant
+    estimates = P.center + (P.sample_boundary(rng, count) - P.center) * rng.uniform(0.3, 1.1, (count, 1))
+    return estimates, 0.5 * shield.certificate.error_shapes[0], rng.uniform(*plant.input_ends, (count, plant.m))
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
+    plant, found = PLANTS[name], certificate(name)
+    shield = SafetyFilter(found, plant)
+    P, reasons = found.polytope, []
+    estimates, shape, proposals = situations(shield, 80)
+    reach = Ellipsoid(shape).support(P.rows @ plant.A) + plant.disturbance.support(P.rows)
+    low, high = P.low + reach, P.high - reach
+    for estimate, proposed in zip(estimates, proposals, strict=True):
+        decision = shield.decide(estimate, shape, proposed)
+        values = P.rows @ (plant.A @ estimate + plant.B @ proposed)
+        left = min((values - low).min(), (high - values).min())
+        if abs(left) > 1e-7:
+            assert (decision.reason == "safe") == (left > 0.0)
+        assert ((plant.input_low <= decision.input) & (decision.input <= plant.input_high)).all()
+        reasons.append(decision.reason)
+        if decision.reason == "safe":
+            continue
+        u = cp.Variable(plant.m)
+        c = P.rows @ (plant.A @ estimate) + P.rows @ plant.B @ u
+        rows = [c[np.isfinite(high)] <= high[np.isfinite(high)], c[np.isfinite(low)] >= low[np.isfinite(low)]]
+        problem = cp.Problem(
+            cp.Minimize(cp.sum_squares(u - proposed)), [*rows, u <= plant.input_high, u >= plant.input_low]
+        )
+        problem.solve(solver=cp.CLARABEL)
+        if problem.status == cp.OPTIMAL and decision.reason == "projected":
+            np.testing.assert_allclose(decision.input, u.value, atol=1e-5 * plant.input_half.max())
+        elif problem.status == cp.INFEASIBLE:
+            assert decision.reason == "fallback"
+            wanted = found.resting_input + found.K @ (estimate - found.resting_state)
+            clipped = np.clip(wanted, plant.input_low, plant.input_high)
+            np.testing.assert_allclose(decision.input, clipped, atol=1e-6 * plant.input_half.max())
+    assert "safe" in reasons
+    assert ("fallback" if name == "hill" else "projected") in reasons  # a step moves little of the speed on a hill
+
+
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
+@pytest.mark.parametrize("name", PLANTS)
+def test_no_end_is_passed_while_guaranteed(name, mode):
+    plant, found, count = PLANTS[name], certificate(name), 40
+    P, rng = found.polytope, np.random.default_rng(1)
+    names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "max_episode_steps": 70}
+    for disturbance in (AdversarialDisturbance(), AdversarialDisturbance(rows=P.rows), "sphere"):
+        env = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=count, disturbance=disturbance, noise="extreme", **names)
+        shield = VectorSafetyShield(env, found, mode)
+        starts = P.center + 0.9 * (P.sample_boundary(rng, count) - P.center)
+        _, info = shield.reset(seed=3, options={"state": starts})
+        assert info["shield_guaranteed"].all()
+        intervened = 0
+        for k in range(60):
+            ends = np.sign(rng.uniform(-1.0, 1.0, (count, plant.m)))
+            actions = [ends, np.ones_like(ends), -np.ones_like(ends)][k // 20]
+            _, _, _, _, info = shield.step(actions.astype(np.float32))
+            assert info["shield_guaranteed"].all(), info["shield_reason"]
+            assert not info["cost"].any()
+            values = info["state"] @ P.rows.T
+            if mode != "lookahead":
+                assert ((P.low <= values) & (values <= P.high)).all()
+            assert ((plant.input_low <= info["input"]) & (info["input"] <= plant.input_high)).all()
+            intervened += info["shield_intervened"].sum()
+        assert intervened > 0
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_loop_and_scalar_and_vector_shields_decide_the_same(name):
+    plant, found = PLANTS[name], certificate(name)
+    settings = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT}
+    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", **settings), found)
+    _, info = env.reset(seed=5)
+    filters = SafetyFilter(found, plant)
+    for k in range(40):
+        action = np.full(plant.m, 1.0 if k % 20 < 10 else -1.0, np.float32)
+        estimate, shape = info["estimate"], info["error_shape"]
+        _, _, _, _, info = env.step(action)
+        proposed = plant.input_high if action[0] > 0.0 else plant.input_low
+        np.testing.assert_allclose(info["input_proposed"], proposed, rtol=1e-12)
+        alone = filters.decide(estimate, shape, info["input_proposed"])
+        many = filters.decide_many(estimate[None], shape, info["input_proposed"][None])
+        np.testing.assert_array_equal(info["input"], alone.input)
+        np.testing.assert_array_equal(many.input[0], alone.input)
+    loop = SafeLoop(found, plant, CHANNEL)
+    loop.start(found.resting_state)
+    decision = loop.decide(2.0 * plant.input_high)
+    assert (decision.input <= plant.input_high).all()
+
+
+def changed(found, **fields):
+    return replace(found, polytope=replace(found.polytope, **fields))
+
+
+def moved(array, index, by):
+    other = array.copy()
+    other[index] += by
+    return other
+
+
+def mutants(name):
+    """What a certificate that is changed a little claims falsely, or can no longer prove."""
+    found, plant = certificate(name), PLANTS[name]
+    P = found.polytope
+    for j in range(len(P.rows)):
+        if np.isfinite(P.high[j]):
+            yield f"upper end {j}", changed(found, high=moved(P.high, j, 0.01))
+            active = np.abs(P.multipliers[j]).argmax()
+            yield f"multiplier {j}", changed(found, multipliers=moved(P.multipliers, (j, active), 0.05))
+        if np.isfinite(P.low[j]):
+            yield f"lower end {j}", changed(found, low=moved(P.low, j, -0.01))
+            active = np.abs(P.lower_multipliers[j]).argmax()
+            yield (
+                f"lower multiplier {j}",
+                changed(found, lower_multipliers=moved(P.lower_multipliers, (j, active), 0.05)),
+            )
+    yield "resting input", replace(found, resting_input=found.resting_input + 0.02 * plant.input_half)
+    shifted = found.resting_state + 0.02 * plant.half_widths
+    yield "center", replace(found, resting_state=shifted, polytope=replace(P, center=shifted))
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_changed_certificate_is_refused_by_both_engines(name):
+    plant, count, refused = PLANTS[name], 0, 0
+    for what, each in mutants(name):
+        verdicts = verify(each, plant).valid, verify_again(each, plant).valid
+        assert verdicts[0] == verdicts[1], what
+        count, refused = count + 1, refused + (not verdicts[0])
+        if "multiplier" not in what and not verdicts[0]:
+            assert broken(each, plant)
+        if what in ("resting input", "center") or what.startswith(("upper end", "lower end")):
+            assert not verdicts[0] or is_invariant(each, plant), what
+    assert refused >= 0.6 * count
+
+
+def is_invariant(found, plant):
+    """Whether the polytope is kept for sure, by linear programs of our own: then a changed end claims nothing false."""
+    from scipy.optimize import linprog
+
+    P = found.polytope
+    rows, ends = [], []
+    for g, low, high in zip(P.rows, P.low, P.high, strict=True):
+        rows += [g] * np.isfinite(high) + [-g] * np.isfinite(low)
+        ends += [high] * np.isfinite(high) + [-low] * np.isfinite(low)
+    k = len(plant.box)
+    if (P.low[:k] < plant.box_low).any() or (P.high[:k] > plant.box_high).any():
+        return False
+    closed = plant.A + plant.B @ found.K
+    constant = plant.B @ (found.resting_input - found.K @ found.resting_state)
+    errors = max(found.error_shapes, key=np.trace)
+    for f, end in zip(rows, ends, strict=True):
+        reach = np.sqrt(f @ plant.B @ found.K @ errors @ found.K.T @ plant.B.T @ f)
+        reach += float(plant.disturbance.support(np.asarray(f)))
+        best = linprog(-(f @ closed), A_ub=np.array(rows), b_ub=np.array(ends), bounds=(None, None))
+        if best.status != 0 or -best.fun + f @ constant + reach > end + 1e-9:
+            return False
+    return True
+
+
+def test_ellipsoid_is_not_kept_around_a_resting_point():
+    plant = ANGLE.symmetric
+    found = certificate_of(plant, CONTRACT)
+    assert found.keeps_ellipsoid
+    for other in (
+        replace(found, resting_state=[0.01, 0.0], polytope=None),
+        replace(found, fingerprint=ANGLE.fingerprint),
+    ):
+        report = verify(other, ANGLE)
+        assert not report.valid
+        assert not verify_again(other, ANGLE).valid
+
+
+def test_center_that_is_not_inside_and_ends_the_wrong_way_are_no_certificate():
+    P = certificate("angle").polytope
+    for fields in ({"center": [5.0, 0.0]}, {"low": P.high, "high": P.low}, {"low": np.full(len(P.rows), np.nan)}):
+        with pytest.raises(CertificateError):
+            replace(P, **fields)
+
+
+def test_bound_of_a_disturbance_with_two_ends_holds_all_of_it_in_rational_numbers():
+    """x+ = A x + B u + E w, told from the old operating point, is A z + B v + d with d in E(D), told from the new one."""
+    E, low, high = np.array([[1.0, 0.3], [0.2, -0.5]]), np.array([-0.3, 0.0]), np.array([0.1, 0.2])
+    model = {"A": [[0.9, 0.1], [0.0, 0.7]], "B": [[0.1], [0.4]], "dt": 1.0} | QUIET
+    limits = {"state_limits": ([-5.0, -5.0], [6.0, 4.0]), "input_limits": (-3.0, 4.0)}
+    plant = LinearPlant(**model, **limits, disturbance_bound=(E, low, high))
+    x, u = plant.operating_state, plant.operating_input  # deviations of the new point from the old one, (0, 0)
+    assert np.abs(x).max() > 0.01
+    rows = [[Fraction(float(entry)) for entry in row] for row in np.hstack([plant.A, plant.B, E])]
+    D = plant.disturbance.shape_matrix
+    for corner in ((a, b) for a in (low[0], high[0]) for b in (low[1], high[1])):
+        there = [Fraction(float(entry)) for entry in (*x, *u, *corner)]
+        d = [sum(a * b for a, b in zip(row, there, strict=True)) - Fraction(float(x[i])) for i, row in enumerate(rows)]
+        assert float(np.array(d, dtype=float) @ np.linalg.solve(D, np.array(d, dtype=float))) <= 1.0
+    absolute = LinearPlant(**model, **limits, disturbance_bound=0.0)
+    np.testing.assert_allclose(plant.box_ends + plant.box @ x, absolute.box_ends, atol=1e-12)
+    np.testing.assert_allclose(plant.input_ends + u, absolute.input_ends, atol=1e-12)
+
+
+def test_disturbance_with_symmetric_ends_leaves_the_operating_point():
+    settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
+    both = LinearPlant(**settings, disturbance_bound=([[1.0]], [-0.1], [0.1]))
+    assert both.fingerprint == LinearPlant(**settings, disturbance_bound=([[1.0]], 0.1)).fingerprint
+    with pytest.raises(ValueError, match="no state stays where it is"):
+        LinearPlant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
+    with pytest.raises(ValueError, match="not strictly within the limits"):
+        LinearPlant(**settings | {"B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.9]))
+
+
+def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
+    plant = LinearPlant(
+        A=[[1.0, 0.1], [0.0, 0.95]],
+        B=[[0.0], [0.1]],
+        dt=0.1,
+        state_limits=([-1.0, -np.inf], [2.0, np.inf]),
+        u_max=1.0,
+        disturbance_bound=[0.001, 0.01],
+        **QUIET,
+    )
+    found = certificate_of(plant, ChannelContract(max_age=2), "polytope")
+    assert verify(found, plant).valid
+    assert verify_again(found, plant).valid
+    assert np.isfinite(found.polytope.widths).all()
+
+
+@pytest.mark.parametrize("points", [None, 4])
+def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
+    model = ([[0.0, 1.0], [0.0, -1.0]], [[0.0], [2.0]], np.eye(2), 0)
+    limits = {
+        "state_limits": ([-1.0, -1.0], [2.0, 1.5]),
+        "input_limits": (-1.0, 0.5),
+        "disturbance_bound": 0.005,
+    } | QUIET
+    delay = {"input_delay": 1} if points is None else {"between_samples": points}
+    plant = LinearPlant.from_statespace(model, 0.1, **limits, **delay)
+    found = certificate_of(plant, CONTRACT, "polytope")
+    assert verify_again(found, plant).valid
+    P, rng = found.polytope, np.random.default_rng(0)
+    names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "disturbance": AdversarialDisturbance()}
+    for mode in ("project", "lookahead"):
+        env = VectorSafetyShield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=30, **names), found, mode)
+        _, info = env.reset(seed=1)
+        seen = info["shield_guaranteed"].copy()
+        for k in range(80):
+            ends = np.ones((30, 1)) if k % 40 < 20 else -np.ones((30, 1))
+            _, _, _, _, info = env.step(np.where(rng.random((30, 1)) < 0.1, -ends, ends).astype(np.float32))
+            assert not (info["shield_guaranteed"] & (info["cost"] > 0.0)).any()
+            seen |= info["shield_guaranteed"]
+        assert seen.all()
+    assert P.low[0] == plant.box_low[0]
