@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
-from ncs_gym.validation import again_if_interrupted
+from ncs_gym.validation import again_if_interrupted, frozen
 
 # More losses in a row than any episode has steps.
 UNLIMITED = 2**31 - 1
@@ -117,7 +117,7 @@ def transmit(
     if isinstance(loss, (GilbertElliott, StackedBursts)):
         bad = bad != (rng.random(size) < loss.p_good_to_bad + (loss.p_bad_to_good - loss.p_good_to_bad) * bad)
         loss = loss.loss_good + (loss.loss_bad - loss.loss_good) * bad
-    if not (sends if size is None else sends.any()):
+    if not (sends if size is None else np.count_nonzero(sends)):  # quicker than any()
         return LossState(bad, consecutive), -1 if size is None else np.full(size, -1)
     arrives = sends & (rng.random(size) >= loss)
     if channel.max_consecutive_losses is not None:
@@ -190,6 +190,7 @@ class VectorChannelState:
     def __init__(self, channel: Channel | Sequence[Channel], rng: np.random.Generator, size: int) -> None:
         self.channel = channel if isinstance(channel, Channel) else side_by_side(channel)
         self._size, self._sends = size, np.zeros(size, np.bool_)
+        self._all = frozen(np.ones(size, np.bool_))  # which send where each step has a sample
         self._loss_state = first_loss_state(self.channel, rng, size)
         # For the samples of each age, after how many steps they arrive.
         self._delays = [np.full(size, -1) for _ in range(self.channel.longest_delay + 1)]
@@ -220,7 +221,9 @@ class VectorChannelState:
             steps: The steps.
             requested: Where a sample is requested, shape (N,), of channels that take samples on request.
         """
-        sends = steps % self.channel.send_period == 0 if requested is None else requested
+        period, sends = self.channel.send_period, requested
+        if sends is None:
+            sends = self._all if isinstance(period, int) and period == 1 else steps % period == 0
         self._loss_state, delays = transmit(self.channel, rng, self._loss_state, sends)
         self._delays, self._sends = [delays, *self._delays[:-1]], sends
         return sends
@@ -240,7 +243,7 @@ class VectorChannelState:
         shortest = channel.shortest_delay if isinstance(channel, StackedChannels) else channel.delay
         for age in range(len(self._delays) - 1, shortest - 1, -1):
             arrives = self._delays[age] == age
-            if arrives.any():
+            if np.count_nonzero(arrives):
                 found.append((age, arrives))
         return found
 

@@ -139,7 +139,8 @@ class Snapshots:
         if len(self._held) < 2:
             self._held.append(sample)
             return sample.copy(order="K")
-        self._reused = any(np.may_share_memory(sample, each) for each in self._held)
+        first, second = self._held
+        self._reused = np.may_share_memory(sample, first) or np.may_share_memory(sample, second)
         return sample.copy(order="K") if self._reused else sample
 
 

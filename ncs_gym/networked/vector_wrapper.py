@@ -177,7 +177,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             earned = np.where(done, self._earned, newest)
             rewards = np.where(restarted, rewards, earned - self._told)
             self._told = np.where(restarted, 0.0, earned)
-        if len(rows := np.flatnonzero(restarted)):
+        if len(rows := restarted.nonzero()[0]):
             self._begin(rows, sample, anew=True)
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             info = info | {"final_obs": self._seen()}
@@ -263,14 +263,14 @@ class _Arrivals:
     ) -> np.ndarray:
         """Sends samples where it is time, and takes those that arrive; returns which environments send, (N,)."""
         sends, own = self.link.send(rng, steps), part.of(samples)
-        if np.count_nonzero(self.link.channel.quantization_step):  # of a float quicker than np.any
+        if np.count_nonzero(self.link.channel.quantization_step):
             own = quantized(self.link.channel, part.space, own)
         self._past = [(own, earned), *self._past[: self.link.channel.longest_delay]]
         before = self.stamp
         for age, arrives in self.link.arrivals():
             stamp, (sample, by_then) = steps - age, self._past[age]
             newer = arrives & (stamp > self.stamp)
-            everywhere = bool(newer.all())
+            everywhere = np.count_nonzero(newer) == len(newer)
             self.sample = sample if everywhere else _where(newer, sample, self.sample)
             self._is_own, self._anew = not everywhere, True
             self.stamp = np.where(newer, stamp, self.stamp)
