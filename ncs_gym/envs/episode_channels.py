@@ -71,8 +71,8 @@ class EpisodeChannels:
             for e in chosen:
                 self._sources[e] = sources[e]
 
-    def begin(self, rng: np.random.Generator, chosen: np.ndarray | None = None) -> list[Any] | None:
-        """Draws the channels of episodes that begin where a mask (N,) says so; all by default.
+    def begin(self, rng: np.random.Generator, rows: np.ndarray | None = None) -> list[Any] | None:
+        """Draws the channels of episodes that begin in some environments, given by their indices; in all by default.
 
         Returns:
             Those of all environments; None if all have the same one, as before.
@@ -82,8 +82,7 @@ class EpisodeChannels:
         """
         if self.is_plain:
             return None
-        indices = range(len(self.now)) if chosen is None else np.flatnonzero(chosen).tolist()
-        for e in indices:
+        for e in range(len(self.now)) if rows is None else rows.tolist():
             source = self._sources[e]
             self.now[e] = self._checked(source(rng), "what was drawn") if callable(source) else source
         return self.now

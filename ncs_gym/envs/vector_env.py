@@ -360,18 +360,19 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
         """Starts episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set."""
-        rng, count = self.np_random, int(np.count_nonzero(mask))
+        rng, rows = self.np_random, np.flatnonzero(mask)
+        count = len(rows)
         first_states, first_errors = self._first(count)
         initial, states = (self._single.initial_set, first_states) if starts is None else (None, starts[mask].T)
         states, known = self._process.start_many(rng, states, initial, mask)
         task_state, memory = self._task.begin_many(rng, self._plant, count), self._process.begin(rng, count)
-        channels, downlinks = self._uplinks.begin(rng, mask), self._downlinks.begin(rng, mask)
+        channels, downlinks = self._uplinks.begin(rng, rows), self._downlinks.begin(rng, rows)
         if count == self.num_envs:
             self._task_state, self._disturbance_memory = task_state, memory
             self._channel_state = VectorChannelState(channels or self._channel, rng, count)
         else:
             self._task_state[..., mask], self._disturbance_memory[..., mask] = task_state, memory
-            self._channel_state.begin(rng, mask, channels)
+            self._channel_state.begin(rng, rows, channels)
         self._prepare_estimator(all_begin=count == self.num_envs)
         self._state[:, mask] = states
         self._estimator.begin(mask, states + first_errors)

@@ -471,7 +471,7 @@ class VectorDownlinkState:
         if chosen.all():
             self._channel_state = VectorChannelState(channels or self._channel, rng, self._size)
         else:
-            self._channel_state.begin(rng, chosen, channels)
+            self._channel_state.begin(rng, np.flatnonzero(chosen), channels)
         self._newest[chosen] = NEVER
         self.committed.start(chosen)
 

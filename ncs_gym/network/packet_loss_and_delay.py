@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
-from ncs_gym.validation import again_if_interrupted
+from ncs_gym.validation import again_if_interrupted, frozen
 
 # More losses in a row than any episode has steps.
 UNLIMITED = 2**31 - 1
@@ -19,7 +19,7 @@ class LossState(NamedTuple):
 
     Attributes:
         bad: Whether the Gilbert-Elliott chain is in its bad state; of a `TraceChannel` the number of the next sample.
-        consecutive: Number of packets that were lost in a row so far.
+        consecutive: Number of packets that were lost in a row so far; counted where the channel limits it.
     """
 
     bad: Any
@@ -56,7 +56,9 @@ class StackedChannels:
         )
         self.jitter: Any = jitter if jitter.any() else 0  # without any, nothing is drawn
         limits = [each.max_consecutive_losses for each in channels]
-        self.max_consecutive_losses = np.array([UNLIMITED if most is None else most for most in limits])
+        self.max_consecutive_losses: Any = None  # without any, nothing is counted
+        if limits != [None] * len(limits):
+            self.max_consecutive_losses = np.array([UNLIMITED if most is None else most for most in limits])
         losses = [each.loss for each in channels]
         self.loss: Any = np.array([0.0 if isinstance(each, GilbertElliott) else each for each in losses])
         if any(isinstance(each, GilbertElliott) for each in losses):
@@ -82,11 +84,12 @@ def first_loss_state(
     channel: Channel | StackedChannels, rng: np.random.Generator, size: int | None = None
 ) -> LossState:
     """Returns the loss process at the start of an episode; a chain starts in its stationary distribution."""
-    bad = False if size is None else np.zeros(size, np.bool_)
     if isinstance(channel, TraceChannel):
         bad = rng.integers(len(channel.trace), size=size)
-    if isinstance(channel.loss, (GilbertElliott, StackedBursts)):
+    elif isinstance(channel.loss, (GilbertElliott, StackedBursts)):
         bad = rng.random(size) < channel.loss.stationary_bad
+    else:
+        bad = False if size is None else np.zeros(size, np.bool_)
     return LossState(bad, 0 if size is None else np.zeros(size, np.int64))
 
 
@@ -114,16 +117,16 @@ def transmit(
     if isinstance(loss, (GilbertElliott, StackedBursts)):
         bad = bad != (rng.random(size) < loss.p_good_to_bad + (loss.p_bad_to_good - loss.p_good_to_bad) * bad)
         loss = loss.loss_good + (loss.loss_bad - loss.loss_good) * bad
-        state = LossState(bad, consecutive)
-    if not (sends if size is None else sends.any()):
-        return state, -1 if size is None else np.full(size, -1)
-    most = channel.max_consecutive_losses
-    lost = sends & (rng.random(size) < loss) & (consecutive < (UNLIMITED if most is None else most))
-    arrives = sends > lost
+    if not (sends if size is None else np.count_nonzero(sends)):  # quicker than any()
+        return LossState(bad, consecutive), -1 if size is None else np.full(size, -1)
+    arrives = sends & (rng.random(size) >= loss)
+    if channel.max_consecutive_losses is not None:
+        arrives = arrives | (sends & (consecutive >= channel.max_consecutive_losses))
+        consecutive = (consecutive + sends) * (1 - arrives)
     delay: Any = channel.delay
     if isinstance(channel.jitter, np.ndarray) or channel.jitter:
         delay = delay + rng.random(size) * (channel.jitter + 1) // 1
-    return LossState(bad, (consecutive + lost) * (1 - arrives)), arrives * (delay + 1) - 1
+    return LossState(bad, consecutive), arrives * (delay + 1) - 1
 
 
 class ChannelState:
@@ -187,28 +190,28 @@ class VectorChannelState:
     def __init__(self, channel: Channel | Sequence[Channel], rng: np.random.Generator, size: int) -> None:
         self.channel = channel if isinstance(channel, Channel) else side_by_side(channel)
         self._size, self._sends = size, np.zeros(size, np.bool_)
+        self._all = frozen(np.ones(size, np.bool_))  # which send where each step has a sample
         self._loss_state = first_loss_state(self.channel, rng, size)
         # For the samples of each age, after how many steps they arrive.
         self._delays = [np.full(size, -1) for _ in range(self.channel.longest_delay + 1)]
 
-    def begin(self, rng: np.random.Generator, chosen: Any, channels: Sequence[Channel] | None = None) -> None:
+    def begin(self, rng: np.random.Generator, rows: np.ndarray, channels: Sequence[Channel] | None = None) -> None:
         """Starts episodes in some environments; what is on its way there never arrives.
 
         Args:
             rng: Source of randomness.
-            chosen: Mask or indices of the environments.
+            rows: Indices of the environments.
             channels: Those of all N environments from now on, the others' being the same as before; None for all the
                 same as before, where they do not differ.
         """
-        indices = np.arange(self._size)[chosen]
         begun: Any = self.channel
         if channels is not None:
-            self.channel, begun = side_by_side(channels), side_by_side([channels[e] for e in indices.tolist()])
+            self.channel, begun = side_by_side(channels), side_by_side([channels[e] for e in rows.tolist()])
             self._delays += [np.full(self._size, -1) for _ in range(self.channel.longest_delay + 1 - len(self._delays))]
-        for kept, first in zip(self._loss_state, first_loss_state(begun, rng, indices.size), strict=True):
-            kept[chosen] = first
+        for kept, first in zip(self._loss_state, first_loss_state(begun, rng, len(rows)), strict=True):
+            kept[rows] = first
         for delays in self._delays:
-            delays[chosen] = -1
+            delays[rows] = -1
 
     def send(self, rng: np.random.Generator, steps: np.ndarray, requested: np.ndarray | None = None) -> np.ndarray:
         """Sends samples where it is time, at steps (N,) of the episodes; returns which environments send, (N,).
@@ -218,7 +221,9 @@ class VectorChannelState:
             steps: The steps.
             requested: Where a sample is requested, shape (N,), of channels that take samples on request.
         """
-        sends = steps % self.channel.send_period == 0 if requested is None else requested
+        period, sends = self.channel.send_period, requested
+        if sends is None:
+            sends = self._all if isinstance(period, int) and period == 1 else steps % period == 0
         self._loss_state, delays = transmit(self.channel, rng, self._loss_state, sends)
         self._delays, self._sends = [delays, *self._delays[:-1]], sends
         return sends
@@ -238,7 +243,7 @@ class VectorChannelState:
         shortest = channel.shortest_delay if isinstance(channel, StackedChannels) else channel.delay
         for age in range(len(self._delays) - 1, shortest - 1, -1):
             arrives = self._delays[age] == age
-            if arrives.any():
+            if np.count_nonzero(arrives):
                 found.append((age, arrives))
         return found
 

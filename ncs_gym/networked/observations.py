@@ -135,12 +135,13 @@ class Snapshots:
                 return {key: self.taken(each) for key, each in sample.items()}
             return tuple(map(self.taken, sample)) if isinstance(sample, tuple) else sample
         if sample.nbytes <= SMALL or self._reused:
-            return sample.copy()
+            return sample.copy(order="K")
         if len(self._held) < 2:
             self._held.append(sample)
-            return sample.copy()
-        self._reused = any(np.may_share_memory(sample, each) for each in self._held)
-        return sample.copy() if self._reused else sample
+            return sample.copy(order="K")
+        first, second = self._held
+        self._reused = np.may_share_memory(sample, first) or np.may_share_memory(sample, second)
+        return sample.copy(order="K") if self._reused else sample
 
 
 def handed_out(sample: Any, *, anew: bool) -> Any:
@@ -150,7 +151,7 @@ def handed_out(sample: Any, *, anew: bool) -> Any:
     sees again while nothing arrives.
     """
     if isinstance(sample, np.ndarray):
-        return sample.copy() if sample.nbytes <= SMALL or not anew else sample
+        return sample.copy(order="K") if sample.nbytes <= SMALL or not anew else sample
     if isinstance(sample, dict):
         return {key: handed_out(each, anew=anew) for key, each in sample.items()}
     return tuple(handed_out(each, anew=anew) for each in sample) if isinstance(sample, tuple) else sample

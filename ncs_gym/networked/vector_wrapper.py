@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -107,7 +106,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         everywhere = bool(chosen.all())
         if everywhere:
             self._make()
-        self._begin(chosen, self._snapshots.taken(observations), anew=not everywhere)
+        self._begin(np.flatnonzero(chosen), self._snapshots.taken(observations), anew=not everywhere)
         return self._seen(), self._with_network(info)
 
     def _make(self) -> None:
@@ -123,28 +122,28 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             self._actuator = _Actuators(settings, VectorChannelState(self._downlinks.now, rng, count), count)
         idle = np.repeat(np.asarray(self._nothing)[None], count, axis=0)
         self._decided = np.repeat(idle[:, None], settings.pending, axis=1)
-        self._applied, self._decided_at = idle, np.full(count, -1)
+        self._applied, self._action_age = idle, np.zeros(count, np.int64)
         self._steps, self._packets = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._earned, self._told = np.zeros(count), np.zeros(count)
         self._over = np.zeros(count, np.bool_)
 
-    def _begin(self, chosen: np.ndarray, samples: Any, *, anew: bool = False) -> None:
-        """Starts episodes where a mask says so, with their first observations.
+    def _begin(self, rows: np.ndarray, samples: Any, *, anew: bool = False) -> None:
+        """Starts episodes in some environments, with their first observations.
 
         Args:
-            chosen: The mask, shape (N,).
+            rows: Indices of the environments.
             samples: Observations of all environments.
             anew: Whether other episodes ran before, whose packets are on their way.
         """
-        settings, rng, rows = self._settings, self.np_random, np.flatnonzero(chosen)
+        settings, rng = self._settings, self.np_random
         if anew:
             for arrivals, links in zip(self._arrivals, self._uplinks, strict=True):
-                arrivals.link.begin(rng, rows, links.begin(rng, chosen))
+                arrivals.link.begin(rng, rows, links.begin(rng, rows))
             if self._actuator is not None:
-                self._actuator.begin(rng, rows, self._downlinks.begin(rng, chosen))
+                self._actuator.begin(rng, rows, self._downlinks.begin(rng, rows))
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             arrivals.begin(rows, part.of(samples))
-        self._steps[rows] = self._packets[rows] = self._decided_at[rows] = 0
+        self._steps[rows] = self._packets[rows] = self._action_age[rows] = 0
         self._applied[rows] = self._nothing
         if settings.delay_reward:
             self._earned[rows] = self._told[rows] = 0.0
@@ -154,11 +153,11 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Sends the actions, steps the environments with those that act now, and sees what arrives."""
         rng, settings = self.np_random, self._settings
-        actions = np.asarray(actions)
+        actions = np.array(actions)
         restarted = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, np.bool_)
-        self._applied, self._decided_at = actions.copy(), self._steps.copy()
+        self._applied = actions
         if self._actuator is not None:
-            self._applied, self._decided_at = self._actuator.exchange(rng, self._steps, actions)
+            self._applied, self._action_age = self._actuator.exchange(rng, self._steps, actions)
         if self._keeps_actions:
             self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
         observations, rewards, terminated, truncated, info = self.env.step(self._applied)
@@ -171,20 +170,20 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         if settings.delay_reward:
             self._earned = self._earned + np.where(restarted, 0.0, rewards)
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
-            sends = arrivals.exchange(rng, self._steps, part, sample, self._earned)
+            sends = arrivals.exchange(rng, self._steps, part, sample, self._earned if settings.delay_reward else None)
             self._packets += sends
         if settings.delay_reward:
             newest = np.max([each.earned for each in self._arrivals], axis=0)
             earned = np.where(done, self._earned, newest)
             rewards = np.where(restarted, rewards, earned - self._told)
             self._told = np.where(restarted, 0.0, earned)
-        if restarted.any():
-            self._begin(restarted, sample, anew=True)
+        if len(rows := restarted.nonzero()[0]):
+            self._begin(rows, sample, anew=True)
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             info = info | {"final_obs": self._seen()}
             if isinstance(info.get("final_info"), dict):
                 info["final_info"] = info["final_info"] | self._with_network({})
-            self._begin(done, self._snapshots.taken(observations), anew=True)
+            self._begin(np.flatnonzero(done), self._snapshots.taken(observations), anew=True)
         self._over = done
         return self._seen(), rewards, terminated, truncated, self._with_network(info)
 
@@ -209,12 +208,11 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         keys = [part.key for part in self._settings.parts]
         ages = [self._steps - each.stamp for each in self._arrivals]
         arrived = [each.arrived.copy() for each in self._arrivals]
-        begun = self._steps == 0
         return {
             **info,
             "measurement_age": ages[0] if keys[0] is None else dict(zip(keys, ages, strict=True)),
             "packet_arrived": arrived[0] if keys[0] is None else dict(zip(keys, arrived, strict=True)),
-            "action_age": np.where(begun, 0, self._steps - 1 - self._decided_at),
+            "action_age": self._action_age.copy(),
             "action_applied": self._applied.copy(),
             "packets": self._packets.copy(),
         }
@@ -237,7 +235,7 @@ class _Arrivals:
         self.earned = np.zeros(count)
         # Whether these samples were made here and nobody else has them; whether they have not been handed out yet.
         self._is_own, self._anew = False, True
-        self._past: deque[tuple[Any, np.ndarray]] = deque()
+        self._past: list[tuple[Any, np.ndarray | None]] = []
 
     def begin(self, rows: np.ndarray, samples: Any) -> None:
         """Starts episodes in some environments, whose first samples are there."""
@@ -261,24 +259,24 @@ class _Arrivals:
         return self.arrived | (self.stamp == steps)
 
     def exchange(
-        self, rng: np.random.Generator, steps: np.ndarray, part: Any, samples: Any, earned: np.ndarray
+        self, rng: np.random.Generator, steps: np.ndarray, part: Any, samples: Any, earned: np.ndarray | None
     ) -> np.ndarray:
         """Sends samples where it is time, and takes those that arrive; returns which environments send, (N,)."""
         sends, own = self.link.send(rng, steps), part.of(samples)
-        if np.any(self.link.channel.quantization_step):
+        if np.count_nonzero(self.link.channel.quantization_step):
             own = quantized(self.link.channel, part.space, own)
-        self._past.appendleft((own, earned))
-        while len(self._past) > self.link.channel.longest_delay + 1:
-            self._past.pop()
-        self.arrived = np.zeros(len(steps), np.bool_)
+        self._past = [(own, earned), *self._past[: self.link.channel.longest_delay]]
+        before = self.stamp
         for age, arrives in self.link.arrivals():
-            newer = arrives & (steps - age > self.stamp)
-            sample, by_then = self._past[age]
-            everywhere = bool(newer.all())
+            stamp, (sample, by_then) = steps - age, self._past[age]
+            newer = arrives & (stamp > self.stamp)
+            everywhere = np.count_nonzero(newer) == len(newer)
             self.sample = sample if everywhere else _where(newer, sample, self.sample)
             self._is_own, self._anew = not everywhere, True
-            self.stamp, self.earned = np.where(newer, steps - age, self.stamp), np.where(newer, by_then, self.earned)
-            self.arrived = self.arrived | newer
+            self.stamp = np.where(newer, stamp, self.stamp)
+            if by_then is not None:
+                self.earned = np.where(newer, by_then, self.earned)
+        self.arrived = self.stamp > before
         return sends
 
 
@@ -290,7 +288,7 @@ class _Actuators:
         self._neutral = np.asarray(settings.neutral)
         self._action = np.repeat(self._neutral[None], count, axis=0)
         self._stamp = np.full(count, -1)
-        self._past: deque[np.ndarray] = deque()
+        self._past: list[np.ndarray] = []
         # What waits for its turn, oldest first: how old each was at its arrival, counted from now on; -1 for none.
         self._waiting = np.zeros((0, count), np.int64)
 
@@ -302,11 +300,9 @@ class _Actuators:
     def exchange(
         self, rng: np.random.Generator, steps: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Sends actions; returns those that act at these steps, and the steps at which they were decided."""
+        """Sends actions; returns those that act at these steps, and how many steps ago they were decided."""
         self._link.send(rng, steps)
-        self._past.appendleft(actions.copy())
-        while len(self._past) > 2 * self._link.channel.longest_delay + 2:
-            self._past.pop()
+        self._past = [actions.copy(), *self._past[: 2 * self._link.channel.longest_delay + 1]]
         arrivals = self._link.arrivals()
         if self._late == "drop":
             arrivals = [(age, arrives & (age == np.asarray(self._link.channel.delay))) for age, arrives in arrivals]
@@ -318,8 +314,8 @@ class _Actuators:
             rows = np.flatnonzero(fresh)
             self._action[rows], self._stamp[rows], acts[rows] = self._past[age][rows], steps[rows] - age, True
         if self._idle == "neutral":
-            return _where(acts, self._action, self._neutral), self._stamp.copy()
-        return self._action.copy(), self._stamp.copy()
+            return _where(acts, self._action, self._neutral), steps - self._stamp
+        return self._action.copy(), steps - self._stamp
 
     def _next_in_turn(self, arrivals: list[tuple[int, np.ndarray]]) -> list[tuple[int, np.ndarray]]:
         """Returns the command of each environment whose turn it is, by its age, and has the others wait."""
