@@ -57,6 +57,14 @@ RUNS = {
         [rf"trained on the {name}, worst network: return {NUMBER}, violating steps: 0" for name in ("best", "range")],
     ),
     "recurrent_ppo.py": (["--steps", "1024"], [rf"mean return of the last 4 episodes: {NUMBER}", "violating steps: 0"]),
+    "quadruple_tank.py": (
+        [],
+        [
+            r"without a shield: [1-9]\d+ of 400 steps outside",
+            r"with a shield: 0 of 400 steps outside, levels \[cm\] \d",
+            r"0 <= level 3 <= 20 cm \(operating point 1.8\)",
+        ],
+    ),
     "servo_requirements.py": (
         [],
         [
@@ -104,7 +112,7 @@ TRAINING = {
     "your_gym_env.py",
 }
 # They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
-LONG = {"both_directions.py", "lost_hour.py", "unstable_plant_loop.py"}
+LONG = {"both_directions.py", "lost_hour.py", "quadruple_tank.py", "unstable_plant_loop.py"}
 # Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},

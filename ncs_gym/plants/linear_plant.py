@@ -81,6 +81,8 @@ _KINDS = {
 _LIMITS = "state_limits", "input_limits", "output_limits", "box", "u_max", "offset"
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
+# What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
+_ZERO = 1e-12
 # Stands for a space at which no line ends.
 _UNBROKEN = "\N{NO-BREAK SPACE}"
 
@@ -1000,11 +1002,12 @@ def _between(name: str, low: float, high: float, center: float, unit: str) -> st
     if center == 0.0 and low == -high:
         return f"|{name}| <= {_sized(high, unit)}"
     point = f" (operating point {center:.6g})" if center else ""
+    bottom, top = (0.0 if abs(center + end) <= _ZERO * abs(center) else center + end for end in (low, high))
     if low == -np.inf:
-        return f"{name} <= {_sized(center + high, unit)}{point}"
+        return f"{name} <= {_sized(top, unit)}{point}"
     if high == np.inf:
-        return f"{name} >= {_sized(center + low, unit)}{point}"
-    return f"{center + low:.6g} <= {name} <= {_sized(center + high, unit)}{point}"
+        return f"{name} >= {_sized(bottom, unit)}{point}"
+    return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
 
 
 def row_limit(plant: LinearPlant, j: int) -> str:

@@ -1,0 +1,63 @@
+"""Prints what certificates keep of the published plants: `python -m experiments.published [names]`."""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+
+from experiments.published.plants import contract_of_plant, plant_of, published
+from ncs_gym import LinearPlant
+from shields import Certificate, Infeasible, synthesize, verify
+
+_COLUMNS = ("plant", "n, m", "age", "limits", "share", "rows", "time [s]")
+_WIDTHS = (18, 6, 4, 12, 8, 6, 9)
+
+
+def main(names: list[str]) -> None:
+    """Prints a row for every plant, and in the end how many have a certificate.
+
+    Raises:
+        SystemExit: If a name is none of theirs.
+    """
+    if unknown := [name for name in names if name not in published()]:
+        raise SystemExit(f"no published plant is called {unknown[0]}; there are {', '.join(published())}")
+    print(_row(*_COLUMNS))
+    found = 0
+    for name in names or published():
+        began, plant = time.perf_counter(), plant_of(name)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                certificate = synthesize(plant, contract=contract_of_plant(name))
+        except Infeasible as infeasible:
+            kept = f"none ({infeasible.binding})"
+            print(_row(name, *_sizes(name, plant), kept, "", f"{time.perf_counter() - began:.1f}"), flush=True)
+            continue
+        assert verify(certificate, plant).valid
+        found += 1
+        print(_row(name, *_sizes(name, plant), *_kept(certificate), f"{time.perf_counter() - began:.1f}"), flush=True)
+    print(f"{found} of {len(names or published())} have a certificate")
+
+
+def _sizes(name: str, plant: LinearPlant) -> tuple[str, str, str]:
+    free = plant.n - int(np.linalg.matrix_rank(plant.box))
+    kind = "symmetric" if plant.is_symmetric else "two ends"
+    return f"{plant.n}, {plant.m}", str(published()[name]["max_age"]), kind if not free else f"{free} free"
+
+
+def _kept(certificate: Certificate) -> tuple[str, str]:
+    share = certificate.provenance.get("polytope_share_of_box")
+    rows = "" if certificate.polytope is None else str(len(certificate.polytope.rows))
+    return "no box" if share is None else f"{share:.3f}", rows
+
+
+def _row(*texts: Any) -> str:
+    return " ".join(f"{text:<{width}}" for text, width in zip(texts, _WIDTHS, strict=True)).rstrip()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
