@@ -12,7 +12,7 @@ import ncs_gym  # noqa: F401
 from ncs_gym import Channel, LinearPlant, contract_of
 from shields import SafetyShield, synthesize
 
-# Deviations of the levels [cm] from the operating point, by the voltages of two pumps [V]; the lower levels are measured.
+# Deviations of the levels [cm] from the operating point, by the voltages of two pumps [V]; two levels are measured.
 A = np.array([[-0.0159, 0, 0.0419, 0], [0, -0.0111, 0, 0.0333], [0, 0, -0.0419, 0], [0, 0, 0, -0.0333]])
 B = np.array([[0.0833, 0], [0, 0.0628], [0, 0.0479], [0.0312, 0]])
 C = np.eye(2, 4)

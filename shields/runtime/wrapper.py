@@ -13,11 +13,11 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import Annotation, Channel, NCSEnv, NCSVectorEnv
+from ncs_gym import Annotation, BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import as_number, own_error_state, setting, shown
+from ncs_gym.validation import as_number, own_error_state, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
@@ -79,6 +79,12 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
         self._input_delay = 0 if inner.downlink_protocol is None else inner.downlink_protocol.input_delay
         self._channels: set[Channel] = set()
         self._made_for = self._premises(inner)
+        if (promised := self._certificate.contract) is not None and inner.certificate_contract is None:
+            warn_caller(
+                "the certificate assumes a contract of the channel, and the environment was made without one, so that "
+                f"its estimator keeps other error sets: give it contract={promised}",
+                BrokenContractWarning,
+            )
 
     def _environment_in(self, env: Any) -> E:
         """Returns the innermost environment after looking at every wrapper around it.

@@ -309,7 +309,7 @@ def test_center_that_is_not_inside_and_ends_the_wrong_way_are_no_certificate():
 
 
 def test_bound_of_a_disturbance_with_two_ends_holds_all_of_it_in_rational_numbers():
-    """x+ = A x + B u + E w, told from the old operating point, is A z + B v + d with d in E(D), told from the new one."""
+    """x+ = A x + B u + E w, told from the old point, is z+ = A z + B v + d with d in E(D), told from the new one."""
     E, low, high = np.array([[1.0, 0.3], [0.2, -0.5]]), np.array([-0.3, 0.0]), np.array([0.1, 0.2])
     model = {"A": [[0.9, 0.1], [0.0, 0.7]], "B": [[0.1], [0.4]], "dt": 1.0} | QUIET
     limits = {"state_limits": ([-5.0, -5.0], [6.0, 4.0]), "input_limits": (-3.0, 4.0)}

@@ -3,6 +3,7 @@
 import warnings
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from ncs_gym import (
@@ -17,6 +18,7 @@ from ncs_gym import (
 )
 from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
+from tests.plants import small
 
 PLANT, CONTRACT = cart_pole(), ChannelContract(4)
 DOWNLINK = Channel(loss=0.2, delay=1, max_consecutive_losses=2)  # c = 3
@@ -134,3 +136,18 @@ def test_shield_keeps_its_guarantee_over_drawn_channels_and_says_where_it_is_los
     one.reset(seed=0, options={"channel": Channel(loss=1.0)})
     with pytest.warns(GuaranteeLostWarning, match="older than the contract"):
         [one.step(one.action_space.sample()) for _ in range(10)]
+
+
+def test_environment_of_a_stable_plant_without_the_contract_of_the_certificate_is_named():
+    plant, channel = small(0.5 * np.eye(2)), Channel(delay=1)
+    certificate = certificate_of(plant, ChannelContract(max_age=1), "polytope")
+    for make in (gym.make, gym.make_vec):
+        shield = SafetyShield if make is gym.make else VectorSafetyShield
+        env = make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel)
+        with pytest.warns(BrokenContractWarning, match=r"made without one.*contract=ChannelContract\(max_age=1"):
+            shield(env, certificate)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", BrokenContractWarning)
+            shield(
+                make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, contract=certificate.contract), certificate
+            )
