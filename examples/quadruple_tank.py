@@ -1,7 +1,9 @@
 """The quadruple tank with the limits that Johansson (2000) published: levels of 0 to 20 cm, pumps of 0 to 10 V.
 
 Neither is symmetric about the operating point. An agent that does harm drives all pumps to one end and then to the
-other; the shield keeps every level. It takes about ten seconds.
+other; the shield keeps every level.
+
+Takes about ten seconds on one core.
 """
 
 import gymnasium as gym

@@ -55,7 +55,7 @@ LAYERS = {
         {"training"},
     ),
     "experiments": (
-        {"errors", "json_values", "terminal"},
+        {"errors", "json_values", "published", "terminal"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},

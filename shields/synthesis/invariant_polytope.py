@@ -31,6 +31,8 @@ LONGEST_SEARCH = 60.0
 _MARGIN = 1e-6
 # A row counts as implied by others up to this: a thousandth of the margin.
 _IMPLIED = 1e-9
+# States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
+_SIMILAR = 1.0
 # The ends of one row that are open.
 _OPEN = np.array([-math.inf]), np.array([math.inf])
 # Where fewer rows than this share of the most are left of a search that has too many, it goes on.
@@ -119,8 +121,9 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
     """
     step = _ClosedLoop(feedback, plant)
     faces = invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress)
-    if step.has_free_states:  # how far they go is known now: in units of that numbers round well
-        step.widths = step.widths * _extents(faces)
+    extents = _extents(faces) if step.has_free_states else np.ones(plant.n)
+    if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
+        step.widths = step.widths * extents
         faces = invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress)
     return _rounded(step, faces)
 

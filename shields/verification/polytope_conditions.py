@@ -8,6 +8,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import qr
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
@@ -20,6 +21,7 @@ from shields.verification.rational_matrix import (
     multiply,
     quadratic,
     rational,
+    to_float,
     transpose,
     weighted_size,
 )
@@ -143,17 +145,22 @@ def widths_of(
 ) -> list[Fraction] | None:
     """Returns bounds of |x_k| over low <= g_j x <= high; None if there are none.
 
-    They follow from the first rows, or else from all, that have two ends: of these C x is |C x|_j <= s_j.
+    They follow from rows C that have two ends, |C x|_j <= s_j: from the first ones, or else from n that a factorization
+    in floats picks among all. Any rows would do.
     """
     ends = zip(rows, low, high, strict=True)
-    chosen = [
+    bounded = [
         (j, [entry / max(-lo, hi) for entry in row])
         for j, (row, lo, hi) in enumerate(ends)
         if lo is not None and hi is not None
     ]
-    leading = [row for j, row in chosen if j < first]
+    leading, both = [row for j, row in bounded if j < first], [row for _, row in bounded]
     widths = half_widths(leading) if leading else None
-    return half_widths([row for _, row in chosen]) if widths is None and chosen else widths
+    if widths is not None or len(both) < len(rows[0]):
+        return widths
+    columns = to_float(both).T
+    picked = qr(columns / np.abs(columns).max(axis=1, keepdims=True).clip(1e-300), mode="r", pivoting=True)[1]
+    return half_widths([both[j] for j in picked[: len(columns)]])
 
 
 def half_widths(box: Matrix) -> list[Fraction] | None:

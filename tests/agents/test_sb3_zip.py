@@ -22,7 +22,7 @@ def test_agent_of_a_zip_acts_as_the_model_did(cls, tmp_path):
     saved = model(cls)
     saved.save(tmp_path / "own.zip")
     assert is_sb3_zip(tmp_path / "own.zip")
-    agent = load_sb3_zip(tmp_path / "own.zip", CRUISE)
+    agent = load_sb3_zip(tmp_path / "own.zip", CRUISE, "none")  # a model that was never trained does not tell
     observations = np.random.default_rng(0).standard_normal((20, 3)).astype(np.float32)
     np.testing.assert_array_equal(agent.act(observations), saved.predict(observations, deterministic=True)[0])
 

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from experiments.published.plants import channel_of, contract_of_plant, plant_of, published
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, Ellipsoid, LinearPlant, contract_of
 from shields import Certificate, CertificateError, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, verify
 from tests.certificates import certificate_of
@@ -378,3 +379,43 @@ def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
             seen |= info["shield_guaranteed"]
         assert seen.all()
     assert P.low[0] == plant.box_low[0]
+
+
+@pytest.mark.parametrize("name", published())
+def test_published_plant_is_accepted_as_its_authors_write_it(name):
+    plant, p = plant_of(name), published()[name]
+    published_ends = np.array([p["input_low"], p["input_high"]])
+    np.testing.assert_allclose(plant.input_ends + plant.operating_input, published_ends, rtol=1e-9, atol=1e-9)
+    limited = [i for i in range(plant.n) if p["state_low"][i] is not None or p["state_high"][i] is not None]
+    for j, i in enumerate(limited):
+        low, high = plant.box_ends[:, j] / plant.box[j, i] + plant.operating_state[i]
+        for end, given in ((low, p["state_low"][i]), (high, p["state_high"][i])):
+            assert end == pytest.approx(given, abs=1e-9) if given is not None else np.isinf(end)
+    assert contract_of(channel_of(name)).max_age <= contract_of_plant(name).max_age
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["ctms_cruise", "fbs_cruise", "glucose_bergman", "cstr_pcgym", "cstr_dompc", "ampyc_sf"]
+)
+def test_published_plant_keeps_its_limits_under_attack(name):
+    plant, contract, channel = plant_of(name), contract_of_plant(name), channel_of(name)
+    found = certificate_of(plant, contract, "polytope")
+    P, rng = found.polytope, np.random.default_rng(0)
+    names = {"plant": plant, "channel": channel, "contract": contract, "noise": "extreme"}
+    for mode in ("project", "lookahead"):
+        env = gym.make_vec(
+            "ncs_gym/LinearNCS-v0", num_envs=100, disturbance=AdversarialDisturbance(rows=P.rows), **names
+        )
+        shield = VectorSafetyShield(env, found, mode)
+        starts = P.center + 0.5 * (P.sample_boundary(rng, 100) - P.center)
+        _, info = shield.reset(seed=0, options={"state": starts})
+        assert info["shield_guaranteed"].mean() > 0.5
+        for k in range(190):
+            ends = (
+                np.sign(rng.uniform(-1.0, 1.0, (100, plant.m)))
+                if k % 2
+                else np.full((100, plant.m), 1.0 - 2.0 * (k // 50 % 2))
+            )
+            _, _, _, _, info = shield.step(ends.astype(np.float32))
+            assert not (info["shield_guaranteed"] & (info["cost"] > 0.0)).any()
