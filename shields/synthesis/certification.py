@@ -139,7 +139,7 @@ def synthesize(
             f"None, got {shown(contract)}"
         )
     report = progress or (lambda line: None)
-    if not plant.is_symmetric or np.linalg.matrix_rank(plant.box_rows) < plant.n:
+    if _needs_resting_point(plant):
         if safe_set == "ellipsoid":
             raise ValueError("only a polytope is sought where limits are not symmetric, or not all states have any")
         return _around_resting_point(plant, contract, report, candidates, search_gain=search_gain)
@@ -151,6 +151,11 @@ def synthesize(
         return largest
     found = (with_largest_polytope if search_gain else with_polytope)(largest, plant, report)
     return max([found, *(with_polytope(each, plant, report) for each in others)], key=_polytope_share)
+
+
+def _needs_resting_point(plant: LinearPlant) -> bool:
+    """Returns whether limits are not symmetric about the operating point, or leave a state free."""
+    return not plant.is_symmetric or bool(np.linalg.matrix_rank(plant.box) < plant.n)
 
 
 def _around_resting_point(
@@ -398,7 +403,8 @@ def carried_over(certificate: Certificate, plant: LinearPlant, contract: Channel
     try:
         if certificate.keeps_ellipsoid:
             return certify(plant, certificate.L, certificate.K, contract)
-        return certify_polytope(plant, certificate.K, contract)
+        rest = Rest(certificate.resting_state, certificate.resting_input)
+        return certify_polytope(plant, certificate.K, contract, rest=rest)
     except Infeasible:
         return None
 
@@ -420,12 +426,27 @@ def nearby_certificate(
         alternations: How often the set is enlarged at most.
         polytope: Whether a polytope is sought where no ellipsoid is found.
     """
+    if _needs_resting_point(plant):
+        return _nearby_around(plant, contract, start)
     try:
         certificate = _nearby(plant, contract, start, alternations)
     except Infeasible:
         certificate = None
     carried = None if certificate or start is None else carried_over(start, plant, contract)
     return certificate or carried or (_polytope_alone(plant, contract) if polytope else None)
+
+
+def _nearby_around(
+    plant: LinearPlant, contract: ChannelContract | None, start: Certificate | None
+) -> Certificate | None:
+    """Returns what `nearby_certificate` does, of a polytope around a resting point."""
+    carried = None if start is None else carried_over(start, plant, contract)
+    if carried is not None:
+        return carried
+    try:
+        return _around_resting_point(plant, contract, lambda line: None, (), search_gain=False)
+    except Infeasible:
+        return None
 
 
 def _nearby(

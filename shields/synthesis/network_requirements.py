@@ -581,10 +581,17 @@ def _scaled(bound: Ellipsoid | None, factor: float) -> Ellipsoid | None:
 
 def _output_ranges(plant: LinearPlant) -> np.ndarray:
     """Returns the largest |y_i| for states in the safe box, with the sensor noise, shape (p,)."""
-    rows = np.concatenate([plant.box_rows, -plant.box_rows])
-    reach = [linprog(-row, A_ub=rows, b_ub=np.ones(len(rows)), bounds=(None, None)) for row in plant.H]
-    extents = np.array([-solved.fun if solved.success else inf for solved in reach])
-    return extents + np.sqrt(np.diag(plant.sensor_error.shape_matrix))
+    above, below = np.isfinite(plant.box_high), np.isfinite(plant.box_low)
+    rows = np.concatenate([plant.box[above], -plant.box[below]])
+    ends = np.concatenate([plant.box_high[above], -plant.box_low[below]])
+    reach = [
+        max(
+            -solved.fun if (solved := linprog(-sign * row, A_ub=rows, b_ub=ends, bounds=(None, None))).success else inf
+            for sign in ((1.0,) if plant.is_symmetric else (1.0, -1.0))
+        )
+        for row in plant.H
+    ]
+    return np.array(reach) + np.sqrt(np.diag(plant.sensor_error.shape_matrix))
 
 
 def _bits_of_sample(ranges: np.ndarray, quantization_step: float) -> float:
