@@ -19,6 +19,7 @@ from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
+from ncs_gym.plants.limits import MovedOperatingPointWarning
 from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
@@ -67,6 +68,7 @@ __all__ = [
     "GymProcess",
     "LinearPlant",
     "LinearProcess",
+    "MovedOperatingPointWarning",
     "NCSEnv",
     "NCSVectorEnv",
     "Networked",

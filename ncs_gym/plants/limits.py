@@ -11,7 +11,16 @@ from ncs_gym import exact
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_numbers, as_setting, as_vector, shown
+from ncs_gym.validation import (
+    LARGEST_NUMBER,
+    SMALLEST_NUMBER,
+    as_matrix,
+    as_numbers,
+    as_setting,
+    as_vector,
+    shown,
+    warn_caller,
+)
 
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
 NEARLY_SYMMETRIC = 1e-12
@@ -126,6 +135,10 @@ def _from_center(limits: Any, center: np.ndarray, name: str) -> tuple[np.ndarray
     if not ((size >= SMALLEST_NUMBER) & (size < LARGEST_NUMBER)).all():
         raise ValueError(f"{name} must be finite numbers of usual size, or infinite, got {shown(limits)}")
     return low, high
+
+
+class MovedOperatingPointWarning(UserWarning):
+    """A disturbance with two different ends moves the point that deviations are counted from."""
 
 
 class Rows(NamedTuple):
@@ -246,10 +259,23 @@ def as_input_ends(value: Any, size: int) -> np.ndarray:
     return np.stack([low, high])
 
 
-def _require_equilibrium(
+def _with_residual(bound: Ellipsoid, missing: np.ndarray, rows: np.ndarray) -> Ellipsoid:
+    """Returns a bound of d with what a point lacks of an equilibrium, doubled; rows, (k, n), give the units."""
+    n = len(missing)
+    if not missing.any():
+        return bound
+    gram = rows.T @ rows
+    lacking = np.diag(n * np.square(2.0 * np.abs(missing)))
+    return Ellipsoid(outer_sum(bound.shape_matrix, lacking, gram + np.eye(n) * np.trace(gram) / n))
+
+
+def _residual_of_equilibrium(
     A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarray, applied: np.ndarray
-) -> None:
-    """Raises unless A x0 + B u0 + c = x0, but for rounding.
+) -> np.ndarray:
+    """Returns A x0 + B u0 + c - x0, rounded once, shape (n,).
+
+    Raises:
+        ValueError: If that is more than rounding.
 
     Args:
         A: Shape (n, n).
@@ -258,10 +284,12 @@ def _require_equilibrium(
         state: x0, shape (n,).
         applied: u0, shape (m,).
     """
-    missing = A @ state + B @ applied + offset - state
+    missing = exact.product(
+        np.hstack([A, B, np.eye(len(A)), -np.eye(len(A))]), np.concatenate([state, applied, offset, state])
+    )
     terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)
     if (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
-        return
+        return missing
     remedy = "leave out offset if the model is one of deviations from the operating point"
     rest = np.eye(len(A)) - A
     if np.linalg.cond(rest) < 1e9:
@@ -293,11 +321,11 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     A, B = as_setting(fields.get("A")), as_setting(fields.get("B"))
     if A is None or B is None or A.ndim != 2 or B.ndim != 2 or len(A) != A.shape[1] or len(B) != len(A) or not B.size:
         return fields | {"box": 1.0, "input_ends": (-1.0, 1.0)}  # A or B is wrong
-    (n, m), limits = B.shape, published
+    (n, m), limits, residual = B.shape, published, np.zeros(len(A))
     state = as_operating_point(fields.get("operating_state"), n, "operating_state")
     applied = as_operating_point(fields.get("operating_input"), m, "operating_input")
     if limits["offset"] is not None:
-        _require_equilibrium(A, B, as_vector(limits["offset"], n, "offset"), state, applied)
+        residual = _residual_of_equilibrium(A, B, as_vector(limits["offset"], n, "offset"), state, applied)
     if limits["u_max"] is not None:
         if limits["input_limits"] is not None:
             raise ValueError("u_max follows from input_limits: give these alone")
@@ -312,7 +340,7 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
             )
         fields["input_ends"] = np.stack(ends)
     ends = as_setting(fields.get("box_ends"))
-    if ends is not None and (np.abs(ends) == 1.0).all():
+    if ends is not None and ends.ndim == 2 and len(ends) == 2 and (ends == [[-1.0], [1.0]]).all():
         del fields["box_ends"]  # symmetric ones need not be told: another box may have another number of rows
     given = []
     if limits["state_limits"] is not None:
@@ -332,6 +360,11 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
             )
         fields |= {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
     bound = fields.get("disturbance_bound")
+    if residual.any():
+        declared = np.zeros(n) if bound is None else bound
+        fields["disturbance_bound"] = _with_residual(
+            as_bound(declared, n, "disturbance_bound"), residual, as_box_rows(fields["box"], n)
+        )
     first = as_setting(bound[0]) if isinstance(bound, (tuple, list)) and len(bound) == 3 else None
     if first is not None and first.ndim == 2:
         fields |= _around_middle_of_disturbance(A, B, bound, fields, (state, applied))
@@ -359,6 +392,11 @@ def _around_middle_of_disturbance(
     declared = as_bound((E, half), n, name)
     if not middle.any():
         return {name: declared}
+    if fields.get("between_samples") not in (None, 1):
+        raise ValueError(
+            f"{name}: with between_samples its ends must be symmetric: how much of a disturbance's middle has come by a
+            " "time within a step is not known"
+        )
     rows = as_box_rows(fields["box"], n)
     ends = as_row_ends(fields.get("box_ends"), len(rows))
     inputs = as_input_ends(fields["input_ends"], m)
@@ -382,10 +420,13 @@ def _around_middle_of_disturbance(
             f"{name}: the middle of this disturbance moves the operating point to {shown((point[0] + x).tolist())} "
             f"with input {shown((point[1] + u).tolist())}, which is not strictly within the limits"
         )
-    lacking = np.diag(n * np.square(2.0 * np.abs(missing)))
-    weight = rows.T @ rows + np.eye(n) * np.trace(rows.T @ rows) / n
+    warn_caller(
+        f"deviations are counted from the state {shown((point[0] + x).tolist())} and the input " f"{shown((point[1] +
+        u).tolist())}, the plant's operating_state and operating_input now: there the middle of the " "disturbance
+        rests", MovedOperatingPointWarning,
+    )
     return {
-        name: Ellipsoid(outer_sum(declared.shape_matrix, lacking, weight)),
+        name: _with_residual(declared, missing, rows),
         "box": rows,
         "box_ends": ends,
         "input_ends": inputs,

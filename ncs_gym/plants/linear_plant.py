@@ -650,7 +650,9 @@ class LinearPlant(ReadOnlyArrays):
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
         if not self.is_symmetric:  # symmetric ones keep the fingerprint they always had
-            digest.update(self.box_ends.astype("<f8").tobytes() + self.input_ends[0].astype("<f8").tobytes())
+            for name in ("box_ends", "input_ends"):
+                array = getattr(self, name)
+                digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         if self.error_gain is not None:
             digest.update(self.error_gain.astype("<f8").tobytes())
         for name in ("disturbance_bound", "sensor_bound", "initial_bound", "operating_state", "operating_input"):

@@ -36,7 +36,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
     conditions = [flag("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)]
     if not fits:
         return conditions
-    if certificate.keeps_ellipsoid and (not plant.is_symmetric or certificate.resting_state.any()):
+    rests_at_zero = not (certificate.resting_state.any() or certificate.resting_input.any())
+    if certificate.keeps_ellipsoid and not (plant.is_symmetric and rests_at_zero):
         return [*conditions, flag("S: an ellipsoid is kept only around zero, within symmetric limits", False)]
     conditions += _multiplier_conditions(certificate)
     if all(condition.holds for condition in conditions):

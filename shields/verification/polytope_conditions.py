@@ -44,8 +44,8 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     if not fits:
         return
     leads = len(rows) >= len(box) and bool((rows[: len(box)] == box).all())
-    ends = (polytope.low[: len(box)], plant.box_low), (plant.box_high, polytope.high[: len(box)])
-    leads = leads and all(bool((least <= most).all()) for most, least in ends)
+    ends = polytope.low[: len(box)], polytope.high[: len(box)]
+    leads = leads and bool((np.stack(ends) == plant.box_ends).all())
     yield flag("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return

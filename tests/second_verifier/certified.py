@@ -34,7 +34,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield is_so("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)
     if not fits:
         return
-    if certificate.keeps_ellipsoid and not (plant.is_symmetric and not certificate.resting_state.any()):
+    at_rest = [*certificate.resting_state.tolist(), *certificate.resting_input.tolist()]
+    if certificate.keeps_ellipsoid and (any(at_rest) or not plant.is_symmetric):
         yield is_so("S: an ellipsoid is kept only around zero, within symmetric limits", False)
         return
     ranges = list(_range_conditions(certificate))

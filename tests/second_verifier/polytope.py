@@ -34,7 +34,8 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     if not fits:
         return
     leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box.ravel(), strict=True))
-    leads = leads and not (polytope.low[:k] < plant.box_low).any() and not (polytope.high[:k] > plant.box_high).any()
+    leads = leads and polytope.low[:k].tolist() == plant.box_low.tolist()
+    leads = leads and polytope.high[:k].tolist() == plant.box_high.tolist()
     yield is_so("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -12,7 +13,15 @@ import numpy as np
 import pytest
 
 from experiments.published.plants import channel_of, contract_of_plant, plant_of, published
-from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, Ellipsoid, LinearPlant, contract_of
+from ncs_gym import (
+    AdversarialDisturbance,
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    LinearPlant,
+    MovedOperatingPointWarning,
+    contract_of,
+)
 from shields import Certificate, CertificateError, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, verify
 from tests.certificates import certificate_of
 from tests.second_verifier.verify import verify_again
@@ -40,16 +49,18 @@ TANKS = LinearPlant.from_statespace(
     disturbance_bound=0.1,
     **QUIET,
 )
-HILL = LinearPlant.from_statespace(
-    ([[-0.01]], [[1.32]], [[1.0]], 0),
-    0.1,
-    state_limits=(0.0, 40.0),
-    input_limits=(0.0, 1.0),
-    operating_state=20.0,
-    operating_input=0.17,
-    disturbance_bound=([[1.0]], [-0.06], [0.0]),
-    **QUIET,
-)
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", MovedOperatingPointWarning)
+    HILL = LinearPlant.from_statespace(
+        ([[-0.01]], [[1.32]], [[1.0]], 0),
+        0.1,
+        state_limits=(0.0, 40.0),
+        input_limits=(0.0, 1.0),
+        operating_state=20.0,
+        operating_input=0.17,
+        disturbance_bound=([[1.0]], [-0.06], [0.0]),
+        **QUIET,
+    )
 PLANTS = {"angle": ANGLE, "tanks": TANKS, "hill": HILL}
 CHANNEL = Channel(loss=0.3, max_consecutive_losses=1, send_period=2)
 CONTRACT = contract_of(CHANNEL)
@@ -314,7 +325,8 @@ def test_bound_of_a_disturbance_with_two_ends_holds_all_of_it_in_rational_number
     E, low, high = np.array([[1.0, 0.3], [0.2, -0.5]]), np.array([-0.3, 0.0]), np.array([0.1, 0.2])
     model = {"A": [[0.9, 0.1], [0.0, 0.7]], "B": [[0.1], [0.4]], "dt": 1.0} | QUIET
     limits = {"state_limits": ([-5.0, -5.0], [6.0, 4.0]), "input_limits": (-3.0, 4.0)}
-    plant = LinearPlant(**model, **limits, disturbance_bound=(E, low, high))
+    with pytest.warns(MovedOperatingPointWarning):
+        plant = LinearPlant(**model, **limits, disturbance_bound=(E, low, high))
     x, u = plant.operating_state, plant.operating_input  # deviations of the new point from the old one, (0, 0)
     assert np.abs(x).max() > 0.01
     rows = [[Fraction(float(entry)) for entry in row] for row in np.hstack([plant.A, plant.B, E])]
@@ -419,3 +431,86 @@ def test_published_plant_keeps_its_limits_under_attack(name):
             )
             _, _, _, _, info = shield.step(ends.astype(np.float32))
             assert not (info["shield_guaranteed"] & (info["cost"] > 0.0)).any()
+
+
+def test_ellipsoid_is_not_kept_by_an_input_that_rests_elsewhere_even_where_that_moves_nothing():
+    """Of two inputs that do the same, opposite ones move nothing, and saturate the fallback."""
+    plant = LinearPlant(
+        A=[[1.02, 0.1], [0.0, 0.99]],
+        B=[[0.0, 0.0], [0.1, 0.1]],
+        dt=0.1,
+        box=1.0,
+        u_max=1.0,
+        disturbance_bound=0.001,
+        **QUIET,
+    )
+    found = certificate_of(plant, ChannelContract(max_age=1))
+    assert found.keeps_ellipsoid
+    for resting_input in ([5.0, -5.0], [1e-9, 0.0]):
+        forged = replace(found, resting_input=resting_input, polytope=None)
+        assert not verify(forged, plant).valid
+        assert not verify_again(forged, plant).valid
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
+    """A plan ends in the polytope if it passes the box's own ends in these rows: closer ones would not be tested."""
+    plant, P = PLANTS[name], certificate(name).polytope
+    for field, by in (("low", 1e-6), ("high", -1e-6)):
+        ends = moved(getattr(P, field), 0, by)
+        if not np.isfinite(ends[0]):
+            continue
+        forged = changed(certificate(name), **{field: ends})
+        assert "polytope: its first rows are those of the safe box" in broken(forged, plant)
+        assert not verify_again(forged, plant).valid
+
+
+def test_plants_that_differ_have_different_fingerprints_also_where_their_numbers_are_the_same():
+    """Three states, inputs and limits: two ends of rows and low ends of inputs are as many numbers as a gain has."""
+    model = {"A": 0.9 * np.eye(3), "B": np.eye(3), "dt": 1.0, "disturbance_bound": 0.01} | QUIET
+    ends = LinearPlant(**model, state_limits=(-1.6, 0.4), input_limits=(-0.2, 1.0))
+    numbers = np.concatenate([ends.box_ends.ravel(), ends.input_low]).reshape(3, 3)
+    gained = LinearPlant(**model, box=ends.box, u_max=ends.input_high, error_gain=numbers)
+    assert ends.fingerprint != gained.fingerprint
+
+
+def test_disturbance_with_two_ends_is_refused_where_the_box_counts_between_samples():
+    model = ([[-0.01]], [[1.0]], [[1.0]], 0)
+    with pytest.raises(ValueError, match="with between_samples its ends must be symmetric"):
+        LinearPlant.from_statespace(
+            model, 0.5, box=1.0, u_max=1.0, between_samples=8, disturbance_bound=([[1.0]], [0.0], [0.2]), **QUIET
+        )
+
+
+def test_operating_point_that_a_disturbance_moves_is_told():
+    with pytest.warns(MovedOperatingPointWarning, match=r"deviations are counted from the state \[.*\] and the input"):
+        LinearPlant(
+            A=[[0.9]], B=[[0.2]], dt=1.0, box=1.0, u_max=1.0, disturbance_bound=([[1.0]], [0.0], [0.02]), **QUIET
+        )
+
+
+def test_what_an_offset_lacks_of_an_equilibrium_by_rounding_is_in_the_bound():
+    state, A, B = 101325.0, 0.5, 0.25
+    offset = (1.0 - A) * state * (1.0 + 5e-13)
+    plant = LinearPlant(
+        A=[[A]],
+        B=[[B]],
+        dt=1.0,
+        state_limits=(state - 1e-3, state + 2e-3),
+        input_limits=(-1.0, 1.0),
+        operating_state=state,
+        offset=[offset],
+        disturbance_bound=0.0,
+        **QUIET,
+    )
+    residual = Fraction(A) * Fraction(state) + Fraction(offset) - Fraction(state)
+    assert residual > 1e-9
+    assert Fraction(float(plant.disturbance.shape_matrix[0, 0])) >= residual**2
+
+
+def test_ends_of_rows_that_are_swapped_are_refused():
+    for ends in (([1.0], [-1.0]), ([1.0], [1.0])):
+        with pytest.raises(ValueError, match="box_ends"):
+            LinearPlant(
+                A=[[0.9]], B=[[0.2]], dt=1.0, box=[[1.0]], u_max=1.0, box_ends=ends, disturbance_bound=0.1, **QUIET
+            )
