@@ -394,8 +394,8 @@ def _around_middle_of_disturbance(
         return {name: declared}
     if fields.get("between_samples") not in (None, 1):
         raise ValueError(
-            f"{name}: with between_samples its ends must be symmetric: how much of a disturbance's middle has come by a
-            " "time within a step is not known"
+            f"{name}: with between_samples its ends must be symmetric: how much of a disturbance's middle has come by "
+            "a time within a step is not known"
         )
     rows = as_box_rows(fields["box"], n)
     ends = as_row_ends(fields.get("box_ends"), len(rows))
@@ -421,9 +421,9 @@ def _around_middle_of_disturbance(
             f"with input {shown((point[1] + u).tolist())}, which is not strictly within the limits"
         )
     warn_caller(
-        f"deviations are counted from the state {shown((point[0] + x).tolist())} and the input " f"{shown((point[1] +
-        u).tolist())}, the plant's operating_state and operating_input now: there the middle of the " "disturbance
-        rests", MovedOperatingPointWarning,
+        f"deviations are counted from the state {shown((point[0] + x).tolist())} and the input "
+        f"{shown((point[1] + u).tolist())}, where the middle of the disturbance rests (plant.operating_state)",
+        MovedOperatingPointWarning,
     )
     return {
         name: _with_residual(declared, missing, rows),
