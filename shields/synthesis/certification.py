@@ -790,7 +790,8 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
         L: Shape of the set, (n, n).
         volume: Volume of the set in units of the largest ellipsoid in the safe box.
     """
-    sizes = ({} if math.isnan(volume) else {"volume_of_box_ellipsoid": volume}) | share_of_box(plant, L)
+    sizes = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
+    sizes = {name: size for name, size in sizes.items() if not (isinstance(size, float) and math.isnan(size))}
     description: dict[str, Any] = {
         name: float(exact.rounded(size, _SHOWN_DIGITS)) if isinstance(size, float) else size
         for name, size in sizes.items()

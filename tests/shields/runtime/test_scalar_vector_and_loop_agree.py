@@ -167,7 +167,8 @@ def test_scalar_shields_vector_shields_and_loops_agree(name, mode, reset):
     many = NCSVectorEnv(feature.count, plant=feature.plant, **settings)
     certificate = certificate_of(feature.plant, many.certificate_contract, feature.safe_set)
     seen = compare(many, 34, feature.options, certificate, mode, anew=(1, 7, 25))
-    doubts = {guarantee.NOT_KNOWN_INSIDE} if mode == "monitor" else set()  # nothing keeps the state in S
+    # Nothing keeps the state in S, and after an outage the error is too large for a while.
+    doubts = {guarantee.NOT_KNOWN_INSIDE, guarantee.LARGE_ERROR} if mode == "monitor" else set()
     assert set(feature.reasons) <= seen.reasons <= set(feature.reasons) | doubts
     assert seen.interventions > 0 or mode in ("monitor", "lookahead")
     assert seen.plans > 0 or mode != "lookahead"
