@@ -675,12 +675,14 @@ class LinearPlant(ReadOnlyArrays):
 
         Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
         """
-        values, (low, high) = self.box.dot(state), self._ends_of_columns if state.ndim > 1 else self.box_ends
+        values, (low, high) = self.box.dot(state), self._ends[state.ndim - 1]
         return np.maximum(values - high, low - values)
 
     @cached_property
-    def _ends_of_columns(self) -> np.ndarray:
-        return self.box_ends[:, :, None]
+    def _ends(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """The low and the high ends, shape (k,), and as columns, (k, 1)."""
+        low, high = read_only(self.box_low), read_only(self.box_high)
+        return (low, high), (low[:, None], high[:, None])
 
     @cached_property
     def _grid_values(self) -> between_samples.GridValues | None:
