@@ -159,7 +159,7 @@ def widths_of(
     if widths is not None or len(both) < len(rows[0]):
         return widths
     columns = to_float(both).T
-    picked = qr(columns / np.abs(columns).max(axis=1, keepdims=True).clip(1e-300), mode="r", pivoting=True)[1]
+    picked = qr(columns / np.abs(columns).max(axis=1, keepdims=True).clip(1e-300), mode="r", pivoting=True)[-1]
     return half_widths([both[j] for j in picked[: len(columns)]])
 
 
