@@ -9,7 +9,7 @@ first asked for.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ncs_gym.installation import require_own_packages
+from ncs_gym.installation import install_command, require_own_packages
 
 if TYPE_CHECKING:
     from agents.agent import Agent, pretrained
@@ -63,12 +63,25 @@ _MODULES = {
     "agent_file": ("AgentError", "pretrained_folder"),
     "training": ("TrainingResult", "train"),
 }
+# Packages of the extra `train` that modules here import.
+_OF_TRAINING = {"torch", "stable_baselines3"}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the module of a public name when the name is first asked for."""
+    """Imports the module of a public name when the name is first asked for.
+
+    Raises:
+        ModuleNotFoundError: If a package of the extra `train` is missing; it says what to type.
+    """
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require_own_packages("shields")
-    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    try:
+        module = import_module(f"{__name__}.{_MODULE_OF[name]}")
+    except ModuleNotFoundError as error:
+        if error.name not in _OF_TRAINING:
+            raise
+        needed = f"agents.{name} needs stable_baselines3 and torch, and {error.name} is not installed"
+        raise ModuleNotFoundError(f"{needed}: {install_command('train')}", name=error.name) from error
+    return getattr(module, name)

@@ -77,7 +77,9 @@ def test_commands_that_need_an_extra_say_so_in_one_sentence(binaries, tmp_path, 
 def test_training_adapter_says_what_is_missing(binaries, tmp_path):
     result = run(binaries / "python", "-c", "from agents import SB3VecEnv", cwd=tmp_path)
     assert result.returncode == 1
-    assert "stable_baselines3" in result.stderr.splitlines()[-1]
+    last = result.stderr.splitlines()[-1]
+    assert "agents.SB3VecEnv needs stable_baselines3 and torch" in last
+    assert "train" in last.partition("is not installed: ")[2]
 
 
 def test_declared_versions_are_those_tested():
