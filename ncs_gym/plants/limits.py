@@ -22,6 +22,8 @@ from ncs_gym.validation import (
     warn_caller,
 )
 
+# Arguments of the constructor of `LinearPlant` that become fields of other names.
+PUBLISHED = "state_limits", "input_limits", "output_limits", "u_max", "offset"
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
 NEARLY_SYMMETRIC = 1e-12
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
@@ -310,69 +312,92 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
         ValueError: If limits are wrong or given twice, or the operating point is no equilibrium of a model with
             `offset`.
     """
-    missing = [names for names in (("box", "state_limits", "output_limits"), ("u_max", "input_limits", "input_ends"))
-               if not any(arguments.get(name) is not None for name in names)]  # fmt: skip
-    if missing:
-        raise TypeError(f"LinearPlant needs limits: give {', and '.join(' or '.join(names[:2]) for names in missing)}")
-    fields = dict(arguments)
-    published = {
-        name: fields.pop(name, None) for name in ("u_max", "state_limits", "input_limits", "output_limits", "offset")
-    }
+    _require_limits(arguments)
+    given = {name: arguments.get(name) for name in PUBLISHED}
+    fields = {name: value for name, value in arguments.items() if name not in PUBLISHED}
     A, B = as_setting(fields.get("A")), as_setting(fields.get("B"))
     if A is None or B is None or A.ndim != 2 or B.ndim != 2 or len(A) != A.shape[1] or len(B) != len(A) or not B.size:
         return fields | {"box": 1.0, "input_ends": (-1.0, 1.0)}  # A or B is wrong
-    (n, m), limits, residual = B.shape, published, np.zeros(len(A))
+    n, m = B.shape
     state = as_operating_point(fields.get("operating_state"), n, "operating_state")
     applied = as_operating_point(fields.get("operating_input"), m, "operating_input")
-    if limits["offset"] is not None:
-        residual = _residual_of_equilibrium(A, B, as_vector(limits["offset"], n, "offset"), state, applied)
-    if limits["u_max"] is not None:
-        if limits["input_limits"] is not None:
-            raise ValueError("u_max follows from input_limits: give these alone")
-        u_max = as_input_limits(limits["u_max"], m)
-        fields["input_ends"] = np.stack([-u_max, u_max])
-    elif limits["input_limits"] is not None:
-        ends = _from_center(limits["input_limits"], applied, "input_limits")
-        if not np.isfinite(ends).all():
-            raise ValueError(
-                "input_limits must be finite, since actions from -1 to 1 stand for inputs from the low to the high "
-                f"end, got {shown(limits['input_limits'])}"
-            )
-        fields["input_ends"] = np.stack(ends)
-    ends = as_setting(fields.get("box_ends"))
-    if ends is not None and ends.ndim == 2 and len(ends) == 2 and (ends == [[-1.0], [1.0]]).all():
-        del fields["box_ends"]  # symmetric ones need not be told: another box may have another number of rows
-    given = []
-    if limits["state_limits"] is not None:
-        if fields.get("box") is not None:
-            raise ValueError("box follows from state_limits: give these alone")
-        given.append(_state_rows(limits["state_limits"], state))
-    if limits["output_limits"] is not None:
-        if fields.get("box") is not None:
-            rows = as_box_rows(fields["box"], n)
-            given.append(Rows(rows, *as_row_ends(fields.get("box_ends"), len(rows))))
-        given.append(_output_rows(limits["output_limits"], state))
-    if given:
-        rows = _joined(given)
-        if not len(rows.rows):
-            raise ValueError(
-                "state_limits and output_limits are all infinite: give at least one finite limit of a state"
-            )
-        fields |= {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
+    lacking = np.zeros(n)
+    if given["offset"] is not None:
+        lacking = _residual_of_equilibrium(A, B, as_vector(given["offset"], n, "offset"), state, applied)
+    fields |= _input_fields(given, applied)
+    fields = _row_fields(fields, given, state)
     bound = fields.get("disturbance_bound")
-    if residual.any():
-        declared = np.zeros(n) if bound is None else bound
-        fields["disturbance_bound"] = _with_residual(
-            as_bound(declared, n, "disturbance_bound"), residual, as_box_rows(fields["box"], n)
-        )
-    first = as_setting(bound[0]) if isinstance(bound, (tuple, list)) and len(bound) == 3 else None
-    if first is not None and first.ndim == 2:
-        fields |= _around_middle_of_disturbance(A, B, bound, fields, (state, applied))
+    if _is_between_ends(bound):
+        return fields | _around_middle_of_disturbance(A, B, bound, fields, (state, applied), lacking)
+    if lacking.any():
+        declared = as_bound(np.zeros(n) if bound is None else bound, n, "disturbance_bound")
+        fields["disturbance_bound"] = _with_residual(declared, lacking, as_box_rows(fields["box"], n))
     return fields
 
 
+def _require_limits(arguments: dict[str, Any]) -> None:
+    """Raises TypeError unless there are limits of states and of inputs."""
+    needed = ("box", "state_limits", "output_limits"), ("u_max", "input_limits", "input_ends")
+    missing = [names[:2] for names in needed if all(arguments.get(name) is None for name in names)]
+    if missing:
+        raise TypeError(f"LinearPlant needs limits: give {', and '.join(' or '.join(names) for names in missing)}")
+
+
+def _input_fields(given: dict[str, Any], center: np.ndarray) -> dict[str, Any]:
+    """Returns the ends of inputs in deviations from their operating point, shape (m,); nothing if they are a field."""
+    if given["u_max"] is not None:
+        if given["input_limits"] is not None:
+            raise ValueError("u_max follows from input_limits: give these alone")
+        u_max = as_input_limits(given["u_max"], len(center))
+        return {"input_ends": np.stack([-u_max, u_max])}
+    if given["input_limits"] is None:
+        return {}
+    ends = _from_center(given["input_limits"], center, "input_limits")
+    if not np.isfinite(ends).all():
+        raise ValueError(
+            "input_limits must be finite, since actions from -1 to 1 stand for inputs from the low to the high end, "
+            f"got {shown(given['input_limits'])}"
+        )
+    return {"input_ends": np.stack(ends)}
+
+
+def _row_fields(fields: dict[str, Any], given: dict[str, Any], center: np.ndarray) -> dict[str, Any]:
+    """Returns the fields with the rows of all limits of states, in deviations from the operating point, shape (n,)."""
+    ends = as_setting(fields.get("box_ends"))
+    if ends is not None and ends.ndim == 2 and len(ends) == 2 and (ends == [[-1.0], [1.0]]).all():
+        # Symmetric ones need not be told: another box may have another number of rows.
+        fields = {name: value for name, value in fields.items() if name != "box_ends"}
+    if given["state_limits"] is None and given["output_limits"] is None:
+        return fields
+    parts = []
+    if given["state_limits"] is not None:
+        if fields.get("box") is not None:
+            raise ValueError("box follows from state_limits: give these alone")
+        parts.append(_state_rows(given["state_limits"], center))
+    elif fields.get("box") is not None:
+        rows = as_box_rows(fields["box"], len(center))
+        parts.append(Rows(rows, *as_row_ends(fields.get("box_ends"), len(rows))))
+    if given["output_limits"] is not None:
+        parts.append(_output_rows(given["output_limits"], center))
+    rows = _joined(parts)
+    if not len(rows.rows):
+        raise ValueError("state_limits and output_limits are all infinite: give at least one finite limit of a state")
+    return fields | {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
+
+
+def _is_between_ends(bound: Any) -> bool:
+    """Returns whether a bound of disturbances is a triple (E, low, high)."""
+    first = as_setting(bound[0]) if isinstance(bound, (tuple, list)) and len(bound) == 3 else None
+    return first is not None and first.ndim == 2
+
+
 def _around_middle_of_disturbance(
-    A: np.ndarray, B: np.ndarray, bound: Any, fields: dict[str, Any], point: tuple[np.ndarray, np.ndarray]
+    A: np.ndarray,
+    B: np.ndarray,
+    bound: Any,
+    fields: dict[str, Any],
+    point: tuple[np.ndarray, np.ndarray],
+    lacking: np.ndarray,
 ) -> dict[str, Any]:
     """Returns the fields that change where a disturbance d = E w has two different ends, low <= w <= high.
 
@@ -391,7 +416,7 @@ def _around_middle_of_disturbance(
     half, middle = 0.5 * (high - low), 0.5 * (low + high)
     declared = as_bound((E, half), n, name)
     if not middle.any():
-        return {name: declared}
+        return {name: _with_residual(declared, lacking, as_box_rows(fields["box"], n))}
     if fields.get("between_samples") not in (None, 1):
         raise ValueError(
             f"{name}: with between_samples its ends must be symmetric: how much of a disturbance's middle has come by "
@@ -426,7 +451,7 @@ def _around_middle_of_disturbance(
         MovedOperatingPointWarning,
     )
     return {
-        name: _with_residual(declared, missing, rows),
+        name: _with_residual(declared, np.abs(missing) + np.abs(lacking), rows),
         "box": rows,
         "box_ends": ends,
         "input_ends": inputs,

@@ -77,8 +77,8 @@ _KINDS = {
     "sensor noise": ("the sensors measure without noise", "sensor_bound or measurement_noise_cov"),
     "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
 }
-# Arguments of the constructor about limits, of which `box` is a field, too.
-_LIMITS = "state_limits", "input_limits", "output_limits", "box", "u_max", "offset"
+# Arguments of the constructor about limits, in this order: those that are fields, too, need not be given.
+_LIMITS = "state_limits", "input_limits", "output_limits", "box", "u_max", "offset", "input_ends", "box_ends"
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
 # What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
@@ -112,12 +112,11 @@ def with_limits_as_published(kind: Kind) -> Kind:
             )
         construct(self, **limits.fields_of(arguments))
 
-    taken = dict(inspect.signature(construct).parameters)
-    published = {name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in _LIMITS}
-    first = {name: taken.pop(name) for name in ("self", "A", "B", "dt")}
-    taken = {name: taken[name].replace(default=None) if name in ("input_ends",) else taken[name] for name in taken}
-    taken.pop("box")
-    __init__.__signature__ = inspect.Signature([*(first | published | taken).values()])  # pyright: ignore
+    of_fields = dict(inspect.signature(construct).parameters)
+    first = {name: of_fields[name] for name in ("self", "A", "B", "dt")}
+    of_limits = {name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in _LIMITS}
+    others = {name: each for name, each in of_fields.items() if name not in of_limits}
+    __init__.__signature__ = inspect.Signature([*(first | of_limits | others).values()])  # pyright: ignore
     constructor.__init__ = __init__
     return kind
 
@@ -440,11 +439,10 @@ class LinearPlant(ReadOnlyArrays):
     def document(self) -> dict[str, Any]:
         """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
         content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
-        content["box_ends"] = limits.listed_ends(self.box_ends)
-        if self.is_symmetric:
+        if self.is_symmetric:  # in the short form
             del content["box_ends"], content["input_ends"]
-            content["u_max"] = _as_json(self.u_max)
-        return {"format": _FORMAT, "plant": content}
+            return {"format": _FORMAT, "plant": content | {"u_max": _as_json(self.u_max)}}
+        return {"format": _FORMAT, "plant": content | {"box_ends": limits.listed_ends(self.box_ends)}}
 
     @classmethod
     def read(cls, given: Mapping[str, Any] | str | os.PathLike[str]) -> Self:

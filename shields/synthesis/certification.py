@@ -175,7 +175,8 @@ def _around_resting_point(
         Infeasible: If none is found.
     """
     progress("resting point")
-    rest, known = farthest_from_limits(plant), [each for each in candidates if carried_over(each, plant, contract)]
+    known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
+    rest = farthest_from_limits(plant)
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     shapes = np.array([proof.Sigma for proof in _proofs(errors)])
     points = points_of_box(plant, _POINTS_OF_REST_LOG2)

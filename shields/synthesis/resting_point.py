@@ -122,7 +122,7 @@ def _generous_rows(plant: LinearPlant, rows: np.ndarray, u_max: np.ndarray) -> n
     K = lqr_gain(plant.A, plant.B, weight + 1e-9 * np.trace(weight) * np.eye(plant.n), np.diag(u_max**-2.0))
     reach = plant.half_widths
     if K is not None:
-        # States from which the regulator keeps all rows and inputs are within sum_j |(A+BK)^j| of what is seen of them.
+        # Of the states from which the undisturbed regulator keeps all rows and inputs, over these steps.
         seen, power, reached = np.vstack([rows, K / u_max[:, None]]), np.eye(plant.n), []
         for _ in range(_STEPS_OF_REACH):
             reached.append(seen @ power)

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
+from unittest import mock
 
 import cvxpy as cp
 import gymnasium as gym
@@ -22,7 +23,16 @@ from ncs_gym import (
     MovedOperatingPointWarning,
     contract_of,
 )
-from shields import Certificate, CertificateError, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, verify
+from shields import (
+    Certificate,
+    CertificateError,
+    SafeLoop,
+    SafetyFilter,
+    SafetyShield,
+    VectorSafetyShield,
+    synthesize,
+    verify,
+)
 from tests.certificates import certificate_of
 from tests.second_verifier.verify import verify_again
 from tests.verdicts import broken
@@ -514,3 +524,24 @@ def test_ends_of_rows_that_are_swapped_are_refused():
             LinearPlant(
                 A=[[0.9]], B=[[0.2]], dt=1.0, box=[[1.0]], u_max=1.0, box_ends=ends, disturbance_bound=0.1, **QUIET
             )
+
+
+def test_candidate_of_another_plant_is_carried_over_and_never_returned_as_it_is():
+    """A tighter problem's certificate belongs to its own plant; the result is always one of the plant asked for."""
+    tighter = replace(ANGLE, disturbance_bound=Ellipsoid(1.5 * ANGLE.disturbance_bound.shape_matrix))
+    candidate = certificate_of(tighter, CONTRACT, "polytope")
+    assert verify(candidate, tighter).valid
+    with mock.patch("shields.synthesis.certification._gains_around", return_value=()):
+        found = synthesize(ANGLE, contract=CONTRACT, candidates=[candidate])
+    assert found.fingerprint == ANGLE.fingerprint
+    assert verify(found, ANGLE).valid
+
+
+def test_offset_and_a_disturbance_with_two_ends_may_both_be_given():
+    limits = {"state_limits": (90.0, 120.0), "input_limits": (-4.0, 6.0), "operating_state": 100.0} | QUIET
+    settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "offset": [0.1 * 100.0]}
+    for low in (-0.1, -0.02):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MovedOperatingPointWarning)
+            plant = LinearPlant(**settings, **limits, disturbance_bound=([[1.0]], [low], [0.1]))
+        assert plant.disturbance.shape_matrix[0, 0] >= (0.5 * (0.1 - low)) ** 2
