@@ -21,7 +21,7 @@ from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
 from ncs_gym.plants.lqr import lqr_gain
-from shields.runtime.set_test import rows_between
+from shields.runtime.set_test import rows_within_step
 
 # Its types are not declared.
 _clarabel: Any = clarabel
@@ -163,7 +163,7 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
     moved[:n, :n] = plant.A
     pushed = np.vstack([plant.B, np.eye(plant.m)[: own.shape[1] - n]])
     loop, drive = moved + pushed @ own, pushed @ of_target
-    (k, grid), beyond = (len(plant.box_rows), rows_between(plant)), ((0, 0), (0, own.shape[1] - n))
+    (k, grid), beyond = (len(plant.box_rows), rows_within_step(plant)), ((0, 0), (0, own.shape[1] - n))
     between = np.pad(grid.state, beyond) + grid.input @ own
     limits = np.vstack([np.pad(plant.box_rows, beyond), between, own / plant.u_max[:, None]])
     direct = np.concatenate([np.zeros((k, 1)), grid.input @ of_target, of_target / plant.u_max[:, None]])
@@ -201,7 +201,7 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     plant, problem, steps = env.plant, regulator_problem(env, weights), PREDICTED_STEPS
     A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
     to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
-    beyond, grid = ((0, 0), (0, len(A) - plant.n)), rows_between(plant)
+    beyond, grid = ((0, 0), (0, len(A) - plant.n)), rows_within_step(plant)
     rows, between = np.pad(plant.box_rows, beyond), np.pad(grid.state, beyond)
     free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
     for k in range(steps):  # z_k = free z_0 + forced u

@@ -15,7 +15,7 @@ from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.set_test import certificate_test, rows_between
+from shields.runtime.set_test import certificate_test, rows_within_step
 from shields.verification import require_valid
 
 # Margins that filters and governors are given, of the safe set and the box, in percent.
@@ -134,7 +134,7 @@ class PredictiveFilter:
         self._all_limits[:-1, : self._limits.shape[1]] = self._limits * longer
         self._all_limits[-1, : len(self._end_limits)] = self._end_limits
         self._weighting = self._root if polytope is None else self._root[:0]
-        self._grid = rows_between(plant)
+        self._grid = rows_within_step(plant)
         times = len(self._grid.state) // len(plant.box_rows)
         self._between = np.tile(np.minimum(at_samples[:-1], at_samples[1:]), times)
 

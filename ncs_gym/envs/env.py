@@ -96,7 +96,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
     | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
     | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in halves of its range; positive is violated |
-    | `worst_constraint_values` | `(k,)` | - | the largest since the last step, also between samples if they count |
+    | `worst_constraint_values` | `(k + q,)` | - | the largest since the last step, and those of limits of x and u |
     | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
     | `packet_arrived` | bool | - | whether a packet arrived at this step |
@@ -237,6 +237,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         sets = self._error_set, self._initial_set
         self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
         self._observer = Observer(self._task, self.observation_space, self._observe, self._horizon)
+        self._worst_is_now = plant.between_samples is None and not len(plant.mixed_rows)
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set
         self._consistent = False
@@ -284,7 +285,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self.episodes += 1
         self._violations = 0.0
         self._consistent, self._over = True, False
-        values = self._plant.constraint_values(self._state)
+        values = self._plant.values_at_start(self._state)
         info = self._info(no_inputs(self._plant.m), values, arrived=False)
         if self.renderer is not None:
             self.renderer.begin(info, self._task_state)
@@ -433,7 +434,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         return self._observer.observation(self._known, self._task.observe(task_state))
 
     def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:
-        values = worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
+        values = worst if self._worst_is_now else self._plant.constraint_values(self._state)
         cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = Constraints(values, worst, cost, self._violations)

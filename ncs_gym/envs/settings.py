@@ -10,7 +10,7 @@ from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
-from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant, inputs_under_way, weight_of
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
@@ -52,13 +52,17 @@ def loop_contracts(
 def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:
     """Returns the ellipsoid that states start in, by default {x : |C x|^2 <= 0.1^2}; W bounds what C leaves free.
 
-    C are the rows of the largest symmetric box inside the plant's.
+    C are the rows of the largest symmetric box inside the plant's. States that are past inputs start at the operating
+    one.
 
     Raises:
         ValueError: If it is none, or of another dimension than the plant.
     """
     if initial_set is None:
-        return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.symmetric.weight))
+        shape = START_FRACTION**2 * np.linalg.inv(weight_of(plant.symmetric_box))
+        past = plant.n - inputs_under_way(plant)
+        shape[past:], shape[:, past:] = 0.0, 0.0
+        return Ellipsoid(shape)
     if expect(initial_set, Ellipsoid, "initial_set").dim != plant.n:
         raise ValueError(f"initial_set must have dimension {plant.n}, got {initial_set.dim}")
     return initial_set

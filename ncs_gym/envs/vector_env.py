@@ -137,7 +137,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             self._requests = Requests(self._channel, self._contract, input_delay, self.num_envs)
         self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
         self._state = np.zeros((self._plant.n, self.num_envs))
-        self._worst = self._plant.constraint_values(self._state)
+        self._worst = self._plant.values_at_start(self._state)
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
@@ -202,7 +202,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         for (_, each), sources in zip(links, read, strict=True):
             each.give(sources, np.flatnonzero(mask).tolist())
         self._begin(mask, starts)
-        self._worst = np.where(mask, self._plant.constraint_values(self._state), self._worst)
+        self._worst = np.where(mask, self._plant.values_at_start(self._state), self._worst)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
         self._draw(info, begins=mask, moved=False)
@@ -232,7 +232,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             self._begin(restarted, None)
             applied, committed = (np.where(restarted, 0.0, each) for each in (applied, committed))
             reward[restarted], arrived[restarted] = 0.0, False
-            self._worst[:, restarted] = self._plant.constraint_values(self._state[:, restarted])
+            self._worst[:, restarted] = self._plant.values_at_start(self._state[:, restarted])
             inputs = Inputs(applied, committed, missing & ~restarted)
         info = self._info(inputs, arrived, None)
         terminated, truncated = self._ends(info["cost"], restarted)
@@ -424,7 +424,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
         plant = self._plant
-        values = self._worst.copy() if plant.between_samples is None else plant.constraint_values(self._state)
+        is_now = plant.between_samples is None and not len(plant.mixed_rows)
+        values = self._worst.copy() if is_now else plant.constraint_values(self._state)
         cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
         estimates, numbers = self._predicted_estimates()
@@ -454,7 +455,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
-        self._worst = self._plant.constraint_values(self._state)
+        self._worst = self._plant.values_at_start(self._state)
         fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
         self._known = self._known._replace(applied=frozen(next(inputs)), committed=frozen(next(inputs)))

@@ -23,7 +23,7 @@ from ncs_gym.validation import (
 )
 
 # Arguments of the constructor of `LinearPlant` that become fields of other names.
-PUBLISHED = "state_limits", "input_limits", "output_limits", "u_max", "offset"
+PUBLISHED = "state_limits", "input_limits", "output_limits", "mixed_limits", "u_max", "offset"
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
 NEARLY_SYMMETRIC = 1e-12
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
@@ -144,10 +144,11 @@ class MovedOperatingPointWarning(UserWarning):
 
 
 class Rows(NamedTuple):
-    """Limits low <= c_j x <= high, with rows in units of half their range.
+    """Limits low <= c_j x <= high, or of states and inputs low <= c_j (x, u) <= high, in units of half their range.
 
     Attributes:
-        rows: c, shape (k, n): half the range of a row is 1; where an end is infinite, the other one is -1 or 1.
+        rows: c, shape (k, n) or (k, n + m): half the range of a row is 1; where an end is infinite, the other one is -1
+            or 1.
         low, high: Their ends, shape (k,); infinite where there is none.
     """
 
@@ -189,6 +190,32 @@ def _output_rows(outputs: Any, center: np.ndarray) -> Rows:
     return _joined(found)
 
 
+def _mixed_rows(given: Any, state: np.ndarray, applied: np.ndarray) -> Rows:
+    """Returns the rows on (x, u) of mixed_limits, a list of (state row, input row, low, high) with absolute ends."""
+    n, m = len(state), len(applied)
+    form = f"mixed_limits must be a list of (state row of shape ({n},), input row of shape ({m},), low, high)"
+    if not isinstance(given, (list, tuple)) or not all(
+        isinstance(each, (list, tuple)) and len(each) == 4 for each in given
+    ):
+        raise ValueError(f"{form}, got {shown(given)}")
+    found = [Rows(np.empty((0, n + m)), np.empty(0), np.empty(0))]
+    for of_state, of_input, low, high in given:
+        row = np.concatenate(
+            [
+                as_point(of_state, n, "the state row of a limit in mixed_limits"),
+                as_point(of_input, m, "the input row of a limit in mixed_limits"),
+            ]
+        )
+        if np.abs(row[n:]).max() < SMALLEST_NUMBER:
+            raise ValueError(
+                f"every limit in mixed_limits must be about an input, got {shown(row.tolist())}: output_limits are "
+                "those of states alone"
+            )
+        ends = _from_center((low, high), np.array([row @ np.concatenate([state, applied])]), "the ends in mixed_limits")
+        found.append(_in_units_of_range(row[None], *ends))
+    return _joined(found)
+
+
 def _joined(parts: Sequence[Rows]) -> Rows:
     return Rows(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
@@ -217,6 +244,20 @@ def as_row_ends(value: Any, rows: int, name: str = "box_ends", *, around_zero: b
     return np.stack([low, high])
 
 
+def as_mixed_rows(value: Any, size: int) -> np.ndarray:
+    """Returns the rows of limits of states and inputs together, shape (q, size); of shape (0, size) for None or [].
+
+    Raises:
+        ValueError: If they are no such rows.
+    """
+    numbers = np.empty(0) if value is None else as_setting(value)
+    return (
+        np.empty((0, size))
+        if numbers is not None and not numbers.size
+        else as_matrix(value, (None, size), "mixed_rows")
+    )
+
+
 def listed_ends(ends: np.ndarray) -> list[Any]:
     """Returns ends of any shape as nested lists for a file, in which None stands for an infinite one."""
     if ends.ndim > 1:
@@ -229,8 +270,8 @@ def _with_infinity(ends: Any, infinity: float) -> Any:
     return [infinity if each is None else each for each in ends] if isinstance(ends, list) else ends
 
 
-def as_input_limits(value: Any, size: int) -> np.ndarray:
-    """Returns u_max as a positive finite array of shape (size,).
+def as_input_limits(value: Any, size: int, name: str = "u_max") -> np.ndarray:
+    """Returns u_max, or what else limits inputs alike, as a positive finite array of shape (size,).
 
     Raises:
         ValueError: If it is anything else.
@@ -241,9 +282,9 @@ def as_input_limits(value: Any, size: int) -> np.ndarray:
         or limits.shape not in ((), (size,))
         or not ((limits >= SMALLEST_NUMBER) & (limits < LARGEST_NUMBER)).all()
     ):
+        hint = "; limits that are not symmetric are given by LinearPlant(input_limits=(low, high), ...)"
         raise ValueError(
-            f"u_max must be a positive number or shape ({size},), got {shown(value)}; limits that are not symmetric "
-            "are given by LinearPlant(input_limits=(low, high), ...)"
+            f"{name} must be a positive number or shape ({size},), got {shown(value)}{hint * (name == 'u_max')}"
         )
     return np.broadcast_to(limits, (size,)).copy()
 
@@ -326,6 +367,7 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
         lacking = _residual_of_equilibrium(A, B, as_vector(given["offset"], n, "offset"), state, applied)
     fields |= _input_fields(given, applied)
     fields = _row_fields(fields, given, state)
+    fields = _mixed_fields(fields, given["mixed_limits"], state, applied)
     bound = fields.get("disturbance_bound")
     if _is_between_ends(bound):
         return fields | _around_middle_of_disturbance(A, B, bound, fields, (state, applied), lacking)
@@ -385,6 +427,17 @@ def _row_fields(fields: dict[str, Any], given: dict[str, Any], center: np.ndarra
     return fields | {"box": rows.rows, "box_ends": np.stack([rows.low, rows.high])}
 
 
+def _mixed_fields(fields: dict[str, Any], given: Any, state: np.ndarray, applied: np.ndarray) -> dict[str, Any]:
+    """Returns the fields with the rows on (x, u) of mixed_limits beside those that they have."""
+    if given is None:
+        return fields
+    added = _mixed_rows(given, state, applied)
+    if fields.get("mixed_rows") is not None:
+        rows = as_mixed_rows(fields["mixed_rows"], len(state) + len(applied))
+        added = _joined([Rows(rows, *as_row_ends(fields.get("mixed_ends"), len(rows), "mixed_ends")), added])
+    return fields | {"mixed_rows": added.rows, "mixed_ends": np.stack([added.low, added.high])}
+
+
 def _is_between_ends(bound: Any) -> bool:
     """Returns whether a bound of disturbances is a triple (E, low, high)."""
     first = as_setting(bound[0]) if isinstance(bound, (tuple, list)) and len(bound) == 3 else None
@@ -440,7 +493,12 @@ def _around_middle_of_disturbance(
             "per step, whatever the input: give symmetric ends around zero"
         )
     ends, inputs = ends - rows @ x, inputs - u[None]
-    if not ((ends[0] < 0.0) & (ends[1] > 0.0)).all() or not ((inputs[0] < 0.0) & (inputs[1] > 0.0)).all():
+    mixed = {}
+    if fields.get("mixed_rows") is not None:
+        coupled = as_mixed_rows(fields["mixed_rows"], n + m)
+        mixed = {"mixed_ends": as_row_ends(fields.get("mixed_ends"), len(coupled), "mixed_ends")}
+        mixed["mixed_ends"] = mixed["mixed_ends"] - coupled @ np.concatenate([x, u])
+    if not all(((each[0] < 0.0) & (each[1] > 0.0)).all() for each in (ends, inputs, *mixed.values())):
         raise ValueError(
             f"{name}: the middle of this disturbance moves the operating point to {shown((point[0] + x).tolist())} "
             f"with input {shown((point[1] + u).tolist())}, which is not strictly within the limits"
@@ -457,4 +515,4 @@ def _around_middle_of_disturbance(
         "input_ends": inputs,
         "operating_state": point[0] + x,
         "operating_input": point[1] + u,
-    }
+    } | mixed

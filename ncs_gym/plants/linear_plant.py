@@ -78,7 +78,10 @@ _KINDS = {
     "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
 }
 # Arguments of the constructor about limits, in this order: those that are fields, too, need not be given.
-_LIMITS = "state_limits", "input_limits", "output_limits", "box", "u_max", "offset", "input_ends", "box_ends"
+_LIMITS = (
+    *("state_limits", "input_limits", "output_limits", "mixed_limits", "box", "u_max", "offset"),
+    *("input_ends", "box_ends", "mixed_rows", "mixed_ends"),
+)
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
 # What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
@@ -144,6 +147,9 @@ class LinearPlant(ReadOnlyArrays):
         input_limits: Pair (low, high) around `operating_input`, each a number or shape (m,). `u_max`, a positive number
             or shape (m,), is the short form of |u_i| <= u_max_i.
         output_limits: Further limits, a list of (row, low, high) with low <= row x <= high.
+        mixed_limits: Limits of states and inputs together, of outputs with feedthrough and of coupled inputs, a list of
+            (state row, input row, low, high) with low <= state row x + input row u <= high for the x at the beginning
+            of a step and the u that is held then. Limits of how fast an input changes: `with_rate_limits`.
         offset: c of a model in absolute coordinates, shape (n,).
 
     Attributes:
@@ -154,6 +160,9 @@ class LinearPlant(ReadOnlyArrays):
         box_ends: The low and the high ends of c_j x, shape (2, k); -1 and 1 where limits are symmetric, infinite where
             there is none.
         input_ends: The low and the high ends of the inputs, shape (2, m).
+        mixed_rows: Rows of limits on (x, u) at the beginning of a step, shape (q, n + m), in units as those of `box`;
+            q = 0 for none.
+        mixed_ends: Their low and high ends, shape (2, q).
         dt: Duration of a step [s].
         gamma: Squared radius of the unknown disturbance, d'd <= gamma.
         H: Output matrix, shape (p, n); the identity by default.
@@ -193,6 +202,8 @@ class LinearPlant(ReadOnlyArrays):
     box: np.ndarray
     input_ends: np.ndarray
     box_ends: np.ndarray = FILLED_IN_LATER
+    mixed_rows: np.ndarray = FILLED_IN_LATER
+    mixed_ends: np.ndarray = FILLED_IN_LATER
     gamma: float = 0.0
     H: np.ndarray = FILLED_IN_LATER
     process_noise_cov: np.ndarray = FILLED_IN_LATER
@@ -224,11 +235,14 @@ class LinearPlant(ReadOnlyArrays):
             state_limits: tuple[ArrayLike, ArrayLike] | None = None,
             input_limits: tuple[ArrayLike, ArrayLike] | None = None,
             output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
+            mixed_limits: Sequence[tuple[ArrayLike, ArrayLike, float, float]] | None = None,
             box: ArrayLike | None = None,
             u_max: ArrayLike | None = None,
             offset: ArrayLike | None = None,
             input_ends: ArrayLike | None = None,
             box_ends: ArrayLike | None = None,
+            mixed_rows: ArrayLike | None = None,
+            mixed_ends: ArrayLike | None = None,
             gamma: float = 0.0,
             H: ArrayLike | None = None,
             process_noise_cov: ArrayLike | None = None,
@@ -261,6 +275,8 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(f"every row of H must measure something, got {shown(self.H.tolist())}")
         self._set("box_ends", limits.as_row_ends(self.box_ends, len(self.box)))
         self._set("input_ends", limits.as_input_ends(self.input_ends, self.m))
+        self._set("mixed_rows", limits.as_mixed_rows(self.mixed_rows, n + self.m))
+        self._set("mixed_ends", limits.as_row_ends(self.mixed_ends, len(self.mixed_rows), "mixed_ends"))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
         is_given = self._check_declared()
         if self.error_gain is not None:
@@ -328,7 +344,15 @@ class LinearPlant(ReadOnlyArrays):
 
     @classmethod
     @own_error_state
-    def from_statespace(cls, sys: Any, dt: float | None = None, *, input_delay: int = 0, **settings: Any) -> Self:
+    def from_statespace(
+        cls,
+        sys: Any,
+        dt: float | None = None,
+        *,
+        input_delay: int = 0,
+        du_max: ArrayLike | None = None,
+        **settings: Any,
+    ) -> Self:
         """Returns the plant of a state-space model; its C becomes H.
 
         Args:
@@ -337,15 +361,17 @@ class LinearPlant(ReadOnlyArrays):
             dt: Duration of a step [s], needed unless the model has one.
             input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
                 estimator knows; box, bounds and names are given for the model's own states.
+            du_max: Largest change of each input from one step to the next, as for `with_rate_limits`.
             settings: Other arguments of `LinearPlant` except A, B and H; limits at least.
 
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
-        if input_delay and settings.get("between_samples") not in (None, 1):
-            raise ValueError("between_samples is for plants without input_delay")
         plant = cls(**statespace.sampled_arguments(sys, dt, settings))
-        return plant if input_delay == 0 else plant._delayed(input_delay)
+        if input_delay:
+            delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
+            plant = plant._storing(delay, delay)
+        return plant if du_max is None else plant.with_rate_limits(du_max)
 
     @own_error_state
     def resampled(self, dt: float) -> LinearPlant:
@@ -386,41 +412,85 @@ class LinearPlant(ReadOnlyArrays):
             process_noise_cov=_symmetric_product(G, self.process_noise_cov),
         )
 
-    def _delayed(self, input_delay: int) -> Self:
-        """Returns the plant whose inputs take effect some steps later.
+    @own_error_state
+    def with_rate_limits(self, du_max: ArrayLike, *, per: str = "step") -> Self:
+        """Returns the plant with limits |u_k - u_{k-1}| <= du_max of how fast inputs change.
 
-        Its state is (x, u_{k-d}, .., u_{k-1}), the oldest input first. Disturbances and first errors are those of x
-        alone.
+        The input of the step before becomes a further state, which the estimator knows; where an input delay has made
+        it one already, no state is added. An episode begins with the operating input as the one before.
+
+        Args:
+            du_max: Largest change of each input, a positive number or shape (m,).
+            per: What it is a change per, "step" or "second".
+
+        Raises:
+            ValueError: If an argument is wrong, the box counts between samples, or the plant has an `initial_cov`.
         """
-        delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
+        if per not in ("step", "second"):
+            raise ValueError(f"per must be 'step' or 'second', got {shown(per)}")
+        change = limits.as_input_limits(du_max, self.m, "du_max") * (self.dt if per == "second" else 1.0)
+        plant = self if inputs_under_way(self) else self._storing(1, delay=0)
+        rows = np.concatenate([np.zeros((self.m, plant.n - self.m)), -np.eye(self.m), np.eye(self.m)], axis=1)
+        rates = limits.Rows(rows / change[:, None], *np.array([[-1.0], [1.0]]) * np.ones(self.m))
+        return replace(
+            plant,
+            mixed_rows=np.concatenate([plant.mixed_rows, rates.rows]),
+            mixed_ends=np.concatenate([plant.mixed_ends, [rates.low, rates.high]], axis=1),
+        )
+
+    def _storing(self, stored_inputs: int, delay: int) -> Self:
+        """Returns the plant with the last inputs as further states: x, u_{k-d}, .., u_{k-1}, the oldest input first.
+
+        Disturbances and first errors are those of x alone.
+
+        Args:
+            stored_inputs: Of how many steps.
+            delay: Steps after which an input takes effect: as many, and the oldest one acts; or 0.
+        """
         if np.any(self.initial_cov):
             raise ValueError(
-                "with input_delay the first error must be given by initial_bound: that of initial_cov is a ball in all "
-                "states, and inputs under way are known"
+                "with inputs as states the first error must be given by initial_bound: that of initial_cov is a ball "
+                "in all states, and past inputs are known"
             )
-        n, m, stored = self.n, self.m, self.m * delay
-        A = np.zeros((n + stored, n + stored))
-        A[:n, :n], A[:n, n : n + m] = self.A, self.B
-        A[n:-m, n + m :] = np.eye(stored - m)
+        if self.between_samples is not None:
+            raise ValueError("between_samples is for plants without input_delay and without limits of rates")
+        n, m, stored = self.n, self.m, self.m * stored_inputs
+        A, B = np.zeros((n + stored, n + stored)), np.zeros((n + stored, m))
+        A[:n, :n], A[n:-m, n + m :] = self.A, np.eye(stored - m)
+        if delay:
+            A[:n, n : n + m] = self.B
+        else:
+            B[:n] = self.B
+        B[-m:] = np.eye(m)
         box = np.zeros((len(self.box) + stored, n + stored))
         box[: len(self.box), :n] = self.box
-        box[len(self.box) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.input_half), delay))
-        ends = np.concatenate([self.box_ends, np.tile(self.input_ends / self.input_half, delay)], axis=1)
-        ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(delay, 0, -1)]
+        box[len(self.box) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.input_half), stored_inputs))
+        ends = np.concatenate([self.box_ends, np.tile(self.input_ends / self.input_half, stored_inputs)], axis=1)
+        # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
+        of_state, of_input = self.mixed_rows[:, :n], self.mixed_rows[:, n:]
+        others = np.zeros((len(of_state), stored if delay else stored + m))
+        others[:, : m if delay else None] = of_input if delay else np.pad(of_input, ((0, 0), (stored, 0)))
+        coupled, coupled_ends = np.concatenate([of_state, others], axis=1), self.mixed_ends
+        if delay:
+            box, ends = np.concatenate([box, coupled]), np.concatenate([ends, coupled_ends], axis=1)
+            coupled, coupled_ends = np.empty((0, n + stored + m)), np.empty((2, 0))
+        ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(stored_inputs, 0, -1)]
         disturbance = self.disturbance_bound
-        if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the inputs under way
+        if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the stored inputs
             ball = Ellipsoid(self.gamma * np.eye(n))
             disturbance = _ellipsoid_around_sum(self.relative_weight, ball, disturbance)
-        # The further states of a model move as they should: inputs under way keep their limits.
+        # The further states of a model move as they should: stored inputs keep their limits.
         remainder = self.remainder
         if remainder is not None:
             remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored))))
         return replace(
             self,
             A=A,
-            B=np.concatenate([np.zeros((n + stored - m, m)), np.eye(m)]),
+            B=B,
             box=box,
             box_ends=ends,
+            mixed_rows=coupled,
+            mixed_ends=coupled_ends,
             gamma=0.0,
             H=np.pad(self.H, ((0, 0), (0, stored))),
             process_noise_cov=np.pad(self.process_noise_cov, (0, stored)),
@@ -430,15 +500,19 @@ class LinearPlant(ReadOnlyArrays):
             remainder=remainder,
             continuous_model=None,
             error_gain=None if self.error_gain is None else np.pad(self.error_gain, ((0, 0), (0, stored))),
-            operating_state=np.concatenate([self.operating_state, np.tile(self.operating_input, delay)]),
+            operating_state=np.concatenate([self.operating_state, np.tile(self.operating_input, stored_inputs)]),
             state_names=[*self.state_names, *(f"{name} of {age}" for age in ages for name in self.input_names)],
-            state_units=[*self.state_units, *tuple(self.input_units) * delay],
+            state_units=[*self.state_units, *tuple(self.input_units) * stored_inputs],
         )
 
     @property
     def document(self) -> dict[str, Any]:
         """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
         content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
+        if not len(self.mixed_rows):
+            del content["mixed_rows"], content["mixed_ends"]
+        else:
+            content["mixed_ends"] = limits.listed_ends(self.mixed_ends)
         if self.is_symmetric:  # in the short form
             del content["box_ends"], content["input_ends"]
             return {"format": _FORMAT, "plant": content | {"u_max": _as_json(self.u_max)}}
@@ -542,9 +616,10 @@ class LinearPlant(ReadOnlyArrays):
 
     @cached_property
     def is_symmetric(self) -> bool:
-        """Whether limits are as far from the operating point on either side: |c_j x| <= 1 and |u_i| <= u_max_i."""
+        """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
         low, high = self.input_ends
-        return bool((np.abs(self.box_ends) == 1.0).all() and np.array_equal(-low, high))
+        symmetric = bool((np.abs(self.box_ends) == 1.0).all() and np.array_equal(-low, high))
+        return symmetric and not len(self.mixed_rows)
 
     @property
     def box_rows(self) -> np.ndarray:
@@ -567,6 +642,11 @@ class LinearPlant(ReadOnlyArrays):
         return self.input_high
 
     def _require_symmetric(self, instead: str) -> None:
+        if len(self.mixed_rows):
+            raise ValueError(
+                "this plant has limits of states and inputs together, and what was asked for takes only |c_j x| <= 1 "
+                f"and |u_i| <= u_max_i (a plant has {instead}, mixed_rows and mixed_ends)"
+            )
         if not self.is_symmetric:
             raise ValueError(
                 "the limits of this plant are not symmetric about its operating point, and what was asked for takes "
@@ -575,12 +655,22 @@ class LinearPlant(ReadOnlyArrays):
 
     @cached_property
     def symmetric(self) -> LinearPlant:
-        """The plant with the largest symmetric limits inside its own; itself if these are symmetric."""
+        """The plant with the largest symmetric limits inside its own; itself if these are symmetric.
+
+        Raises:
+            ValueError: If there are limits of states and inputs together.
+        """
         if self.is_symmetric:
             return self
-        nearest = np.minimum(-self.box_low, self.box_high)
-        box, u_max = self.box / nearest[:, None], np.minimum(-self.input_low, self.input_high)
-        return replace(self, box=box, box_ends=None, input_ends=(-u_max, u_max))
+        if len(self.mixed_rows):
+            self._require_symmetric("box_ends and input_ends")
+        u_max = np.minimum(-self.input_low, self.input_high)
+        return replace(self, box=self.symmetric_box, box_ends=None, input_ends=(-u_max, u_max))
+
+    @cached_property
+    def symmetric_box(self) -> np.ndarray:
+        """Rows c_j of the largest box |c_j x| <= 1 inside the safe box, shape (k, n)."""
+        return read_only(self.box / np.minimum(-self.box_low, self.box_high)[:, None])
 
     @cached_property
     def input_low(self) -> np.ndarray:
@@ -648,7 +738,7 @@ class LinearPlant(ReadOnlyArrays):
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
         if not self.is_symmetric:  # symmetric ones keep the fingerprint they always had
-            for name in ("box_ends", "input_ends"):
+            for name in ("box_ends", "input_ends", *(("mixed_rows", "mixed_ends") if len(self.mixed_rows) else ())):
                 array = getattr(self, name)
                 digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         if self.error_gain is not None:
@@ -682,6 +772,27 @@ class LinearPlant(ReadOnlyArrays):
         low, high = read_only(self.box_low), read_only(self.box_high)
         return (low, high), (low[:, None], high[:, None])
 
+    @again_if_interrupted
+    def mixed_values(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns how far the rows of `mixed_rows` are beyond the nearer end, in units of half their range.
+
+        Shape (q,) or (q, N), for states of shape (n,) or (n, N) and inputs of shape (m,) or (m, N).
+        """
+        values = self.mixed_rows[:, : self.n].dot(state) + self.mixed_rows[:, self.n :].dot(u)
+        low, high = self.mixed_ends if values.ndim == 1 else self.mixed_ends[:, :, None]
+        return np.maximum(values - high, low - values)
+
+    @again_if_interrupted
+    def values_at_start(self, state: np.ndarray) -> np.ndarray:
+        """Returns `worst_constraint_values` where no step has been: those of a state at which the operating input acts.
+
+        Shape (k + q,) or (k + q, N), for a state of shape (n,) or (n, N).
+        """
+        values = self.constraint_values(state)
+        if not len(self.mixed_rows):
+            return values
+        return np.concatenate([values, self.mixed_values(state, np.zeros((self.m, *state.shape[1:])))])
+
     @cached_property
     def _grid_values(self) -> between_samples.GridValues | None:
         rows = self.grid_rows
@@ -689,10 +800,10 @@ class LinearPlant(ReadOnlyArrays):
 
     @again_if_interrupted
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
-        """Returns the largest |c_j x| - 1 of a step after its beginning, shape (k,) or (k, N).
+        """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
 
-        With `between_samples` at these times of the step, what moved x+ away from A x + B u in proportion to the time;
-        else at its end alone.
+        Shape (k + q,) or (k + q, N). With `between_samples` at these times of the step, what moved x+ away from A x + B
+        u in proportion to the time; else at its end alone.
 
         Args:
             state: x at the beginning, shape (n,) or (n, N).
@@ -700,7 +811,8 @@ class LinearPlant(ReadOnlyArrays):
             x_next: x+, of the shape of x.
         """
         values, grid = self.constraint_values(x_next), self._grid_values
-        return values if grid is None else grid.worst(state, u, x_next, values)
+        values = values if grid is None else grid.worst(state, u, x_next, values)
+        return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
 
     def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns a physical state, input or output as its deviation from the operating point.
@@ -734,9 +846,7 @@ class LinearPlant(ReadOnlyArrays):
     @cached_property
     def weight(self) -> np.ndarray:
         """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
-        gram = exact.product(self.box.T, self.box)
-        squares = np.diag(gram)
-        return read_only(gram + 1e-6 * np.diag(squares + exact.total(squares) / self.n * (squares == 0.0)))
+        return read_only(weight_of(self.box))
 
     @cached_property
     def _box_shape(self) -> np.ndarray:
@@ -903,16 +1013,27 @@ def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:
     return None if bound is None else Ellipsoid(np.pad(bound.shape_matrix, (0, zeros)))
 
 
-def inputs_under_way(plant: LinearPlant) -> int:
-    """Returns how many of the last states are inputs under way, as those of an `input_delay` are; 0 of most plants.
+def weight_of(rows: np.ndarray) -> np.ndarray:
+    """Returns positive definite W, shape (n, n), of rows c_j, (k, n): C'C, regularized."""
+    gram = exact.product(rows.T, rows)
+    squares = np.diag(gram)
+    return gram + 1e-6 * np.diag(squares + exact.total(squares) / len(gram) * (squares == 0.0))
 
-    These are states (u_{k-d}, .., u_{k-1}) of a plant that the input itself reaches only as the newest of them.
+
+def inputs_under_way(plant: LinearPlant) -> int:
+    """Returns how many of the last states are past inputs, of an `input_delay` or limits of rates; 0 of most plants.
+
+    These are states (u_{k-d}, .., u_{k-1}), of which the input is the newest one in the next step.
     """
     n, m = plant.n, plant.m
-    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B, np.eye(n)[:, -m:]):
+    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B[-m:], np.eye(m)):
         return 0
     stored = m
-    while stored + m < n and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m]):
+    while (
+        stored + m < n
+        and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m])
+        and not plant.B[-stored - m : -stored].any()
+    ):
         stored += m
     return stored
 
@@ -942,10 +1063,11 @@ def _describe(plant: LinearPlant) -> str:
         "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *_outputs(plant)),
         "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix)), plant.state_names, plant.state_units),
     }
+    own = plant.n - inputs_under_way(plant)  # rows of past inputs alone limit nothing: inputs have limits
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [row_limit(plant, j) for j in range(len(plant.box))],
+        "safe box": [row_limit(plant, j) for j in range(len(plant.box)) if plant.box[j, :own].any()],
         "input limits": [
             _between(name, low, high, center, unit)
             for name, low, high, center, unit in zip(
@@ -958,6 +1080,8 @@ def _describe(plant: LinearPlant) -> str:
             )
         ],
     }
+    if len(plant.mixed_rows):
+        lines["both together"] = [mixed_limit(plant, j) for j in range(len(plant.mixed_rows))]
     if plant.between_samples is not None:
         lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
     for title, (sizes_of, names, units) in extents.items():
@@ -1023,9 +1147,29 @@ def row_limit(plant: LinearPlant, j: int) -> str:
     if low == -high:
         terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
         return f"|{terms.removeprefix('+')}| <= 1"
-    size, center = float(np.abs(row).max()), float(row @ plant.operating_state)  # in units of its largest entry
-    terms = " ".join(f"{row[i] / size:+.4g} {plant.state_names[i]}" for i in limited)
-    return _between(terms.removeprefix("+"), low / size, high / size, center / size, "")
+    return _sum_between(row, low, high, plant.operating_state, plant.state_names)
+
+
+def mixed_limit(plant: LinearPlant, j: int) -> str:
+    """Returns what row j of the limits of states and inputs together limits."""
+    low, high = plant.mixed_ends[:, j].tolist()
+    row, center = np.roll(plant.mixed_rows[j], plant.m), np.concatenate([plant.operating_input, plant.operating_state])
+    return _sum_between(row, low, high, center, [*plant.input_names, *plant.state_names])
+
+
+def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, names: Sequence[str]) -> str:
+    """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units."""
+    size = float(np.abs(row).max())  # in units of its largest entry
+    terms = "".join(
+        f" {'-' if row[i] < 0.0 else '+'} {_factor(abs(float(row[i])) / size)}{names[i]}"
+        for i in np.flatnonzero(row).tolist()
+    )
+    terms = terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}"
+    return _between(terms, low / size, high / size, float(row @ center) / size, "")
+
+
+def _factor(size: float) -> str:
+    return "" if size == 1.0 else f"{size:.4g} "
 
 
 def _deviation(plant: LinearPlant, i: int) -> str:

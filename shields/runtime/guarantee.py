@@ -103,7 +103,7 @@ class GuaranteeMonitor:
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
         plant, certificate = safety_filter.plant, safety_filter.certificate
         self._input_delay = 0 if downlink is None else downlink.input_delay
-        self._on_grid = plant.grid_rows is not None
+        self._within_step = plant.grid_rows is not None or len(plant.mixed_rows) > 0
         self._is_promised = downlink is None or downlink.contract is not None
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
@@ -126,7 +126,7 @@ class GuaranteeMonitor:
         """
         broken = _first(unmoved * 0, _not(unmoved), OTHER_STEPS)
         state = self._observe(self._within_limits(broken, report), known_inside, report, 0)
-        return state if is_first else state._replace(wait=steps_until_proved(state.wait, not self._on_grid, 0))
+        return state if is_first else state._replace(wait=steps_until_proved(state.wait, not self._within_step, 0))
 
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
@@ -138,7 +138,7 @@ class GuaranteeMonitor:
         for ahead, (inside, report) in enumerate(earlier):
             seen = self._observe(self._within_limits(broken, report), inside, report, 0)
             broken = seen.broken
-            if self._on_grid:  # what is not proved of x_j is not of the way to x_{j+1}
+            if self._within_step:  # what is not proved of x_j is not of the way to x_{j+1}
                 wait = steps_until_proved(wait, inside & seen.inside, ahead + 1)
             else:
                 wait = steps_until_proved(wait, seen.inside, ahead)
@@ -175,7 +175,7 @@ class GuaranteeMonitor:
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
         # A passed test proves the times on the grid and the next state; the first one needs x itself in the box.
-        on_the_way = inside & state.inside if self._on_grid else True
+        on_the_way = inside & state.inside if self._within_step else True
         return self._observe(broken, inside, report, state.wait, on_the_way)
 
     def reasons(self, state: MonitorState, age: Any = 0) -> Any:
@@ -188,7 +188,7 @@ class GuaranteeMonitor:
             reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
         if state.inside is not True:
             reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
-        if self._input_delay or self._on_grid:
+        if self._input_delay or self._within_step:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         if state.certified is True or _all(state.certified):
             return reason
@@ -221,7 +221,7 @@ class GuaranteeMonitor:
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
-        if self._input_delay or self._on_grid:
+        if self._input_delay or self._within_step:
             wait = steps_until_proved(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
         return MonitorState(broken, inside, errors.certified, wait)
 

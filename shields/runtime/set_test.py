@@ -1,7 +1,7 @@
 """The test of an input: whether everything that one step can reach with it lies in the set that a certificate keeps.
 
-A set is rows with two ends, a cone, or both: an ellipsoid has no rows, a polytope no cone, and where the box counts
-between samples, too, its rows at the times of a grid stand below (docs/shield_proof.md).
+A set is rows with two ends, a cone, or both: an ellipsoid has no rows, a polytope no cone, and limits within a step
+stand below: of states and inputs together, and of the box at the times of a grid (docs/shield_proof.md).
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ class SetTest:
 
           low + reach <= g c <= high - reach,    reach = sqrt(g A Sigma_k A' g') + sqrt(g D g'),
 
-      which is exact for what is known: the supports of errors and disturbances add up. Where the box counts between
-      samples, too, its rows on x_hat and u at these times (`rows_between`) follow, for either set.
+      which is exact for what is known: the supports of errors and disturbances add up. The rows on x_hat and u of
+      limits within a step (`rows_within_step`) follow, for either set.
 
     Radius and row limits are reduced, and Sigma_pred enlarged, by a bound on the rounding of all products and of
     simulating the step; where a set has both, by the larger of their bounds.
 
     Args:
-        plant: Gives A, B, D, the limits and the rows between samples.
+        plant: Gives A, B, D, the limits and the rows within a step.
         cone: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n); (0, n) for P.
         rows: Those of P, shape (r, n); (0, n) for S.
         low, high: Their ends, shape (r,).
@@ -76,12 +76,12 @@ class SetTest:
     Attributes:
         cone: k, the number of rows at the top of the arrays below that are coordinates of the cone.
         root: Of the cone and of P, shape (k + r, n).
-        state_rows, input_rows: These times A and B, and then the rows between samples, shapes (.., n) and (.., m).
+        state_rows, input_rows: These times A and B, and then the rows within a step, shapes (.., n) and (.., m).
         joint: Both beside each other, without the cone.
-        middle, half: Of the ends of the rows, those between samples included: low <= v <= high is |v - middle| <= half,
+        middle, half: Of the ends of the rows, those within a step included: low <= v <= high is |v - middle| <= half,
             which is as fast as one end. The half is less by the rounding of both.
         D: G D G' of the cone with the rounding of computing it, shape (k, k).
-        disturbed: sqrt(g D g') of the rows with the rounding of computing it, and what stands for it between samples.
+        disturbed: sqrt(g D g') of the rows with the rounding of computing it, and what stands for it within a step.
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, of rows their largest entries, shape (n,).
         pushed: Largest norm of |G| |B| |u| within the limits, or its largest entry.
@@ -95,24 +95,24 @@ class SetTest:
         self, plant: LinearPlant, cone: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray
     ) -> None:
         self.plant, self.cone, self.limits = plant, len(cone), plant.input_ends.T.tolist()
-        between, self.root = rows_between(plant), read_only(np.concatenate([cone, rows]))
-        self.state_rows = read_only(np.concatenate([self.root @ plant.A, between.state]))
-        self.input_rows = read_only(np.concatenate([self.root @ plant.B, between.input]))
+        within, self.root = rows_within_step(plant), read_only(np.concatenate([cone, rows]))
+        self.state_rows = read_only(np.concatenate([self.root @ plant.A, within.state]))
+        self.input_rows = read_only(np.concatenate([self.root @ plant.B, within.input]))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
-        low, high = closed(np.concatenate([low, between.low]), np.concatenate([high, between.high]))
+        low, high = closed(np.concatenate([low, within.low]), np.concatenate([high, within.high]))
         self.middle = read_only(0.5 * (low + high))
         self.half = read_only(0.5 * (high - low) - self.rounding * np.abs(self.middle))
         self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
         size = np.abs(self.root)
-        sizes = np.concatenate([size @ np.abs(plant.A), np.abs(between.state)])
-        pushes = np.concatenate([size @ np.abs(plant.B), np.abs(between.input)])
+        sizes = np.concatenate([size @ np.abs(plant.A), np.abs(within.state)])
+        pushes = np.concatenate([size @ np.abs(plant.B), np.abs(within.input)])
         self.columns, self.own_columns = read_only(self._norms(sizes)), read_only(self._norms(size))
         self.pushed, self.shift = self._largest(pushes), self._largest(np.abs(self.input_rows))
         D = plant.disturbance.shape_matrix
         rounding = self.rounding * float(self.own_columns @ np.sqrt(np.diag(D))) ** 2
         spread = cone @ D @ cone.T + rounding * np.eye(self.cone)
         self.D = read_only(0.5 * (spread + spread.T))
-        self.disturbed = read_only(np.concatenate([supports(rows, D, rounding), between.disturbed]))
+        self.disturbed = read_only(np.concatenate([supports(rows, D, rounding), within.disturbed]))
 
     def _norms(self, sizes: np.ndarray) -> np.ndarray:
         """Returns the norms of the columns in the cone, or their largest entries in the rows if they are larger."""
@@ -236,10 +236,10 @@ class SetTest:
         return left >= margin + self.rounding * self.own_columns.dot(np.abs(estimates))
 
     @own_error_state
-    def keeps_between(
+    def keeps_within_step(
         self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
     ) -> bool:
-        """Returns whether the box is kept between this sample and the next, if that counts, with input u or none."""
+        """Returns whether the limits within this step are kept with input u or none."""
         first = len(self.root)
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.state_rows[first:].dot(estimate)
@@ -475,11 +475,11 @@ def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
     return np.sqrt(np.maximum(squares, 0.0) + rounding)
 
 
-class RowsBetween(NamedTuple):
-    """The box at the times tau_i, i = 1..N-1: low <= row (A_tau x + B_tau u) + disturbance <= high.
+class RowsWithinStep(NamedTuple):
+    """Limits within a step: low <= state x + input u + disturbance <= high, of x at its beginning.
 
-    Rows are those of the box, divided by what eta leaves of half their range; no rows for a plant that counts at
-    samples alone.
+    First the rows of the box at the times tau_i, i = 1..N-1, divided by what eta leaves of half their range, none for a
+    plant that counts at samples alone; then the limits of states and inputs together, which no disturbance reaches.
 
     Attributes:
         state: Rows on x_hat, shape (g, n).
@@ -506,29 +506,26 @@ class RowsBetween(NamedTuple):
 
 
 @own_error_state  # what is not finite passes no test
-def rows_between(plant: LinearPlant) -> RowsBetween:
-    """Returns the rows of a plant's box between two samples."""
-    rows, grid = plant.box, plant.grid_rows
-    if grid is None:
-        none = np.empty(0)
-        return RowsBetween(np.empty((0, plant.n)), np.empty((0, plant.m)), none, none, none, rows, *plant.box_ends)
-    D, rounding = plant.disturbance.shape_matrix, 8.0 * plant.n * float(np.finfo(float).eps)
-    left = (1.0 - grid.remainder) / _OUTWARD
-    rho = supports(rows, D, rounding * (np.abs(rows) @ np.sqrt(np.diag(D))) ** 2)
-    at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
-    count = len(grid.state) - 1
-    low, high = _shrunk(plant.box_ends, left)
-    low_at_samples, high_at_samples = _shrunk(plant.box_ends, at_samples)
-    return RowsBetween(
-        state=read_only((grid.state[1:] / left[:, None]).reshape(-1, plant.n)),
-        input=read_only((grid.input[1:] / left[:, None]).reshape(-1, plant.m)),
-        low=read_only(np.tile(low, count)),
-        high=read_only(np.tile(high, count)),
-        disturbed=read_only(np.tile(np.where(left > 0.0, rho / left, np.inf), count)),
-        at_samples=read_only(rows / at_samples[:, None]),
-        low_at_samples=read_only(low_at_samples),
-        high_at_samples=read_only(high_at_samples),
-    )
+def rows_within_step(plant: LinearPlant) -> RowsWithinStep:
+    """Returns the rows of a plant's limits within a step."""
+    rows, grid, n = plant.box, plant.grid_rows, plant.n
+    of_state, of_input, (low, high) = plant.mixed_rows[:, :n], plant.mixed_rows[:, n:], plant.mixed_ends
+    disturbed, at_samples, ends = np.zeros(len(low)), rows, (plant.box_low, plant.box_high)
+    if grid is not None:
+        D, rounding = plant.disturbance.shape_matrix, 8.0 * n * float(np.finfo(float).eps)
+        left = (1.0 - grid.remainder) / _OUTWARD
+        rho = supports(rows, D, rounding * (np.abs(rows) @ np.sqrt(np.diag(D))) ** 2)
+        left_at_samples = np.where(left > rho, left - rho, 0.0) / _OUTWARD
+        count = len(grid.state) - 1
+        of_state = np.concatenate([(grid.state[1:] / left[:, None]).reshape(-1, n), of_state])
+        of_input = np.concatenate([(grid.input[1:] / left[:, None]).reshape(-1, plant.m), of_input])
+        low, high = (
+            np.concatenate([np.tile(on_grid, count), mixed])
+            for on_grid, mixed in zip(_shrunk(plant.box_ends, left), (low, high), strict=True)
+        )
+        disturbed = np.concatenate([np.tile(np.where(left > 0.0, rho / left, np.inf), count), disturbed])
+        at_samples, ends = rows / left_at_samples[:, None], _shrunk(plant.box_ends, left_at_samples)
+    return RowsWithinStep(*map(read_only, (of_state, of_input, low, high, disturbed, at_samples, *ends)))
 
 
 def _shrunk(ends: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

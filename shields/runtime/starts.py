@@ -17,7 +17,7 @@ from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
-from shields.runtime.set_test import PredictedErrors, rows_between
+from shields.runtime.set_test import PredictedErrors, rows_within_step
 from shields.verification.rational_matrix import (
     is_positive_semidefinite,
     multiply,
@@ -68,7 +68,7 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
     E(P) does exactly if c_i P c_i' is at most the square of the nearer end for all rows. Where the box counts between
     samples, they have to lie in a smaller one, in which disturbances cannot leave it.
     """
-    between = rows_between(plant)
+    between = rows_within_step(plant)
     return _between(between.at_samples, between.low_at_samples, between.high_at_samples, initial)
 
 
@@ -116,7 +116,7 @@ def starts_known(
     else:
         center, shape = np.asarray(initial, dtype=np.float64), np.zeros((plant.n, plant.n))
     for ahead in range(input_delay):
-        if not safety_filter.test.keeps_between(center, safety_filter.errors_of(shape), MARGIN):
+        if not safety_filter.test.keeps_within_step(center, safety_filter.errors_of(shape), MARGIN):
             known[ahead] = StartKnown(False, False)
         center, shape = _moved(plant, center, shape)
         errors = safety_filter.errors_of(shape)
@@ -139,7 +139,7 @@ def known_inside(
     """
     if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
         return True
-    if not safety_filter.test.keeps_between(estimate, errors, MARGIN, u):
+    if not safety_filter.test.keeps_within_step(estimate, errors, MARGIN, u):
         return False
     return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
 

@@ -31,8 +31,8 @@ from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import (
     Feedback,
     feedback_of,
-    grid_in_closed_loop,
     invariant_polytope,
+    limits_within_step,
     points_of_box,
     share_in_polytope,
     share_of_points,
@@ -642,7 +642,7 @@ def _tightened_box(
     Raises:
         Infeasible: If it still does after several boxes.
     """
-    grid = grid_in_closed_loop(feedback_of(certificate), plant)
+    grid = limits_within_step(feedback_of(certificate), plant)
     if not len(grid.high):
         return None
     reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / np.maximum(grid.high, 1e-300)

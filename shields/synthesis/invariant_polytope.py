@@ -181,7 +181,8 @@ def invariant_faces(
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
     """Returns the share of the safe box's volume that a polytope fills, to about three digits.
 
-    None where states are inputs under way, or the box is no product of intervals.
+    None where the box is no product of intervals; where the last states are past inputs (`LinearPlant.from_statespace`)
+    of the others, with past inputs at the operating one.
     """
     points = points_of_box(plant, _POINTS_LOG2)
     return None if points is None else float((polytope.gauge(points) <= 1.0).mean())
@@ -189,14 +190,15 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
 
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
     """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`."""
-    rows = plant.box
+    rows, n = plant.box, plant.n - inputs_under_way(plant)
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n
-    if inputs_under_way(plant) or not is_product or not np.isfinite(plant.box_ends).all():
+    if not is_product or not np.isfinite(plant.box_ends).all():
         return None
-    points = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(log2) - 1.0
-    order = np.abs(rows).argmax(axis=0)  # the row of each state
-    values = 0.5 * (plant.box_low + plant.box_high)[order] + 0.5 * (plant.box_high - plant.box_low)[order] * points
-    return values / rows.sum(axis=0)
+    order = np.abs(rows).argmax(axis=0)[:n]  # the row of each state
+    ends, points = plant.box_ends[:, order], np.zeros((2**log2, plant.n))
+    drawn = 2.0 * qmc.Sobol(n, scramble=False).random_base2(log2) - 1.0
+    points[:, :n] = (0.5 * (ends[0] + ends[1]) + 0.5 * (ends[1] - ends[0]) * drawn) / rows.sum(axis=0)[:n]
+    return points
 
 
 def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) -> float:
@@ -231,13 +233,15 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
     return 0.0
 
 
-class ClosedLoopGrid(NamedTuple):
-    """What the fallback makes of x - x_c at the times of a plant's grid; g rows ordered by time, then by box row.
+class LimitsInClosedLoop(NamedTuple):
+    """What limits within a step ask of x - x_c under the fallback: first the box at the times of a plant's grid.
+
+    Those are ordered by time, then by box row; limits of states and inputs together follow.
 
     Attributes:
-        images: c (A_tau + B_tau K), shape (g, n).
-        low, high: Between what image (x - x_c) may be so that c x stays within its ends, less eta, for all errors and
-            disturbances, shape (g,).
+        images: c (A_tau + B_tau K), and f + g K of the others, shape (g, n).
+        low, high: Between what image (x - x_c) may be so that the limit holds for all errors and disturbances, for the
+            box less eta, shape (g,).
     """
 
     images: np.ndarray
@@ -245,16 +249,26 @@ class ClosedLoopGrid(NamedTuple):
     high: np.ndarray
 
 
-def grid_in_closed_loop(feedback: Feedback, plant: LinearPlant) -> ClosedLoopGrid:
-    """Returns the rows of docs/shield_proof.md, "Between the samples"; none for a plant without a grid."""
-    if plant.grid_rows is None:
-        return ClosedLoopGrid(np.empty((0, plant.n)), np.empty(0), np.empty(0))
-    (K, errors, D, rest), (state, pushed, _) = feedback, plant.grid_rows
-    answer, (taken, disturbed) = pushed @ K, taken_between_samples(plant, plant.grid_rows, D)
-    reach = np.sqrt(np.einsum("...i,lij,...j->l...", answer, errors, answer).max(axis=0))
-    least, at_rest = taken + disturbed + reach, state @ rest.state + pushed @ rest.input
-    low, high = plant.box_low - at_rest + least, plant.box_high - at_rest - least
-    return ClosedLoopGrid((state + answer).reshape(-1, plant.n), low.ravel(), high.ravel())
+def limits_within_step(feedback: Feedback, plant: LinearPlant) -> LimitsInClosedLoop:
+    """Returns the rows of docs/shield_proof.md, "Between the samples" and "States and inputs together"."""
+    (K, errors, D, rest), n = feedback, plant.n
+    state, pushed = plant.mixed_rows[:, :n], plant.mixed_rows[:, n:]
+    (low, high), taken = plant.mixed_ends, float(ACTION_ROUNDING) * (np.abs(pushed) @ plant.input_half)
+    if plant.grid_rows is not None:
+        on_grid, pushed_on_grid, _ = plant.grid_rows
+        of_grid, disturbed = taken_between_samples(plant, plant.grid_rows, D)
+        points = len(on_grid)
+        state = np.concatenate([on_grid.reshape(-1, n), state])
+        pushed = np.concatenate([pushed_on_grid.reshape(-1, plant.m), pushed])
+        taken = np.concatenate([(of_grid + disturbed).ravel(), taken])
+        low, high = (
+            np.concatenate([np.tile(of_box, points), mixed])
+            for of_box, mixed in zip(plant.box_ends, (low, high), strict=True)
+        )
+    answer = pushed @ K
+    least = taken + np.sqrt(np.maximum(np.einsum("ri,lij,rj->lr", answer, errors, answer), 0.0).max(axis=0))
+    at_rest = state @ rest.state + pushed @ rest.input
+    return LimitsInClosedLoop(state + answer, low - at_rest + least, high - at_rest - least)
 
 
 class _ClosedLoop:
@@ -268,7 +282,7 @@ class _ClosedLoop:
         self.next = plant.A + plant.B @ self._K
 
     def first_faces(self) -> Faces:
-        """Returns the faces of the box, of the input limits and on the grid.
+        """Returns the faces of the box, of the input limits and of limits within a step.
 
         Raises:
             Infeasible: If errors of the estimate alone take an input beyond its limit, or the rest is not inside.
@@ -280,11 +294,17 @@ class _ClosedLoop:
         low, high = plant.input_low - u_c + taken, plant.input_high - u_c - taken
         if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
-        inputs, grid = in_half_ranges(self._K, low, high), grid_in_closed_loop(self._feedback, plant)
-        low, high = grid.low + _MARGIN, grid.high - _MARGIN
-        if ((low >= 0.0) | (high <= 0.0)).any():
+        inputs, within = in_half_ranges(self._K, low, high), limits_within_step(self._feedback, plant)
+        low, high = within.low + _MARGIN, within.high - _MARGIN
+        left = (low >= 0.0) | (high <= 0.0)
+        if left[: len(left) - len(plant.mixed_rows)].any():
             raise _none("errors and disturbances alone leave the box between two samples; smaller bounds leave room")
-        faces = box.followed_by(inputs).followed_by(in_half_ranges(grid.images, low, high))
+        if left.any():
+            raise _none(
+                "errors of the estimate alone break a limit of states and inputs together; better sensors, or a gain "
+                "that answers less, leave room"
+            )
+        faces = box.followed_by(inputs).followed_by(in_half_ranges(within.images, low, high))
         return faces._replace(rows=faces.rows * self.widths)
 
     def predecessor(self, faces: Faces) -> Faces:
@@ -320,7 +340,7 @@ class _ClosedLoop:
         return own.followed_by(Faces(rows, low, high).some(slice(count, None)))
 
     def multipliers(self, faces: Faces) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what writes rows after one step, of the gain and on the grid as sums of rows, (r + m + g, r) each.
+        """Returns what writes rows after one step, of the gain and within a step as sums of rows, (r + m + g, r) each.
 
         The first bound them from above, the second from below.
         """
@@ -328,8 +348,8 @@ class _ClosedLoop:
         gains = slice(len(rows), len(rows) + self._plant.m)
         reached = rows @ self.rest.state
         own = Faces(rows * self.widths, faces.low - reached, faces.high - reached)
-        grid = grid_in_closed_loop(self._feedback, self._plant).images
-        images = np.concatenate([rows @ self.next, self._K / limits[:, None], grid]) * self.widths
+        within = limits_within_step(self._feedback, self._plant).images
+        images = np.concatenate([rows @ self.next, self._K / limits[:, None], within]) * self.widths
         found = np.array([[bound.multipliers for bound in _extremes(own, image)] for image in images])
         found[np.abs(found) < 1e-13] = 0.0
         found[gains] *= limits[:, None, None]

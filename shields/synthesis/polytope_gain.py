@@ -73,9 +73,16 @@ def gains_of_larger_polytopes(
 
 
 def regulators(plant: LinearPlant) -> list[np.ndarray]:
-    """Returns the gains, shape (m, n), of linear-quadratic regulators that use more and more of the inputs."""
-    efforts = (effort * np.diag(plant.input_half**-2.0) for effort in _INPUT_WEIGHTS)
-    found = (lqr_gain(plant.A, plant.B, plant.weight, effort) for effort in efforts)
+    """Returns the gains, shape (m, n), of linear-quadratic regulators that use less and less of the inputs.
+
+    Limits of states and inputs together cost as inputs do.
+    """
+    state, pushed = plant.mixed_rows[:, : plant.n], plant.mixed_rows[:, plant.n :]
+    effort, crossed = np.diag(plant.input_half**-2.0) + pushed.T @ pushed, state.T @ pushed
+    found = (
+        lqr_gain(plant.A, plant.B, plant.weight + weight * state.T @ state, weight * effort, weight * crossed)
+        for weight in _INPUT_WEIGHTS
+    )
     return [K for K in found if K is not None]
 
 
@@ -155,7 +162,8 @@ def polytope_margin(problem: DesignProblem, K: np.ndarray, *, input_limits: bool
 def needs_of(feedback: Feedback, plant: LinearPlant) -> np.ndarray | None:
     """Returns how far errors and disturbances take the limits from rest under a gain, in units of half their range.
 
-    Shape (k + m,), of the rows of the box and of the inputs, as `polytope_margin` adds them up; None if it is too slow.
+    Shape (k + m + q,), as `polytope_margin` adds them up for the rows of the box, of the inputs and of both together;
+    None if it is too slow.
     """
     K, errors, D, _ = feedback
     closed_loop = plant.A + plant.B @ K
@@ -163,12 +171,14 @@ def needs_of(feedback: Feedback, plant: LinearPlant) -> np.ndarray | None:
     steps = np.inf if radius >= 1.0 else np.log(_LEFT_OVER) / np.log(max(radius, 1e-3))
     if steps > _MOST_STEPS:
         return None
+    pushed = plant.mixed_rows[:, plant.n :] @ K
     inputs = K / plant.input_half[:, None]
-    moved, needs = np.concatenate([plant.box, inputs]), np.zeros(len(plant.box) + plant.m)
+    moved = np.concatenate([plant.box, inputs, plant.mixed_rows[:, : plant.n] + pushed])
+    needs = np.zeros(len(moved))
     for _ in range(int(steps) + plant.n):
         needs += _reach(moved @ (plant.B @ K), errors) + _reach(moved, D[None])
         moved = moved @ closed_loop
-    needs[len(plant.box) :] += _reach(inputs, errors)
+    needs[len(plant.box) :] += _reach(np.concatenate([inputs, pushed]), errors)
     return np.maximum(needs, _SMALLEST_NEED)
 
 

@@ -38,10 +38,10 @@ def equilibria(plant: LinearPlant) -> np.ndarray:
 
 def _limit_rows(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the rows of all limits on (x, u), in units of half their range, and their ends."""
-    rows = np.zeros((len(plant.box) + plant.m, plant.n + plant.m))
-    rows[: len(plant.box), : plant.n] = plant.box
-    rows[len(plant.box) :, plant.n :] = np.diag(1.0 / plant.input_half)
-    return rows, *np.concatenate([plant.box_ends, plant.input_ends / plant.input_half], axis=1)
+    box = np.hstack([plant.box, np.zeros((len(plant.box), plant.m))])
+    inputs = np.hstack([np.zeros((plant.m, plant.n)), np.diag(1.0 / plant.input_half)])
+    ends = plant.box_ends, plant.input_ends / plant.input_half, plant.mixed_ends
+    return np.concatenate([box, inputs, plant.mixed_rows]), *np.concatenate(ends, axis=1)
 
 
 def farthest_from_limits(plant: LinearPlant, needs: np.ndarray | None = None) -> Rest:
@@ -49,7 +49,7 @@ def farthest_from_limits(plant: LinearPlant, needs: np.ndarray | None = None) ->
 
     Args:
         plant: The plant.
-        needs: What distances from the limits are in units of, shape (k + m,), > 0; half the range by default.
+        needs: What distances from the limits are in units of, shape (k + m + q,), > 0; half the range by default.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
@@ -76,7 +76,10 @@ def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:
 
 
 def distances(plant: LinearPlant, rest: Rest) -> np.ndarray:
-    """Returns how far a point is from the nearer end of every limit, in units of half its range, shape (k + m,)."""
+    """Returns how far a point is from the nearer end of every limit, in units of half its range, shape (k + m + q,).
+
+    Of the k rows of the box, of the m inputs, and of the q limits of both together.
+    """
     rows, low, high = _limit_rows(plant)
     values = rows @ np.concatenate(rest)
     return np.minimum(values - low, high - values)
@@ -92,7 +95,7 @@ def limits_around(plant: LinearPlant, rest: Rest) -> SymmetricLimits:
     if not (nearest > 0.0).all():
         raise Infeasible("the resting point is not strictly within the limits of states and inputs", "S", 1.0)
     k = len(plant.box)
-    rows, u_max = plant.box / nearest[:k, None], plant.input_half * nearest[k:]
+    rows, u_max = plant.box / nearest[:k, None], plant.input_half * nearest[k : k + plant.m]
     if np.linalg.matrix_rank(rows * plant.half_widths) < plant.n:
         rows = np.concatenate([rows, _generous_rows(plant, rows, u_max)])
     return SymmetricLimits(rows, u_max)

@@ -31,14 +31,14 @@ _ROOT_DIGITS = 128
 
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (P) and (PU): the polytope is in the box, invariant under the fallback, which respects the input limits.
+    """Checks (P), (PU) and (PM): the polytope is in the box, and the fallback keeps it and all limits of inputs.
 
     All is counted from the resting point, where the fallback is u = K x_hat. With r = g (A+BK) - lambda G the next g x+
     is at most sum_i max(lambda_i high_i, lambda_i low_i) + sum_k |r_k| w_k + s + d, where s bounds the root of g BK
     Sigma (BK)' g' for all error sets, and d that of g D g' and what rounding the action does; from below likewise.
     """
     rows, box = polytope.rows, plant.box
-    images = len(rows) + plant.m + len(box) * (plant.between_samples or 0)
+    images = len(rows) + plant.m + len(box) * (plant.between_samples or 0) + len(plant.mixed_rows)
     fits = polytope.multipliers.shape == (images, len(rows))
     yield flag("polytope: shapes", fits)
     if not fits:
@@ -70,6 +70,26 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
         low, high = (Fraction(float(end[i])) - u_c for end in (plant.input_low, plant.input_high))
         left = faces.left_of(gain, len(rows) + i, low, high) - rho
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
+    yield from _mixed_conditions(faces, certificate, plant, images)
+
+
+def _mixed_conditions(faces: Faces, certificate: Certificate, plant: LinearPlant, images: int) -> Iterator[Condition]:
+    """Checks (PM): limits of states and inputs together hold with the fallback, for every state of the polytope.
+
+    f x + g u = (f + g K) x - g K e around what it is at rest, and u is applied with what rounding an action does.
+    """
+    K, half = rational(certificate.K), [Fraction(float(each)) for each in plant.input_half]
+    rest = rational(np.concatenate([certificate.resting_state, certificate.resting_input]))[0]
+    errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
+    for j, row in enumerate(rational(plant.mixed_rows) if len(plant.mixed_rows) else ()):
+        pushed = row[plant.n :]
+        image = add([row[: plant.n]], multiply([pushed], K))[0]
+        least = root_above(max(quadratic([pushed], error) for error in errors))
+        least += ACTION_ROUNDING * weighted_size(pushed, half)
+        at_rest = sum((entry * value for entry, value in zip(row, rest, strict=True)), Fraction(0))
+        low, high = (Fraction(float(ends[j])) - at_rest if np.isfinite(ends[j]) else None for ends in plant.mixed_ends)
+        left = faces.left_of(image, images - len(plant.mixed_rows) + j, low, high) - least
+        yield scalar_condition(f"(PM) limit {j + 1} of states and inputs together holds on the polytope", left)
 
 
 class Faces(NamedTuple):

@@ -49,7 +49,7 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
         for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.largest_input])):
             name = f"(G) what is between grid points is at most eta of row {j + 1}"
             yield ball_at_least_zero(name, arb(number(grid.remainder[j])) - least)
-        if polytope is None or len(polytope.multipliers) == len(polytope.rows) + m + k * points:
+        if polytope is None or len(polytope.multipliers) == len(polytope.rows) + m + k * points + len(plant.mixed_rows):
             yield from _gain_conditions(certificate, plant)
 
 

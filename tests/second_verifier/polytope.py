@@ -1,4 +1,4 @@
-"""(P) and (PU) of docs/shield_proof.md by the second engine: rational matrices, roots as balls."""
+"""(P), (PU) and (PM) of docs/shield_proof.md by the second engine: rational matrices, roots as balls."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from tests.second_verifier.exact import (
 
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (P) and (PU) without the code of the first engine; what cannot be stated is left out."""
+    """Checks (P), (PU) and (PM) without the code of the first engine; what cannot be stated is left out."""
     r, k = len(polytope.rows), len(plant.box)
-    images = r + plant.m + k * (plant.between_samples or 0)
-    fits = polytope.multipliers.shape == (images, r)
+    before = r + plant.m + k * (plant.between_samples or 0)
+    fits = polytope.multipliers.shape == (before + len(plant.mixed_ends[0]), r)
     yield is_so("polytope: shapes", fits)
     if not fits:
         return
@@ -59,6 +59,16 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
             ends = [number(end[i]) - number(certificate.resting_input[i]) for end in plant.input_ends]
             left = inside.distance(gain, r + i, *ends) - arb(FLOAT32 * half[i]) - arb(largest).sqrt()
             yield ball_at_least_zero(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
+        at_rest = [*certificate.resting_state, *certificate.resting_input]
+        for i in range(len(plant.mixed_ends[0])):
+            both = matrix(plant.mixed_rows[i]).tolist()[0]
+            state, push = fmpq_mat([both[: plant.n]]), fmpq_mat([both[plant.n :]])
+            value = sum((a * number(b) for a, b in zip(both, at_rest, strict=True)), fmpq(0))
+            ends = [number(end[i]) - value if np.isfinite(end[i]) else None for end in plant.mixed_ends]
+            left = inside.distance((state + push * K).tolist()[0], before + i, *ends)
+            left -= arb(max(form(push, mapped(K, Sigma)) for Sigma in errors)).sqrt()
+            left -= arb(FLOAT32 * reach_of(push, half))
+            yield ball_at_least_zero(f"(PM) limit {i + 1} of states and inputs together holds on the polytope", left)
 
 
 class Inside:

@@ -16,7 +16,7 @@ from shields import Certificate, Infeasible, SafeLoop, SafetyFilter, synthesize,
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
-from shields.runtime.set_test import ellipsoid_test, rows_between
+from shields.runtime.set_test import ellipsoid_test, rows_within_step
 from shields.runtime.starts import starts_known
 from shields.synthesis.network_requirements import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
@@ -229,7 +229,7 @@ def test_before_the_first_decision_behind_a_downlink_times_between_samples_count
 
 def test_plants_without_a_grid_have_no_rows_of_one():
     plant = found("TruckTrailerCruise")[0]
-    test = rows_between(plant)
+    test = rows_within_step(plant)
     assert not len(test.state)
     assert test.at_samples is plant.box_rows
 

@@ -14,12 +14,12 @@ from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import own_error_state, read_only
 from shields.runtime.set_test import (
     SMALLEST_RADIUS,
-    RowsBetween,
+    RowsWithinStep,
     SetTest,
     ball,
     closed,
     judged_shapes,
-    rows_between,
+    rows_within_step,
     supports,
 )
 
@@ -146,7 +146,7 @@ class Prediction:
         plant: The plant.
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
-            its others. Those of the box are closer where it counts between samples, too (`RowsBetween`).
+            its others. Those of the box are closer where it counts between samples, too (`RowsWithinStep`).
         middle, half: Of the ends of these rows, shape (r,); the half is less by the rounding of both.
         grid: What is asked between samples.
         powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
@@ -160,7 +160,7 @@ class Prediction:
 
     def __init__(self, first: SetTest, steps: int) -> None:
         plant, n, m = first.plant, first.plant.n, first.plant.m
-        self.plant, self.steps, between = plant, steps, rows_between(plant)
+        self.plant, self.steps, between = plant, steps, rows_within_step(plant)
         self.cone, ends_in = first.root[: first.cone], first.root[first.cone :]
         k = len(between.at_samples)
         self.rows = np.concatenate([between.at_samples, ends_in[k:]])
@@ -210,7 +210,7 @@ class PlanGrid:
         middle: Of the ends of these rows, shape (g,).
     """
 
-    def __init__(self, prediction: Prediction, test: RowsBetween) -> None:
+    def __init__(self, prediction: Prediction, test: RowsWithinStep) -> None:
         steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
         size, self._rounding = np.abs(test.state), prediction.rounding
         self.free = read_only(test.state @ prediction.powers[:-1])

@@ -1,0 +1,368 @@
+"""Limits of states and inputs together: rates, coupled inputs, outputs with feedthrough; proofs, attacks, decisions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cvxpy as cp
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, LinearPlant, contract_of
+from shields import Infeasible, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize, verify
+from tests.certificates import certificate_of
+from tests.second_verifier.verify import verify_again
+
+QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
+MODEL = ([[0.0, 1.0], [-0.5, -1.0]], [[0.0], [1.0]], np.eye(2), 0)
+ONE_INPUT = {"state_limits": ([-0.5, -0.5], [0.8, 0.6]), "input_limits": (-2.0, 1.0), "disturbance_bound": 0.003}
+TWO_INPUTS = {
+    "A": [[0.9, 0.1], [0.0, 0.95]],
+    "B": [[0.1, 0.02], [0.05, 0.2]],
+    "dt": 0.5,
+    "state_limits": ([0.0, 0.0], [10.0, 8.0]),
+    "input_limits": ([0.0, -1.0], [8.0, 4.0]),
+    "operating_state": [4.0, 4.0],
+    "operating_input": [3.0, 1.0],
+    "disturbance_bound": 0.02,
+} | QUIET
+PLANTS = {
+    "rates": LinearPlant.from_statespace(MODEL, 0.1, du_max=0.3, **ONE_INPUT, **QUIET),
+    "rates of a late input": LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, du_max=0.3, **ONE_INPUT, **QUIET),
+    # What passengers feel: the second row of the model itself, from -.6 to .4.
+    "feedthrough": LinearPlant.from_statespace(
+        MODEL, 0.1, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
+    ),
+    "coupled": LinearPlant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS),
+}
+CHANNEL = Channel(loss=0.3, max_consecutive_losses=1, send_period=2)
+CONTRACT = contract_of(CHANNEL)
+MODES = ["project", "switch", "boundary", "lookahead"]
+
+
+def certificate(name):
+    return certificate_of(PLANTS[name], CONTRACT, "polytope")
+
+
+def mixed_values(plant, states, inputs):
+    """How far the limits are passed, by the plant's rows alone: shape (count, q)."""
+    values = np.hstack([states, inputs]) @ plant.mixed_rows.T
+    low, high = plant.mixed_ends
+    return np.maximum(low - values, values - high)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_both_engines_prove_it_with_the_same_margins(name):
+    plant, found = PLANTS[name], certificate(name)
+    ours, other = verify(found, plant), verify_again(found, plant)
+    assert ours.valid
+    assert other.valid
+    margins = {condition.name: condition.margin for condition in other.conditions}
+    shared = [condition for condition in ours.conditions if condition.name.startswith("(PM)")]
+    assert len(shared) == len(plant.mixed_rows) > 0
+    for condition in shared:
+        assert condition.margin == pytest.approx(margins[condition.name], rel=1e-9, abs=1e-12)
+    assert found.polytope is not None
+    assert not found.keeps_ellipsoid
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
+    plant, found = PLANTS[name], certificate(name)
+    P, K, n = found.polytope, found.K, plant.n
+    faces = [(g, high) for g, high in zip(P.rows, P.high, strict=True) if np.isfinite(high)]
+    faces += [(-g, -low) for g, low in zip(P.rows, P.low, strict=True) if np.isfinite(low)]
+    A_ub, b_ub = np.array([g for g, _ in faces]), np.array([end for _, end in faces])
+    for row, low, high in zip(plant.mixed_rows, *plant.mixed_ends, strict=True):
+        f, g = row[:n] + row[n:] @ K, row[n:]
+        constant = g @ (found.resting_input - K @ found.resting_state)
+        reach = max(Ellipsoid(shape).support(g @ K) for shape in found.error_shapes)
+        for sign, end in ((1.0, high), (-1.0, -low)):
+            best = linprog(-sign * f, A_ub=A_ub, b_ub=b_ub, bounds=(None, None))
+            assert best.status == 0
+            assert -best.fun + sign * constant + reach <= end + 1e-9
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", PLANTS)
+def test_no_limit_is_passed_while_guaranteed(name, mode):
+    plant, found, count = PLANTS[name], certificate(name), 30
+    P, rng = found.polytope, np.random.default_rng(1)
+    names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "max_episode_steps": 70}
+    for disturbance in (AdversarialDisturbance(), AdversarialDisturbance(rows=P.rows), "sphere"):
+        env = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=count, disturbance=disturbance, noise="extreme", **names)
+        shield = VectorSafetyShield(env, found, mode)
+        starts = P.center + 0.9 * (P.sample_boundary(rng, count) - P.center)
+        _, info = shield.reset(seed=3, options={"state": starts})
+        assert info["shield_guaranteed"].all()
+        closest, intervened = -np.inf, 0
+        for k in range(60):
+            states = info["state"]
+            ends = np.sign(rng.uniform(-1.0, 1.0, (count, plant.m)))
+            actions = [ends, np.ones_like(ends), -np.ones_like(ends)][k // 20]
+            _, _, _, _, info = shield.step(actions.astype(np.float32))
+            assert info["shield_guaranteed"].all(), info["shield_reason"]
+            assert not info["cost"].any()
+            passed = mixed_values(plant, states, info["input"])
+            np.testing.assert_allclose(info["worst_constraint_values"][:, len(plant.box) :], passed, atol=1e-12)
+            closest, intervened = max(closest, passed.max()), intervened + info["shield_intervened"].sum()
+        assert (-0.05 if mode in ("project", "lookahead") else -0.5) < closest <= 0.0  # the limit is what binds
+        assert intervened > 0
+
+
+@pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
+def test_without_the_limit_in_the_certificate_it_is_passed(name):
+    """The negative twin: a shield that does not know the limit, in the same runs."""
+    plant, count = PLANTS[name], 30
+    blind = replace(plant, mixed_rows=None, mixed_ends=None)
+    found = certificate_of(blind, CONTRACT, "polytope")
+    env = gym.make_vec(
+        "ncs_gym/LinearNCS-v0", num_envs=count, plant=blind, channel=CHANNEL, contract=CONTRACT, max_episode_steps=70
+    )
+    shield = VectorSafetyShield(env, found)
+    _, info = shield.reset(seed=3)
+    rng, passed = np.random.default_rng(1), 0
+    for _ in range(60):
+        states = info["state"]
+        actions = np.sign(rng.uniform(-1.0, 1.0, (count, plant.m)))
+        _, _, _, _, info = shield.step(actions.astype(np.float32))
+        assert not info["cost"].any()
+        passed += (mixed_values(plant, states, info["input"]) > 0.0).any(axis=1).sum()
+    assert passed > 100
+
+
+@pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
+def test_unshielded_steps_beyond_a_limit_are_counted(name):
+    plant, rng = PLANTS[name], np.random.default_rng(1)
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=CHANNEL, contract=CONTRACT)
+    _, info = env.reset(seed=0)
+    counted = 0
+    for _ in range(60):
+        state = info["state"]
+        _, _, _, _, info = env.step(rng.choice([-1.0, 1.0], plant.m).astype(np.float32))
+        beyond = mixed_values(plant, state[None], info["input"][None]).max() > 0.0
+        outside = plant.constraint_values(info["state"]).max() > 0.0
+        assert info["cost"] == float(beyond or outside)
+        assert len(info["constraint_values"]) == len(plant.box)
+        counted += beyond and not outside
+    assert counted > 5
+
+
+@pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
+def test_decision_is_that_of_a_conic_solver(name):
+    plant, found = PLANTS[name], certificate(name)
+    shield, P, rng = SafetyFilter(found, plant), found.polytope, np.random.default_rng(0)
+    shape, reasons = 0.5 * found.error_shapes[0], []
+    reach = Ellipsoid(shape).support(P.rows @ plant.A) + plant.disturbance.support(P.rows)
+    own = Ellipsoid(shape).support(plant.mixed_rows[:, : plant.n])
+    rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), plant.mixed_rows])
+    low = np.concatenate([P.low + reach, plant.mixed_ends[0] + own])
+    high = np.concatenate([P.high - reach, plant.mixed_ends[1] - own])
+    for _ in range(60):
+        estimate = P.center + (P.sample_boundary(rng, 1)[0] - P.center) * rng.uniform(0.3, 1.0)
+        proposed = rng.uniform(*plant.input_ends)
+        decision = shield.decide(estimate, shape, proposed)
+        values = rows @ np.concatenate([estimate, proposed])
+        left = min((values - low).min(), (high - values).min())
+        if abs(left) > 1e-7:
+            assert (decision.reason == "safe") == (left > 0.0)
+        reasons.append(decision.reason)
+        if decision.reason != "projected":
+            continue
+        u = cp.Variable(plant.m)
+        c = rows[:, : plant.n] @ estimate + rows[:, plant.n :] @ u
+        finite = np.isfinite(high), np.isfinite(low)
+        kept = [c[finite[0]] <= high[finite[0]], c[finite[1]] >= low[finite[1]]]
+        limits = [u <= plant.input_high, u >= plant.input_low]
+        cp.Problem(cp.Minimize(cp.sum_squares(u - proposed)), kept + limits).solve(solver=cp.CLARABEL)
+        np.testing.assert_allclose(decision.input, u.value, atol=1e-5 * plant.input_half.max())
+    assert {"safe", "projected"} <= set(reasons)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name):
+    plant, found = PLANTS[name], certificate(name)
+    closer = replace(plant, mixed_ends=0.3 * plant.mixed_ends)
+    claimed = replace(found, fingerprint=closer.fingerprint)
+    P, first = found.polytope, len(found.polytope.rows) + plant.m
+    upper, lower = P.multipliers.copy(), P.lower_multipliers.copy()
+    upper[first, np.abs(upper[first]).argmax()] += 0.5
+    lower[first, np.abs(lower[first]).argmax()] -= 0.5
+    forged = [(replace(found, polytope=replace(P, multipliers=upper, lower_multipliers=lower)), plant)]
+    few = replace(P, multipliers=P.multipliers[:first], lower_multipliers=P.lower_multipliers[:first])
+    forged += [(claimed, closer), (replace(found, polytope=few), plant)]
+    for each, claims in forged:
+        assert not verify(each, claims).valid
+        assert not verify_again(each, claims).valid
+
+
+def test_certificate_of_the_plant_without_the_limit_is_none_of_the_plant_with_it():
+    plant = PLANTS["coupled"]
+    found = certificate_of(replace(plant, mixed_rows=None, mixed_ends=None), CONTRACT, "polytope")
+    assert not verify(found, plant).valid
+    assert not verify(replace(found, fingerprint=plant.fingerprint), plant).valid
+
+
+def test_stable_plant_with_limits_of_rates_needs_no_contract():
+    plant = PLANTS["rates"]
+    assert plant.spectral_radius < 1.0
+    found = synthesize(plant)
+    assert found.contract is None
+    assert verify(found, plant).valid
+    np.testing.assert_array_less(np.sqrt(found.error_shapes[:, 2, 2]), 1e-4)  # the past input is known
+
+
+def test_rates_may_be_given_per_second_and_for_a_plant_that_is_made():
+    plant = LinearPlant.from_statespace(MODEL, 0.1, **ONE_INPUT, **QUIET)
+    assert plant.with_rate_limits(0.3).fingerprint == PLANTS["rates"].fingerprint
+    assert plant.with_rate_limits(2.5, per="second").fingerprint == plant.with_rate_limits(0.25).fingerprint
+    late = LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, **ONE_INPUT, **QUIET)
+    assert late.with_rate_limits(0.3).fingerprint == PLANTS["rates of a late input"].fingerprint
+    assert late.with_rate_limits(0.3).n == late.n == plant.n + 2
+    assert "|u1 - u1 of 1 step ago| <= 0.3" in str(PLANTS["rates"])
+    assert "u1 of 1 step ago <= " not in str(PLANTS["rates"]).replace("|u1 - u1 of 1 step ago| <= 0.3", "")
+
+
+def test_limit_of_a_late_input_is_one_of_the_input_that_acts():
+    limit = [([-0.5, -1.0], [1.0], -0.6, 0.4)]
+    plant = LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, mixed_limits=limit, **ONE_INPUT, **QUIET)
+    assert not len(plant.mixed_rows)
+    state = np.array([0.1, 0.2, 0.35, -0.4])  # the oldest input acts now
+    value = -0.05 - 0.2 + 0.35
+    assert plant.constraint_values(state)[-1] == pytest.approx(max(value - 0.4, -0.6 - value) / 0.5)
+
+
+def test_episode_begins_with_the_operating_input_as_the_one_before():
+    for name in ("rates", "rates of a late input"):
+        env = gym.make("ncs_gym/LinearNCS-v0", plant=PLANTS[name], channel=CHANNEL, contract=CONTRACT)
+        _, info = env.reset(seed=1)
+        assert not info["state"][2:].any()
+        assert info["state"][:2].all()
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+def test_limit_of_rates_is_kept_behind_a_downlink(mode):
+    plant = PLANTS["rates"]
+    downlink = Channel(loss=0.3, max_consecutive_losses=2)
+    settings = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "downlink": downlink}
+    env = gym.make("ncs_gym/LinearNCS-v0", disturbance="adversarial", **settings)
+    shield = SafetyShield(env, mode=mode)
+    rng, guaranteed = np.random.default_rng(0), 0
+    for seed in range(5):
+        _, info = shield.reset(seed=seed)
+        for _ in range(60):
+            before = info["input"]
+            _, _, _, _, info = shield.step(rng.choice([-1.0, 1.0], 1).astype(np.float32))
+            if info["shield_guaranteed"]:
+                assert info["cost"] == 0.0
+                assert np.abs(info["input"] - before).max() <= 0.3
+            guaranteed += info["shield_guaranteed"]
+    assert guaranteed > 200
+
+
+def test_loop_without_gymnasium_knows_the_limit():
+    plant, found = PLANTS["rates"], certificate("rates")
+    loop = SafeLoop(found, plant, CHANNEL)
+    loop.start(found.resting_state)
+    last = found.resting_state[2:]
+    for k in range(20):
+        decision = loop.decide(plant.input_high if k % 2 else plant.input_low)
+        assert np.abs(decision.input - last).max() <= 0.3
+        last = decision.input
+        loop.receive()
+
+
+def test_file_and_fingerprint_hold_the_limits(tmp_path):
+    for name, plant in PLANTS.items():
+        plant.save(tmp_path / "plant.json")
+        again = LinearPlant.load(tmp_path / "plant.json")
+        assert again.fingerprint == plant.fingerprint, name
+        np.testing.assert_array_equal(again.mixed_rows, plant.mixed_rows)
+        np.testing.assert_array_equal(again.mixed_ends, plant.mixed_ends)
+        assert replace(plant, mixed_ends=1.01 * plant.mixed_ends).fingerprint != plant.fingerprint
+        certificate(name).save(tmp_path / "certificate.json")
+    without = replace(PLANTS["coupled"], mixed_rows=None, mixed_ends=None)
+    assert "mixed_rows" not in without.document["plant"]
+    open_end = replace(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])
+    open_end.save(tmp_path / "plant.json")
+    assert LinearPlant.load(tmp_path / "plant.json").mixed_ends[0].tolist() == [-np.inf]
+
+
+def test_limits_move_with_the_operating_point():
+    """The same limits and the same model, told from another point, hold for the same inputs and states."""
+    plant, there = PLANTS["coupled"], {"operating_state": [5.0, 3.0], "operating_input": [4.0, 2.0]}
+    other = LinearPlant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS | there)
+    state, u = np.array([5.5, 4.5]), np.array([5.0, 2.9])
+    values = [each.mixed_values(each.to_deviation(state), each.to_deviation(u, "input")) for each in (plant, other)]
+    np.testing.assert_allclose(*values)
+    assert values[0] == pytest.approx([(2.9 - 2.5 - 0.2) / 0.6])
+
+
+def test_plant_with_such_limits_has_none_that_are_only_symmetric():
+    for name in ("u_max", "box_rows", "symmetric"):
+        with pytest.raises(ValueError, match="limits of states and inputs together"):
+            getattr(PLANTS["coupled"], name)
+
+
+REFUSED = {
+    "no list": (5.0, "mixed_limits must be a list of"),
+    "three of four": ([([0.0, 0.0], [1.0, 1.0], 1.0)], "mixed_limits must be a list of"),
+    "a row too short": ([([0.0], [1.0, 1.0], -1.0, 1.0)], "state row of a limit in mixed_limits"),
+    "no input": ([([1.0, 0.0], [0.0, 0.0], -1.0, 9.0)], "must be about an input"),
+    "operating point beyond": ([([0.0, 0.0], [1.0, 1.0], -1.0, 1.0)], "operating point"),
+    "ends the wrong way": ([([0.0, 0.0], [1.0, 1.0], 9.0, 1.0)], "low < high"),
+    "not finite": ([([0.0, np.nan], [1.0, 1.0], -1.0, 1.0)], "finite"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_no_such_limit_is_refused(what):
+    given, sentence = REFUSED[what]
+    with pytest.raises(ValueError, match=sentence):
+        LinearPlant(mixed_limits=given, **TWO_INPUTS)
+
+
+def test_what_is_no_limit_of_rates_is_refused():
+    plant = LinearPlant.from_statespace(MODEL, 0.1, **ONE_INPUT, **QUIET)
+    for given, sentence in ((0.0, "du_max must be a positive number"), ([1.0, 2.0], "du_max"), ("a", "du_max")):
+        with pytest.raises(ValueError, match=sentence):
+            plant.with_rate_limits(given)
+    with pytest.raises(ValueError, match="per must be"):
+        plant.with_rate_limits(1.0, per="minute")
+    with pytest.raises(ValueError, match="between_samples is for plants without"):
+        LinearPlant.from_statespace(MODEL, 0.1, between_samples=4, du_max=0.3, **ONE_INPUT, **QUIET)
+    with pytest.raises(ValueError, match="initial_bound"):
+        replace(plant, initial_bound=None, initial_cov=1e-4 * np.eye(2)).with_rate_limits(1.0)
+
+
+def test_only_a_polytope_is_sought_and_a_limit_that_nothing_keeps_has_a_reason():
+    with pytest.raises(ValueError, match="only a polytope is sought"):
+        synthesize(PLANTS["coupled"], safe_set="ellipsoid")
+    unstable = LinearPlant.from_statespace(
+        ([[1.0]], [[1.0]], [[1.0]], 0), 0.1, state_limits=(-1.0, 1.0), input_limits=(-3.0, 3.0), du_max=1e-3,
+        disturbance_bound=0.05, **QUIET,
+    )  # fmt: skip
+    with pytest.raises(Infeasible):
+        synthesize(unstable, contract=CONTRACT)
+
+
+def test_limits_count_beside_times_between_samples():
+    plant = LinearPlant.from_statespace(
+        MODEL, 0.1, between_samples=4, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
+    )
+    found = certificate_of(plant, CONTRACT, "polytope")
+    assert verify(found, plant).valid
+    assert verify_again(found, plant).valid
+    names = [condition.name[:4] for condition in verify(found, plant).conditions]
+    assert names.count("(PM)") == 1
+    assert names.count("(PB)") == 4 * len(plant.box)
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=CHANNEL, contract=CONTRACT, disturbance="adversarial")
+    shield, rng = SafetyShield(env, found), np.random.default_rng(0)
+    shield.reset(seed=0)
+    for _ in range(100):
+        _, _, _, _, info = shield.step(rng.choice([-1.0, 1.0], 1).astype(np.float32))
+        assert info["shield_guaranteed"]
+        assert info["cost"] == 0.0
+        assert len(info["worst_constraint_values"]) == len(plant.box) + 1
