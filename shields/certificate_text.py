@@ -22,16 +22,12 @@ def size_of(recorded: dict[str, Any]) -> str:
         recorded.get("share_with_gain_of_ellipsoid"), " ({:.3g} % with the gain of the largest ellipsoid)", 100.0
     )
     polytope = "{:.3g} % of the safe box's volume" + other + "; the ellipsoid "
+    of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
+    at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
     shares = (
         _text(polytope_share, polytope, 100.0)
-        + _text(
-            recorded.get("share_of_box"), "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume", 100.0
-        ),
-        _text(
-            recorded.get("share_of_box_at_rest"),
-            "{:.4g} % of the volume of the safe box of the states, with no input under way",
-            100.0,
-        ),
+        + _text(recorded.get("share_of_box"), of_box, 100.0)
+        + _text(recorded.get("share_of_box_at_rest"), at_rest, 100.0),
         f"an unknown share of the safe box ({unknown})" if isinstance(unknown, str) else "",
         _text(recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the largest ellipsoid in the box", 100.0),
     )

@@ -99,7 +99,7 @@ class ScriptedEnv(NCSEnv):
             states = many._downlink_state._channel_state._loss_state
             self._downlink_state.in_flight._loss_state = LossState(*(kept[index] for kept in states))
         self.np_random, self._violations = ScriptedGenerator(), 0.0
-        info = self._info(no_inputs(self.plant.m), self.plant.constraint_values(self._state), arrived=False)
+        info = self._info(no_inputs(self.plant.m), self.plant.values_at_start(self._state), arrived=False)
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple:
@@ -188,7 +188,10 @@ class LoopBeside:
 
     def decide(self, action: np.ndarray, *, ask: bool) -> None:
         """Decides about the action that the shield is about to be given."""
-        self.decision = self.loop.decide(self.loop.filter.plant.u_max * np.asarray(action, np.float64), ask=ask)
+        plant = self.loop.filter.plant
+        self.decision = self.loop.decide(
+            plant.input_middle + plant.input_half * np.asarray(action, np.float64), ask=ask
+        )
 
     def compare(self, info: dict[str, Any]) -> None:
         """Compares the decision with the shield's, and then what both make of the step."""

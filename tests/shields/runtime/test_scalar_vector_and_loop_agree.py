@@ -36,6 +36,13 @@ LOCAL = LinearPlant(
     remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"),
     **BOUNDS,
 )
+RATES = LinearPlant(
+    A=[[0.9, 0.1], [0.0, 0.8]],
+    B=[[0.0], [0.3]],
+    disturbance_bound=0.01,
+    mixed_limits=[([0.5, -1.0], [0.5], -0.7, 0.8)],
+    **BOUNDS,
+).with_rate_limits(0.4)
 SPARSE = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
 ASKED = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
@@ -75,6 +82,9 @@ GOES_ON, NEVER = ("", guarantee.NOT_KNOWN_INSIDE), (guarantee.NO_DOWNLINK_CONTRA
 FEATURES = {
     "one input, in every mode": Feature(TRUCK, {"channel": SPARSE, "disturbance": "adversarial"}, MODES),
     "an unstable plant with a contract": Feature(CART, LATE_CART, ("project", "lookahead", "monitor")),
+    "limits of rates and of both together": Feature(
+        RATES, {"channel": SPARSE, "disturbance": "adversarial"}, MODES, safe_set="polytope"
+    ),
     "some outputs": Feature(
         RANDOM["n=3 m=2 p=1"], {"channel": Channel(0.3, 0.01, delay=1, jitter=2)}, ("project", "switch", "boundary")
     ),
