@@ -13,6 +13,8 @@ from ncs_gym.validation import own_error_state
 FLAT = 1e-13
 # Rows whose directions differ by less than this are parallel; what is found is tested again, with a larger margin.
 PARALLEL = 1e-12
+# Where the way to a set is longer than one over this, next to the way to the farthest of its faces, there is none.
+NOTHING_LEFT = 1e-9
 # Newton steps on the multiplier; from the left on a concave function they rise monotonically and converge fast.
 NEWTON_STEPS = 60
 RELATIVE_TOLERANCE = 1e-12
@@ -169,64 +171,93 @@ def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """Returns argmin |u - wanted| over |offset + effect u| <= limits, row by row; NaN where there is none.
 
-    One input is an interval. Otherwise the closest point of a polytope lies on a face that the wanted one is beyond:
-    on the plane of each of these the problem is the same with one input less.
-
     Args:
         wanted: Shape (m, N).
         offset: Shape (r, N).
-        effect: Shape (r, m, N), or (r, m, 1) for the same in all; every direction has some row.
+        effect: Shape (r, m); every direction has some row.
         limits: Shape (r, N); nothing is admissible where one is negative or NaN.
 
     Returns:
         Shape (m, N).
     """
     if len(wanted) == 1:
-        inverse = 1.0 / effect[:, 0]
-        flat = np.isinf(inverse)
-        middle, half = offset * -inverse, limits * np.abs(inverse)
-        low, high = middle - half, middle + half
-        if np.count_nonzero(flat):  # rows that no input moves
-            low = np.where(flat, np.where(np.abs(offset) <= limits, -np.inf, np.inf), low)
-            high = np.where(flat, np.inf, high)
-        low, high = low.max(axis=0), high.min(axis=0)
-        return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
-    values = offset + _changes(effect, wanted)
+        return _closest_in_interval(wanted, offset, effect, limits)
+    values = offset + effect @ wanted
     beyond = ~(np.abs(values) <= limits)
     closest = np.where(beyond.any(axis=0), np.nan, wanted)
-    row, problem = np.nonzero(beyond & (limits >= 0.0))
-    if not row.size:
-        return closest
-    shared = effect.shape[2] == 1
-    normals, start = effect[row, :, 0 if shared else problem].T, wanted[:, problem]
-    face = np.sign(values[row, problem]) * limits[row, problem]
-    foot = start + normals * ((face - values[row, problem]) / (normals * normals).sum(axis=0))
-    usable = np.isfinite(foot).all(axis=0)
-    row, problem = row[usable], problem[usable]
-    foot, start, normals = foot[:, usable], start[:, usable], normals[:, usable]
-    # Directions in the plane of the face, shape (m, m - 1, F).
-    if len(normals) == 2:
-        plane = (np.stack([-normals[1], normals[0]]) / np.hypot(*normals))[:, None]
-    else:
-        plane = np.linalg.svd(normals.T[:, None])[2][:, 1:].transpose(2, 1, 0)
-    left = limits[:, problem]
-    left[row, np.arange(len(row))] = np.inf  # the face itself
-    here = effect if shared else effect[:, :, problem]
-    within = np.stack([_changes(here, direction) for direction in plane.swapaxes(0, 1)], axis=1)
-    # A row that is parallel to the face does not change in its plane: rounding must not decide whether it holds there.
-    parallel = (within * within).sum(axis=1) <= PARALLEL**2 * (here * here).sum(axis=1)
-    within = np.where(parallel[:, None], 0.0, within)
-    left = np.where(parallel, left * (1.0 + PARALLEL) + PARALLEL * np.abs(offset[:, problem]), left)
-    moves = closest_between(np.zeros(plane.shape[1:]), offset[:, problem] + _changes(here, foot), within, left)
-    found = foot + (plane * moves).sum(axis=1)
-    distance = np.sqrt(((found - start) ** 2).sum(axis=0))
-    least = np.full(wanted.shape[1], np.inf)
-    np.fmin.at(least, problem, distance)
-    best = distance == least[problem]
-    closest[:, problem[best]] = found[:, best]
+    beyond &= (limits >= 0.0).all(axis=0)
+    if len(wanted) == 2:
+        return _closest_on_edges(closest, wanted, values, effect, limits, beyond)
+    for each in np.flatnonzero(beyond.any(axis=0)):
+        closest[:, each] = wanted[:, each] + _shortest(effect, values[:, each], limits[:, each])
     return closest
 
 
-def _changes(effect: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """Returns effect u row by row, shape (r, N), of inputs (m, N); effect as in `closest_between`."""
-    return effect[..., 0] @ inputs if effect.shape[2] == 1 else (effect * inputs).sum(axis=1)
+def _closest_in_interval(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns what `closest_between` does for one input, whose effect may differ between problems, shape (r, N)."""
+    inverse = 1.0 / effect
+    flat = np.isinf(inverse)
+    middle, half = offset * -inverse, limits * np.abs(inverse)
+    low, high = middle - half, middle + half
+    if np.count_nonzero(flat):  # rows that no input moves
+        low = np.where(flat, np.where(np.abs(offset) <= limits, -np.inf, np.inf), low)
+        high = np.where(flat, np.inf, high)
+    low, high = low.max(axis=0), high.min(axis=0)
+    return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
+
+
+def _closest_on_edges(
+    closest: np.ndarray, wanted: np.ndarray, values: np.ndarray, effect: np.ndarray, limits: np.ndarray, beyond: Any
+) -> np.ndarray:
+    """Returns `closest`, shape (2, N), with what `closest_between` finds of two inputs, many problems at once.
+
+    The closest point lies on an edge that the wanted one is beyond, and on the line of each of these it is in an
+    interval. `values` are those of the rows at the wanted inputs, `beyond` says which problems are beyond which edges.
+    """
+    row, problem = np.nonzero(beyond & effect.any(axis=1)[:, None])
+    normals = effect[row].T
+    way = np.sign(values[row, problem]) * limits[row, problem] - values[row, problem]
+    foot = normals * (way / (normals * normals).sum(axis=0))
+    line = np.stack([-normals[1], normals[0]]) / np.hypot(*normals)
+    left, along = limits[:, problem], effect @ line
+    left[row, np.arange(len(row))] = np.inf  # the edge itself
+    # A row that is parallel to the edge does not change on its line: rounding must not decide whether it holds there.
+    parallel = along * along <= PARALLEL**2 * (effect * effect).sum(axis=1)[:, None]
+    along = np.where(parallel, 0.0, along)
+    left = np.where(parallel, left * (1.0 + PARALLEL) + PARALLEL * np.abs(values[:, problem]), left)
+    start = values[:, problem] + effect @ foot
+    moves = foot + line * _closest_in_interval(np.zeros((1, len(row))), start, along, left)
+    distance = np.hypot(*moves)
+    least = np.full(wanted.shape[1], np.inf)
+    np.fmin.at(least, problem, distance)
+    best = distance == least[problem]
+    closest[:, problem[best]] = (wanted[:, problem] + moves)[:, best]
+    return closest
+
+
+def _shortest(effect: np.ndarray, values: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns argmin |x| over |values + effect x| <= limits, shape (m,); NaN where there is none.
+
+    For rows G x >= h that is a problem of least distance: with z >= 0 of the smallest r = (G' z, h' z - 1),
+    x = -r[:m] / r[m] (Lawson and Hanson 1974, chapter 23, docs/bibliography.md).
+
+    Args:
+        effect: Shape (r, m).
+        values: Shape (r,); x = 0 does not fulfil all rows.
+        limits: Shape (r,).
+    """
+    from scipy.optimize import nnls  # takes long to import
+
+    none, sizes = np.full(effect.shape[1], np.nan), np.sqrt((effect * effect).sum(axis=1))
+    moved = sizes > 0.0
+    if not (np.abs(values[~moved]) <= limits[~moved]).all():
+        return none
+    G = effect[moved] / sizes[moved, None]
+    G, h = np.concatenate([-G, G]), np.concatenate([values - limits, -values - limits])[np.tile(moved, 2)]
+    h = h / np.tile(sizes[moved], 2)
+    farthest = float(h.max())
+    try:
+        z, left = nnls(np.vstack([G.T, h / farthest]), np.eye(len(none) + 1)[-1])
+    except (RuntimeError, ValueError):  # no solution within its steps, or what is not finite
+        return none
+    return (G.T @ z) * (farthest / (1.0 - float(h @ z) / farthest)) if left > NOTHING_LEFT else none

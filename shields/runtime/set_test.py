@@ -217,7 +217,7 @@ class SetTest:
         rows = np.concatenate([self.input_rows[self.cone :], np.eye(len(half))])
         offset = np.concatenate([offset, np.broadcast_to(-middle, inputs.shape)])
         bounds = np.concatenate([row_limits, np.broadcast_to(half, inputs.shape)])
-        return closest_between(inputs, offset, rows[..., None], bounds)
+        return closest_between(inputs, offset, rows, bounds)
 
     @own_error_state
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:

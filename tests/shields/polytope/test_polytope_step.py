@@ -9,6 +9,7 @@ import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from ncs_gym import AdversarialDisturbance, ChannelContract, Ellipsoid, LinearPlant
 from ncs_gym.processes.plant_step import BlockSampler
@@ -98,7 +99,7 @@ def test_closest_points_are_those_of_a_conic_solver_in_three_dimensions():
     rng = np.random.default_rng(0)
     effect, room = rng.standard_normal((12, 3)), rng.uniform(0.2, 1.0, (12, 40))
     offset, wanted = 0.3 * rng.standard_normal((12, 40)), rng.uniform(-3.0, 3.0, (3, 40))
-    found = closest_between(wanted, offset, np.repeat(effect[..., None], 40, axis=-1), room)
+    found = closest_between(wanted, offset, effect, room)
     infeasible = 0
     for k in range(40):
         u = cp.Variable(3)
@@ -112,6 +113,22 @@ def test_closest_points_are_those_of_a_conic_solver_in_three_dimensions():
             infeasible += 1
             assert np.isnan(found[:, k]).all()
     assert infeasible < 30
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_closest_points_do_not_depend_on_units_and_bear_many_rows(unit):
+    """Far outside nearly all of 150 rows in four dimensions: the optimality conditions hold, and so does every row."""
+    rng = np.random.default_rng(1)
+    effect, room = rng.standard_normal((150, 4)), rng.uniform(0.5, 1.0, (150, 20))
+    wanted = rng.uniform(-30.0, 30.0, (4, 20))
+    found = closest_between(unit * wanted, np.zeros((150, 20)), effect / unit, room) / unit
+    values = effect @ found
+    assert (np.abs(values) <= room * (1.0 + 1e-9)).all()
+    for k in range(20):  # what is left to the wanted point is a nonnegative sum of the normals of active rows
+        active = room[:, k] - np.abs(values[:, k]) < 1e-7
+        normals = effect[active] * np.sign(values[active, k])[:, None]
+        assert active.any()
+        assert nnls(normals.T, (wanted - found)[:, k])[1] < 1e-6
 
 
 def test_rows_given_twice_or_with_both_signs_change_no_projection():
@@ -135,8 +152,8 @@ def test_parallel_rows_do_not_hide_the_closest_point():
         effect = np.stack([row, rng.uniform(0.1, 3.0) * row, [1.0, 0.0], [0.0, 1.0]])
         room = np.array([1.0, np.linalg.norm(effect[1]) / np.linalg.norm(row), 5.0, 5.0])
         wanted = 3.0 * rng.standard_normal((2, 1))
-        found = closest_between(wanted, np.zeros((4, 1)), effect[..., None], room[:, None])[:, 0]
-        once = closest_between(wanted, np.zeros((3, 1)), effect[[0, 2, 3], :, None], room[[0, 2, 3], None])[:, 0]
+        found = closest_between(wanted, np.zeros((4, 1)), effect, room[:, None])[:, 0]
+        once = closest_between(wanted, np.zeros((3, 1)), effect[[0, 2, 3]], room[[0, 2, 3], None])[:, 0]
         np.testing.assert_allclose(found, once, atol=1e-9)
 
 
