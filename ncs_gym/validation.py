@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 import warnings
@@ -94,6 +95,13 @@ class ReadOnlyArrays:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
+
+
+class CopiedWhole:
+    """Mixin for what changes from step to step: no copy shares anything with it, shallow copies neither."""
+
+    def __copy__(self) -> Self:
+        return copy.deepcopy(self)
 
 
 def setting(name: str, kept_as: str | None = None) -> Any:

@@ -200,5 +200,6 @@ def _numbers(value: Any, name: str) -> np.ndarray:
         if array.dtype.kind != "c":
             return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's, of a tensor without numbers
-        raise ValueError(f"{name} must be numbers, got {type(value).__name__}: {error}") from error
+        holds = "what torch.func and torch.export transform, and the meta device, have no numbers to decide about"
+        raise ValueError(f"{name} must be numbers, got {type(value).__name__}: {error} ({holds})") from error
     raise ValueError(f"{name} must be real numbers, got {array.dtype}")

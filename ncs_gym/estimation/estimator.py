@@ -21,7 +21,7 @@ from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import again_if_interrupted, frozen, own_error_state, setting
+from ncs_gym.validation import CopiedWhole, again_if_interrupted, frozen, own_error_state, setting
 
 
 class Estimate(NamedTuple):
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
     newest: int
 
 
-class Estimator:
+class Estimator(CopiedWhole):
     """Estimates the state from time-stamped packets that may be lost, late, reordered or duplicated.
 
     The packets of a step are applied at the steps their samples were taken at, and everything after is replayed. Next

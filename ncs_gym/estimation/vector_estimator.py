@@ -12,10 +12,10 @@ import numpy as np
 from ncs_gym.estimation.arrival_histories import NO_REPLAY, NO_SAMPLE, UNKNOWN, ArrivalHistories
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum_in_axes
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import frozen
+from ncs_gym.validation import CopiedWhole, frozen
 
 
-class VectorEstimator:
+class VectorEstimator(CopiedWhole):
     """What `Estimator` does, for N environments.
 
     Args:

@@ -17,7 +17,7 @@ import numpy as np
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
-from ncs_gym.validation import as_count, as_flag, as_numbers, read_only, shown
+from ncs_gym.validation import CopiedWhole, as_count, as_flag, as_numbers, read_only, shown, warn_caller
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
@@ -158,7 +158,7 @@ def digest_of_inputs(before: bytes, u: np.ndarray | None) -> bytes:
     return blake2b(before + (b"" if u is None else (u + 0.0).astype("<f8").tobytes()), digest_size=16).digest()
 
 
-class Actuator:
+class Actuator(CopiedWhole):
     """Applies at each step the input that was committed for it, or zero if no command with it has arrived.
 
     Commands may be lost, late, early, duplicated or overtake each other: what is committed for a step is the same in
@@ -176,7 +176,7 @@ class Actuator:
         missing: Whether the input applied last was zero because the committed one had not arrived.
         requested: After `apply`, whether a sensor beside the actuator takes the sample of the next step, where samples
             are on request: not if a command said so, and always where none has arrived.
-        refused: How many commands of this episode were refused.
+        refused: How many commands were refused in this episode, those of a later one included.
         echo: What was applied since the start of the episode, for `SafeLoop.receive(echoes=...)`.
 
     Raises:
@@ -218,6 +218,8 @@ class Actuator:
             )
         now = self.echo.steps
         for command in [_as_command(each, (self.input_delay + 1, len(self._nothing))) for each in commands]:
+            if command.episode > self.echo.episode:
+                self._refuse_later(command.episode)
             if command.episode != self.echo.episode:
                 continue
             if command.stamp > now + self.input_delay + 1 or (np.abs(command.inputs) > self._limits).any():
@@ -229,6 +231,15 @@ class Actuator:
             for ahead, requested in enumerate(command.requests, command.stamp):
                 if ahead >= now:
                     self._requested.setdefault(ahead, requested)
+
+    def _refuse_later(self, episode: int) -> None:
+        self.refused += 1
+        if self.refused == 1:
+            warn_caller(
+                f"a command of episode {episode} was refused in episode {self.echo.episode}, and no input of it is "
+                f"applied: start({episode}) begins it",
+                UserWarning,
+            )
 
     def apply(self, step: int) -> np.ndarray:
         """Returns the input to apply at a step, shape (m,) [physical units], as a new array.

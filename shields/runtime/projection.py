@@ -185,7 +185,7 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     values = offset + effect @ wanted
     beyond = ~(np.abs(values) <= limits)
     closest = np.where(beyond.any(axis=0), np.nan, wanted)
-    beyond &= (limits >= 0.0).all(axis=0)
+    beyond = beyond & (limits >= 0.0).all(axis=0)
     if len(wanted) == 2:
         return _closest_on_edges(closest, wanted, values, effect, limits, beyond)
     for each in np.flatnonzero(beyond.any(axis=0)):
@@ -207,14 +207,19 @@ def _closest_in_interval(wanted: np.ndarray, offset: np.ndarray, effect: np.ndar
 
 
 def _closest_on_edges(
-    closest: np.ndarray, wanted: np.ndarray, values: np.ndarray, effect: np.ndarray, limits: np.ndarray, beyond: Any
+    closest: np.ndarray,
+    wanted: np.ndarray,
+    values: np.ndarray,
+    effect: np.ndarray,
+    limits: np.ndarray,
+    beyond: np.ndarray,
 ) -> np.ndarray:
     """Returns `closest`, shape (2, N), with what `closest_between` finds of two inputs, many problems at once.
 
     The closest point lies on an edge that the wanted one is beyond, and on the line of each of these it is in an
     interval. `values` are those of the rows at the wanted inputs, `beyond` says which problems are beyond which edges.
     """
-    row, problem = np.nonzero(beyond & effect.any(axis=1)[:, None])
+    row, problem = np.nonzero(beyond & (effect != 0.0).any(axis=1)[:, None])
     normals = effect[row].T
     way = np.sign(values[row, problem]) * limits[row, problem] - values[row, problem]
     foot = normals * (way / (normals * normals).sum(axis=0))

@@ -17,7 +17,17 @@ from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
 from ncs_gym.network.downlink import as_echo
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.network.requests import Requests, require_on_request
-from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, own_error_state, setting, shown, warn_caller
+from ncs_gym.validation import (
+    CopiedWhole,
+    as_count,
+    as_flag,
+    as_numbers,
+    as_vector,
+    own_error_state,
+    setting,
+    shown,
+    warn_caller,
+)
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
 from shields.runtime.decisions import Decision
@@ -49,7 +59,7 @@ class _Phase(Enum):
     DECIDED = auto()
 
 
-class SafeLoop:
+class SafeLoop(CopiedWhole):
     """Keeps a real plant in its safe set, whatever its controller proposes (docs/deployment.md).
 
     One control step is `receive`, which moves the estimate to now, your controller, and `decide`, whose input is

@@ -82,3 +82,13 @@ def test_empty_batches_give_empty_ones(setting):
     safe = layer(actions, torch.tensor(empty))
     safe.sum().backward()
     assert safe.shape == (0, plant.m)
+
+
+def test_what_has_no_numbers_to_decide_about_is_named(setting):
+    plant, certificate, estimates, _, actions = setting
+    layer = SafeLayer(certificate, plant)
+    given = torch.tensor(actions[:3]), torch.tensor(estimates[:3])
+    with pytest.raises(ValueError, match=r"what torch.func and torch.export transform, and the meta device"):
+        torch.func.vmap(lambda u, x: layer(u[None], x[None])[0])(*given)
+    with pytest.raises(ValueError, match=r"what torch.func and torch.export transform, and the meta device"):
+        layer(*(each.to("meta") for each in given))

@@ -1,5 +1,8 @@
 """Mistakes that used to pass in silence: each is refused with a sentence, or heard."""
 
+import copy
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,7 +12,18 @@ from stable_baselines3.common.monitor import Monitor
 
 from agents import SafetyCallback
 from agents.loop import CostPenalty
-from ncs_gym import Channel, LinearPlant, NCSEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
+from ncs_gym import (
+    Actuator,
+    Channel,
+    Command,
+    Estimator,
+    LinearPlant,
+    NCSEnv,
+    Packet,
+    UnusedPacketsWarning,
+    cart_pole,
+    truck_trailer,
+)
 from shields import SafeLoop, SafetyFilter, SafetyShield, synthesize
 from tests.certificates import certificate_of
 
@@ -117,3 +131,54 @@ def test_monitor_has_the_share_of_guaranteed_states(certificate):
     while not (result := shield.step([0.1]))[3]:
         pass
     assert result[4]["episode"]["episode_guaranteed"] == 8 / 20
+
+
+def test_copy_of_a_loop_shares_nothing_with_it(certificate):
+    """A shallow copy that shared the estimator would go on with what the other was told, and be guaranteed outside."""
+    loop = SafeLoop(certificate, PLANT, Channel(delay=1))
+    loop.start([0.0, 0.0])
+    x = np.zeros(2)
+    for k in range(30):
+        loop.receive([Packet(k, x, loop.episode)] if k else [])
+        x = PLANT.A @ x + PLANT.B @ loop.decide([4.0]).input
+    trial, own = copy.copy(loop), copy.deepcopy(loop)
+    for _ in range(50):
+        trial.receive()
+        trial.decide([-4.0])
+        loop.receive()
+        own.receive()
+        np.testing.assert_array_equal(loop.decide([4.0]).input, own.decide([4.0]).input)
+        assert loop.guaranteed == own.guaranteed
+
+
+def test_copies_of_estimators_and_actuators_share_nothing():
+    estimator, actuator = Estimator(PLANT, Channel()), Actuator(1, 1)
+    estimator.reset(np.zeros(2))
+    others = copy.copy(estimator), copy.copy(actuator)
+    before = others[0].mean.copy()
+    for _ in range(5):
+        estimator.advance(np.ones(1), [])
+    actuator.receive([Command(0, [[1.0], [2.0]])])
+    actuator.apply(0)
+    np.testing.assert_array_equal(others[0].mean, before)
+    assert others[0].step == 0
+    assert others[1].echo.steps == 0
+    assert others[1].apply(1).item() == 0.0
+    assert others[1].missing
+
+
+def test_commands_of_an_episode_that_an_actuator_has_not_begun_are_named_once():
+    actuator = Actuator(1, 1)
+    actuator.receive([Command(0, [[0.0], [1.0]])])
+    actuator.apply(0)
+    with pytest.warns(UserWarning, match=r"episode 2 was refused in episode 0.*start\(2\) begins it"):
+        actuator.receive([Command(0, [[0.0], [1.0]], episode=2)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        actuator.receive([Command(1, [[0.0], [1.0]], episode=2)])
+    assert actuator.refused == 2
+    actuator.start(2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        actuator.receive([Command(5, [[0.0], [1.0]], episode=0)])  # late ones of an earlier episode are usual
+    assert actuator.refused == 0
