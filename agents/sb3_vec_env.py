@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ncs_gym import NCSVectorEnv
-from ncs_gym.envs.settings import CHANNELS
+from ncs_gym.validation import AroundEnvironment, require_not_inside
 
 # Networks of control loops are small: more threads wait for each other, pay off at batches of 16384 only, and make
 # results depend on their number. Set once, at the import, so that torch.set_num_threads afterwards has the last word.
@@ -40,7 +40,7 @@ _STATEFUL_ATTRIBUTES = (
 )
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(AroundEnvironment, VecEnv):
     """A gymnasium `VectorEnv` as a stable-baselines3 `VecEnv`.
 
     stable-baselines3 expects the step that ends an episode to return the first observation of the next episode, and
@@ -73,6 +73,8 @@ class SB3VecEnv(VecEnv):
             observations are not arrays.
     """
 
+    _inside = "_made_around"
+
     def __init__(
         self, vector_env: VectorEnv, *, allow_reset_transitions: bool = False, info_keys: Sequence[str] = ()
     ) -> None:
@@ -93,9 +95,10 @@ class SB3VecEnv(VecEnv):
         self.batch_info: dict[str, Any] = {}
         self._started = time.time()
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
+        self._made_around = vector_env
 
     def reset(self) -> np.ndarray:
-        """Starts all episodes, with the seeds and options given by `seed` and `set_options`.
+        """Starts all episodes, with the seeds and options given by `seed` and `set_options`, which are for these only.
 
         Raises:
             ValueError: If options differ between environments, or `info_keys` names what no info has.
@@ -106,7 +109,6 @@ class SB3VecEnv(VecEnv):
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
-        self._kept = {name: option for name, option in options.items() if name in CHANNELS}
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         self._require_known_keys(info)
         self._reset_seeds()
@@ -148,7 +150,7 @@ class SB3VecEnv(VecEnv):
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._masks and self._mode is not AutoresetMode.SAME_STEP:
-                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy(), **self._kept})
+                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
                 observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
                 for e in np.flatnonzero(done).tolist():
                     self.reset_infos[e] = {key: value[e] for key, value in _dense(reset_info).items()}
@@ -199,6 +201,7 @@ class SB3VecEnv(VecEnv):
         """
         inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
+            require_not_inside(attr_name, self.vector_env, "SB3VecEnv")
             raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
         values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
         for e in chosen:

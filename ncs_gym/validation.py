@@ -96,23 +96,72 @@ class ReadOnlyArrays:
         return self
 
 
-def setting(name: str, kept_as: str | None = None) -> Any:
+class Setting(property):
+    """A property that is read, and never set; see `setting`."""
+
+    def __init__(self, name: str, kept_as: str, instead: str) -> None:
+        super().__init__(attrgetter(kept_as), self._refuse)
+        self._name, self._instead = name, instead
+
+    def refusal(self, owner: Any) -> str:
+        """Returns why it cannot be set, and how to make another object."""
+        kind = type(owner).__name__
+        way = f", as in {owner.made_by}" if hasattr(owner, "made_by") else ""
+        why = f"{self._name} is a setting of {kind} and cannot be changed: make another {kind} with it{way}"
+        return why + self._instead
+
+    def _refuse(self, owner: Any, value: Any) -> None:
+        raise AttributeError(self.refusal(owner))
+
+
+def setting(name: str, kept_as: str | None = None, instead: str = "") -> Any:
     """Returns a property for what an object is made with, and other parts of it rest on: it is read, and never set.
 
-    Who tries is told how to make another object; a class may say so by its attribute `made_by`.
+    Assigning raises an error that says how to make another object; a class may say so by its attribute `made_by`.
 
     Args:
         name: Of the property.
         kept_as: Attribute that holds the value, also of a part ("part.attribute"); the name after an underscore by
             default.
+        instead: End of the error's sentence, which says what else can be done.
+    """
+    return Setting(name, kept_as or f"_{name}", instead)
+
+
+class AroundEnvironment:
+    """Mixin of wrappers: setting what only something inside has raises an error, since it would have no effect.
+
+    Names that nothing inside has are the wrapper's own, and may be set. Of those, `__init__` sets before `env` what
+    something inside may have too.
     """
 
-    def refuse(owner: Any, value: Any) -> None:
-        kind = type(owner).__name__
-        way = f", as in {owner.made_by}" if hasattr(owner, "made_by") else ""
-        raise AttributeError(f"{name} is a setting of {kind} and cannot be changed: make another {kind} with it{way}")
+    # Attribute that holds what is inside.
+    _inside = "env"
 
-    return property(attrgetter(kept_as or f"_{name}"), refuse)
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name[0] != "_" and name not in self.__dict__ and not hasattr(type(self), name):
+            require_not_inside(name, self.__dict__.get(self._inside), type(self).__name__)
+        super().__setattr__(name, value)
+
+
+def require_not_inside(name: str, inside: Any, outside: str) -> None:
+    """Raises AttributeError if setting an attribute outside would have no effect, because something inside has it.
+
+    Args:
+        name: Of the attribute.
+        inside: The outermost of the layers inside; None for none.
+        outside: What it would be set on, for the message.
+    """
+    layer = inside
+    while layer is not None:
+        own = getattr(layer, "__dict__", {})
+        if name in own or hasattr(type(layer), name):
+            kept = getattr(type(layer), name, None)
+            if isinstance(kept, Setting):
+                raise AttributeError(kept.refusal(layer))
+            kind = type(layer).__name__
+            raise AttributeError(f"{name} belongs to the {kind} inside: set on {outside} it would have no effect")
+        layer = own.get("env")
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

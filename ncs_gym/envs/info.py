@@ -65,6 +65,7 @@ def loop_info(
     contract: ChannelContract | None,
     constraints: Constraints,
     sampled: Requested,
+    network: dict[str, Any],
 ) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
@@ -77,6 +78,7 @@ def loop_info(
         contract: What the channel guarantees, if anything.
         constraints: How the safe box is kept; `values`, `cost` and `violations` are fresh arrays.
         sampled: What was requested in the step.
+        network: What `EpisodeChannels.infos` says.
     """
     values, worst, cost, violations = constraints
     many, oldest = state.ndim > 1, np.inf if contract is None else contract.max_age
@@ -104,4 +106,5 @@ def loop_info(
         "requested": own(sampled.requested),
         "request_forced": own(sampled.forced),
         "packets": own(sampled.packets),
+        **({key: value.copy() for key, value in network.items()} if many else network),
     }

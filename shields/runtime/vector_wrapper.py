@@ -42,7 +42,7 @@ class Clock(NamedTuple):
     ticks: int
 
 
-class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
+class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
     """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
 
     Every info value has N as its first axis; `shield_reason` is an array of str objects, read-only while
