@@ -141,7 +141,7 @@ class AroundEnvironment:
     def __setattr__(self, name: str, value: Any) -> None:
         if name[0] != "_" and name not in self.__dict__ and not hasattr(type(self), name):
             require_not_inside(name, self.__dict__.get(self._inside), type(self).__name__)
-        super().__setattr__(name, value)
+        object.__setattr__(self, name, value)
 
 
 def require_not_inside(name: str, inside: Any, outside: str) -> None:
