@@ -170,7 +170,7 @@ def _fits(value: Any, annotation: Any) -> bool:
     return isinstance(value, (*kinds, int) if float in kinds else tuple(kinds))
 
 
-# The info that says what was applied; in its place `SB3VecEnv` has to be asked for it.
+# The info that says what was applied.
 APPLIED = "input_committed"
 
 
@@ -178,8 +178,7 @@ class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
     Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits":
-    plant.input_ends}`; `SB3VecEnv` needs `info_keys=("input_committed",)`. `train` does so with the hyperparameter
-    `stored_action="applied"`.
+    plant.input_ends}`. `train` does so with the hyperparameter `stored_action="applied"`.
 
     Args:
         arguments: Those of `ReplayBuffer`.
@@ -207,6 +206,6 @@ class AppliedActionBuffer(ReplayBuffer):
             ValueError: If infos do not say what was applied.
         """
         if any(APPLIED not in info for info in infos):
-            raise ValueError(f'infos have no "{APPLIED}": make SB3VecEnv(..., info_keys=("{APPLIED}",))')
+            raise ValueError(f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym')
         applied = (np.array([info[APPLIED] for info in infos]) - self._middle) / self._half
         super().add(obs, next_obs, applied.reshape(action.shape).astype(action.dtype), reward, done, infos)

@@ -75,7 +75,7 @@ def trained(env_id: str, algorithm: str, layer: SafeLayer | None, seed: int, ste
     single = ncs_env(gym.make(env_id))
     certificate = certificate_for(single.plant, single.certificate_contract)
     shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=32), certificate)
-    envs, plant = SB3VecEnv(shield, info_keys=("input_committed",)), single.plant
+    envs, plant = SB3VecEnv(shield), single.plant
     own = {} if layer is None else {"layer": layer}
     if algorithm == "PPO":
         settings = {"n_steps": 32, "batch_size": 256, "n_epochs": 5, "gamma": 0.9, "gae_lambda": 0.98}
