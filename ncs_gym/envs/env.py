@@ -21,7 +21,7 @@ from ncs_gym.envs.settings import (
     start_option,
     starting_set,
 )
-from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
+from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -96,6 +96,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
     | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
+    | `action_applied` | `(m,)` | - | the action in [-1, 1] that stands for `input`, float32 |
+    | `action_committed` | `(m,)` | - | the action that stands for `input_committed`, which clones learn |
     | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in halves of its range; positive is violated |
     | `worst_constraint_values` | `(k,)` | - | the largest since the last step, also between samples if they count |
     | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
@@ -456,7 +458,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
         happened = estimator.mean, self._state, inputs.missing, arrived
-        return loop_info(self._known, *happened, self._contract, constraints, sampled, self._network)
+        told = constraints, sampled, self._network, actions_of(inputs, self._plant)
+        return loop_info(self._known, *happened, self._contract, *told)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -15,7 +15,7 @@ from ncs_gym.envs.episode_channels import channel_infos, covering, downlinks, up
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import CHANNELS, channel_setting, vector_reset_options
-from ncs_gym.envs.spaces import Observer, read_actions
+from ncs_gym.envs.spaces import Observer, actions_of, read_actions
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
@@ -445,7 +445,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             asked, forced = self._requests.requested, self._requests.forced
         happened = self._estimator.mean, self._state, inputs.missing, arrived
         sampled = Requested(asked, forced, self._packets)
-        return loop_info(self._known, *happened, self._contract, constraints, sampled, self._network)
+        told = constraints, sampled, self._network, actions_of(inputs, self._plant)
+        return loop_info(self._known, *happened, self._contract, *told)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
