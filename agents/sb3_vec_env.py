@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.step_info import step_infos
 from ncs_gym import NCSVectorEnv
-from ncs_gym.validation import AroundEnvironment, require_not_inside
+from ncs_gym.validation import AroundEnvironment, require_batched_infos, require_not_inside
 
 # Networks of control loops are small: more threads wait for each other, pay off at batches of 16384 only, and make
 # results depend on their number. Set once, at the import, so that torch.set_num_threads afterwards has the last word.
@@ -105,6 +105,7 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
+        require_batched_infos(info, "SB3VecEnv")
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{key: value[e] for key, value in _dense(info).items()} for e in range(self.num_envs)]

@@ -177,6 +177,20 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
+def require_batched_infos(info: Any, outside: str) -> None:
+    """Raises ValueError unless the infos of a vector environment are a dictionary of arrays, as wrappers outside need.
+
+    Args:
+        info: The infos.
+        outside: The wrapper that reads them, for the message.
+    """
+    if not isinstance(info, dict):
+        raise ValueError(
+            f"{outside} reads a dictionary of arrays as infos, and a wrapper inside makes a {type(info).__name__} "
+            f"of them: put it (DictInfoToList, say) outside of {outside}"
+        )
+
+
 def printable(text: str) -> str:
     """Returns a text that means nothing to a terminal: characters that are not printed are escaped."""
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
@@ -197,12 +211,25 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as messages quote it: on one line, and not without end; a path as it is."""
+    """Returns a value as messages quote it: on one line, and not without end; a path as it is.
+
+    Of a tensor with gradient, which is no array, it says what to do.
+    """
     try:
         text = " ".join((str(value) if isinstance(value, PurePath) else repr(value)).split())
     except Exception:
         text = f"a {type(value).__name__}"
-    return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+    text = text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+    return f"{text}, which has a gradient: detach it (.detach())" if _has_gradient(value) else text
+
+
+def _has_gradient(value: Any) -> bool:
+    """Returns whether a value is a tensor of torch with gradient, or a list with one, which numpy makes no array of."""
+    try:
+        entries = value if isinstance(value, (list, tuple)) else (value,)
+        return any(getattr(entry, "requires_grad", False) is True for entry in entries)
+    except Exception:  # attributes of other people's objects may raise anything
+        return False
 
 
 def as_setting(value: Any) -> np.ndarray | None:

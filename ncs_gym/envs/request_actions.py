@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.validation import AroundEnvironment, as_number, as_numbers, shown
+from ncs_gym.validation import AroundEnvironment, as_number, as_numbers, require_batched_infos, shown
 
 
 class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
@@ -98,6 +98,7 @@ class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorAr
         """Starts episodes; see `NCSVectorEnv.reset`."""
         # gymnasium's annotation leaves out the lists that its own vector environments take.
         observations, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        require_batched_infos(info, "VectorRequestActions")
         self._packets = info["packets"]
         return self._seen(observations), info
 

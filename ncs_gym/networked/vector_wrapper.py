@@ -18,7 +18,7 @@ from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
-from ncs_gym.validation import AroundEnvironment
+from ncs_gym.validation import AroundEnvironment, require_batched_infos
 
 
 class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
@@ -105,6 +105,7 @@ class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
         observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
+        require_batched_infos(info, "VectorNetworked")
         first = seed[0] if isinstance(seed, list) else seed
         if first is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
