@@ -54,7 +54,7 @@ def finished(command, settings, file="summary.json"):
         ("attack", AttackSettings, {"mode": "switch"}, "mode"),
         ("study", StudySettings, {"budget": 0.5}, "budget"),
         ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
-        ("attack", AttackSettings, {"steps": 1e7}, "steps"),
+        ("attack", AttackSettings, {"steps": 1e6}, "steps"),
         ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
     ],
 )
