@@ -241,9 +241,14 @@ def as_setting(value: Any) -> np.ndarray | None:
 def _as_array(value: Any) -> np.ndarray:
     """Returns an array, also of a sparse matrix of scipy, which numpy takes for an object, unless it is too large."""
     array = np.asarray(value)
-    if array.dtype.kind == "O" and array.ndim == 0 and hasattr(value, "toarray") and hasattr(value, "nnz"):
+    if array.dtype.kind == "O" and array.ndim == 0 and _is_sparse(value):
         return value.toarray() if math.prod(value.shape) <= MOST_EXPANDED else array
     return array
+
+
+def _is_sparse(value: Any) -> bool:
+    """Returns whether a value is a sparse matrix of scipy."""
+    return hasattr(value, "toarray") and hasattr(value, "nnz")
 
 
 def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
@@ -258,6 +263,12 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
     matrix = as_setting(value)
+    if matrix is None and _is_sparse(value) and math.prod(value.shape) > MOST_EXPANDED:
+        sizes = " x ".join(map(str, value.shape))
+        raise ValueError(
+            f"{name} is a sparse matrix of {sizes} entries, which is not expanded beyond {MOST_EXPANDED:,} of them: "
+            "reduce the model"
+        )
     if matrix is None:
         raise ValueError(f"{name} must be a matrix of numbers, got {shown(value)}")
     expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"

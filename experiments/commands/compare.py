@@ -25,7 +25,7 @@ from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import decimals_of, scenario_text, summary_text
-from experiments.runs.arms import Arm, by_arm
+from experiments.runs.arms import Arm, by_arm, full_names
 from experiments.runs.experiment import (
     certificate_line,
     certificate_of,
@@ -99,9 +99,7 @@ def shortened(settings: CompareSettings) -> CompareSettings:
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
     """Returns the settings with the full names of arms, each of which is listed once."""
-    arms, baselines = (
-        tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.baselines)
-    )
+    arms, baselines = (full_names(names, settings.mode) for names in (settings.arms, settings.baselines))
     if len(set(arms)) != len(arms) or not arms:
         raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
     baselines = tuple(name for name in dict.fromkeys(baselines) if name not in arms)

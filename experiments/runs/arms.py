@@ -108,6 +108,11 @@ class Arm:
         return training, filtered()
 
 
+def full_names(names: Sequence[str], mode: str) -> tuple[str, ...]:
+    """Returns the full names of arms, under which results are kept; see `Arm.of`."""
+    return tuple(Arm.of(name, mode).name for name in names)
+
+
 def is_shield(mode: str | None) -> bool:
     """Returns whether a mode is one of the shield's that protects: not "monitor", and no other filter."""
     return mode in _SHIELD_MODES
