@@ -1,7 +1,7 @@
 """Shows Minari: a dataset of shielded episodes for offline learning, with the cost of every step among the infos.
 
-The collector stands inside the shield, so that the actions stored are those that were applied. Takes about five seconds
-on one core; needs minari with its extras "create" and "hdf5". The dataset goes into Minari's own folder.
+Takes about five seconds on one core; needs minari with its extras "create" and "hdf5". The dataset goes into Minari's
+own folder. The collector stands inside the shield, so that the actions stored are those that were applied.
 """
 
 import gymnasium as gym
