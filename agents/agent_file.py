@@ -91,11 +91,21 @@ def pretrained_folder(env_id: str) -> Path:
     Raises:
         AgentError: If the package has none for it; the message names those that it has.
     """
-    root = Path(str(resources.files("agents"))) / "trained"
-    found = {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
+    found = _pretrained()
     if env_id not in found:
         raise AgentError(f"there is no pretrained agent of {shown(env_id)}, only of {', '.join(found)}")
     return found[env_id]
+
+
+def has_pretrained(env_id: str) -> bool:
+    """Returns whether an agent of an environment comes with the package."""
+    return env_id in _pretrained()
+
+
+def _pretrained() -> dict[str, Path]:
+    """Returns the folders of the agents that come with the package, by the ids of their environments."""
+    root = Path(str(resources.files("agents"))) / "trained"
+    return {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
 
 
 def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:

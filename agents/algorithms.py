@@ -107,7 +107,6 @@ def _arguments(
         raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
     if stored == "applied":
         own["replay_buffer_class"] = AppliedActionBuffer
-        own["replay_buffer_kwargs"] = {"limits": env.get_attr("plant")[0].input_ends}
     if (noise_type := hyperparams.get("noise_type")) not in (None, "normal"):
         raise ValueError(f"noise_type cannot be {shown(noise_type)}")
     if (deviation := hyperparams.get("noise_std")) is not None:
@@ -170,27 +169,16 @@ def _fits(value: Any, annotation: Any) -> bool:
     return isinstance(value, (*kinds, int) if float in kinds else tuple(kinds))
 
 
-# The info that says what was applied; in its place `SB3VecEnv` has to be asked for it.
-APPLIED = "input_committed"
+# The info that says what was applied: behind a downlink what was decided, to be applied later.
+APPLIED = "action_committed"
 
 
 class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
-    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits":
-    plant.input_ends}`; `SB3VecEnv` needs `info_keys=("input_committed",)`. `train` does so with the hyperparameter
+    Hand it to SAC, TD3 and their kind as `replay_buffer_class`. `train` does so with the hyperparameter
     `stored_action="applied"`.
-
-    Args:
-        arguments: Those of `ReplayBuffer`.
-        limits: The ends of the inputs, shape (2, m), for which actions -1 and 1 stand.
-        keywords: Those of `ReplayBuffer`.
     """
-
-    def __init__(self, *arguments: Any, limits: Any, **keywords: Any) -> None:
-        super().__init__(*arguments, **keywords)
-        low, high = np.asarray(limits, dtype=np.float64)
-        self._middle, self._half = 0.5 * (low + high), 0.5 * (high - low)
 
     def add(
         self,
@@ -204,9 +192,14 @@ class AppliedActionBuffer(ReplayBuffer):
         """Adds a transition of every environment.
 
         Raises:
-            ValueError: If infos do not say what was applied.
+            ValueError: If infos do not say what was applied, or actions have entries that are no inputs.
         """
         if any(APPLIED not in info for info in infos):
-            raise ValueError(f'infos have no "{APPLIED}": make SB3VecEnv(..., info_keys=("{APPLIED}",))')
-        applied = (np.array([info[APPLIED] for info in infos]) - self._middle) / self._half
-        super().add(obs, next_obs, applied.reshape(action.shape).astype(action.dtype), reward, done, infos)
+            raise ValueError(f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym')
+        applied = np.array([info[APPLIED] for info in infos])
+        if applied.shape != action.shape:
+            raise ValueError(
+                f'"{APPLIED}" has the shape {applied.shape}, actions have {action.shape}: a wrapper adds entries to '
+                "them, which the buffer cannot store"
+            )
+        super().add(obs, next_obs, applied.astype(action.dtype), reward, done, infos)

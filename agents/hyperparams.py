@@ -109,8 +109,10 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
             (`n_envs`, `n_steps`, `n_epochs`, `buffer_size`) is out of range, or networks are larger than
             `MOST_WEIGHTS`.
     """
-    if algorithm not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm {algorithm!r}; known are {', '.join(ALGORITHMS)}")
+    if not (isinstance(algorithm, str) and algorithm in ALGORITHMS):
+        meant = [name for name in ALGORITHMS if name.lower() == str(algorithm).lower()]
+        advice = f"; it is written {meant[0]!r}" if meant else ""
+        raise ValueError(f"unknown algorithm {shown(algorithm)}{advice}; known are {', '.join(ALGORITHMS)}")
     if not isinstance(given, Mapping | None):
         raise ValueError(f"hyperparameters must be a dictionary, got {type(given).__name__}")
     hyperparams = with_changes(DEFAULTS[algorithm], _as_json(given or {}))

@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ncs_gym import Channel
 from ncs_gym.envs.json_settings import from_json
-from ncs_gym.validation import shown
+from ncs_gym.validation import AroundEnvironment, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import DEFAULT_HORIZON, MODES
@@ -151,7 +151,7 @@ class LoopConfig:
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
 
 
-class CostPenalty(VectorWrapper):
+class CostPenalty(AroundEnvironment, VectorWrapper):
     """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
 
     Args:
@@ -160,8 +160,8 @@ class CostPenalty(VectorWrapper):
     """
 
     def __init__(self, env: VectorEnv, penalty: float) -> None:
-        super().__init__(env)
         self.penalty = penalty
+        super().__init__(env)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Steps the environments; the cost of an episode's last step is read from its final info."""
@@ -174,7 +174,7 @@ class CostPenalty(VectorWrapper):
         return observation, rewards - self.penalty * cost, terminated, truncated, info
 
 
-class ResidualActions(VectorWrapper):
+class ResidualActions(AroundEnvironment, VectorWrapper):
     """Applies u = gain x_hat plus the agent's part, clipped to the limits (Silver et al. 2018).
 
     Args:
@@ -183,8 +183,8 @@ class ResidualActions(VectorWrapper):
     """
 
     def __init__(self, env: VectorEnv, gain: np.ndarray) -> None:
-        super().__init__(env)
         self.gain = gain
+        super().__init__(env)
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Starts episodes."""

@@ -13,8 +13,9 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.step_info import step_infos
 from ncs_gym import NCSVectorEnv
-from ncs_gym.envs.settings import CHANNELS
+from ncs_gym.validation import AroundEnvironment, require_batched_infos, require_not_inside
 
 # Networks of control loops are small: more threads wait for each other, pay off at batches of 16384 only, and make
 # results depend on their number. Set once, at the import, so that torch.set_num_threads afterwards has the last word.
@@ -24,8 +25,6 @@ torch.set_num_threads(1)
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
 _EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
-# Infos in the dicts of every step, asked for or not: what algorithms for constrained problems read.
-_STEP_KEYS = ("cost",)
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
 _STATEFUL_ATTRIBUTES = (
     "steps",
@@ -40,7 +39,7 @@ _STATEFUL_ATTRIBUTES = (
 )
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(AroundEnvironment, VecEnv):
     """A gymnasium `VectorEnv` as a stable-baselines3 `VecEnv`.
 
     stable-baselines3 expects the step that ends an episode to return the first observation of the next episode, and
@@ -50,10 +49,9 @@ class SB3VecEnv(VecEnv):
     once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
     Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`,
-    `is_success` and `episode_guaranteed` where there are such infos. Filling a dict per environment and step is slow.
-    Therefore the dicts hold by default only what the library needs, and `cost` where there is such an info:
-    `batch_info` has all values of the last step as arrays, and `info_keys` names further values to be copied into the
-    dicts.
+    `is_success` and `episode_guaranteed` where there are such infos. The dicts of all steps have all keys of
+    the infos; values are taken out of the arrays when they are read (`StepInfo`). `batch_info` has the arrays of the
+    last step.
 
     Importing this class sets torch to one thread, with which small networks train fastest; call
     `torch.set_num_threads` after the import for another number.
@@ -61,7 +59,6 @@ class SB3VecEnv(VecEnv):
     Args:
         vector_env: The vector environment.
         allow_reset_transitions: Whether to accept environments that take a step to reset.
-        info_keys: Infos that the dicts of every step hold besides `cost`; those of an episode's last step hold all.
 
     Attributes:
         vector_env: The vector environment.
@@ -73,14 +70,14 @@ class SB3VecEnv(VecEnv):
             observations are not arrays.
     """
 
-    def __init__(
-        self, vector_env: VectorEnv, *, allow_reset_transitions: bool = False, info_keys: Sequence[str] = ()
-    ) -> None:
+    _inside = "_made_around"
+
+    def __init__(self, vector_env: VectorEnv, *, allow_reset_transitions: bool = False) -> None:
         if not isinstance(vector_env, (VectorEnv, gym.vector.VectorWrapper)):
             raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
         if isinstance(vector_env.single_observation_space, (gym.spaces.Dict, gym.spaces.Tuple)):
             raise ValueError(f"observations must be arrays, got {vector_env.single_observation_space}")
-        self.vector_env, self._info_keys = vector_env, (*_STEP_KEYS, *info_keys)
+        self.vector_env = vector_env
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._masks = isinstance(vector_env.unwrapped, _WITH_RESET_MASK)
         if self._mode is not AutoresetMode.SAME_STEP and not self._masks and not allow_reset_transitions:
@@ -93,12 +90,13 @@ class SB3VecEnv(VecEnv):
         self.batch_info: dict[str, Any] = {}
         self._started = time.time()
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
+        self._made_around = vector_env
 
     def reset(self) -> np.ndarray:
-        """Starts all episodes, with the seeds and options given by `seed` and `set_options`.
+        """Starts all episodes, with the seeds and options given by `seed` and `set_options`, which are for these only.
 
         Raises:
-            ValueError: If options differ between environments, or `info_keys` names what no info has.
+            ValueError: If options differ between environments.
         """
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
@@ -106,22 +104,14 @@ class SB3VecEnv(VecEnv):
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
-        self._kept = {name: option for name, option in options.items() if name in CHANNELS}
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
-        self._require_known_keys(info)
+        require_batched_infos(info, "SB3VecEnv")
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{key: value[e] for key, value in _dense(info).items()} for e in range(self.num_envs)]
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
         self._resetting = np.zeros(self.num_envs, np.bool_)
         return observation
-
-    def _require_known_keys(self, info: dict[str, Any]) -> None:
-        """Raises ValueError unless all of `info_keys` occur; of other environments than ours a reset does not say."""
-        unknown = sorted(set(self._info_keys) - set(_STEP_KEYS) - set(info))
-        if unknown and isinstance(self.vector_env.unwrapped, NCSVectorEnv):
-            known = ", ".join(sorted(key for key in info if not key.startswith("_")))
-            raise ValueError(f"info_keys names {', '.join(map(repr, unknown))}, which no info has; known are {known}")
 
     def step_async(self, actions: np.ndarray) -> None:
         """Stores a copy of the actions for `step_wait`."""
@@ -138,17 +128,16 @@ class SB3VecEnv(VecEnv):
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             last = info["final_obs"]
             self.batch_info = _with_final(info, done)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         dense = _dense(self.batch_info)
-        for key in dense.keys() & self._info_keys:
-            for one, value in zip(infos, dense[key], strict=True):
-                one[key] = value
+        infos = step_infos(dense, self.num_envs)
+        if not self._masks:  # other people's vector environments may write into arrays of earlier steps
+            infos = [each.copy() for each in infos]
         for e in np.flatnonzero(done).tolist():
             infos[e] = self._last_info(e, dense, last[e], bool(truncated[e] and not terminated[e]))
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._masks and self._mode is not AutoresetMode.SAME_STEP:
-                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy(), **self._kept})
+                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
                 observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
                 for e in np.flatnonzero(done).tolist():
                     self.reset_infos[e] = {key: value[e] for key, value in _dense(reset_info).items()}
@@ -199,6 +188,7 @@ class SB3VecEnv(VecEnv):
         """
         inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
+            require_not_inside(attr_name, self.vector_env, "SB3VecEnv")
             raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
         values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
         for e in chosen:

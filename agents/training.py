@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
-from agents.algorithms import APPLIED, build_model, normalized_env
+from agents.algorithms import build_model, normalized_env
 from agents.callbacks import DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
@@ -144,9 +144,9 @@ def _trainable(
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     envs = loop.vector(hyperparams["n_envs"])
-    if (is_applied := hyperparams.get("stored_action") == "applied") and loop.residual_gain is not None:
+    if hyperparams.get("stored_action") == "applied" and loop.residual_gain is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
-    env = normalized_env(algorithm, SB3VecEnv(envs, info_keys=(APPLIED,) if is_applied else ()), hyperparams)
+    env = normalized_env(algorithm, SB3VecEnv(envs), hyperparams)
     model = build_model(algorithm, env, hyperparams, seed, before + steps)
     model.num_timesteps = before
     if algorithm not in ON_POLICY:

@@ -75,7 +75,7 @@ def trained(env_id: str, algorithm: str, layer: SafeLayer | None, seed: int, ste
     single = ncs_env(gym.make(env_id))
     certificate = certificate_for(single.plant, single.certificate_contract)
     shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=32), certificate)
-    envs, plant = SB3VecEnv(shield, info_keys=("input_committed",)), single.plant
+    envs = SB3VecEnv(shield)
     own = {} if layer is None else {"layer": layer}
     if algorithm == "PPO":
         settings = {"n_steps": 32, "batch_size": 256, "n_epochs": 5, "gamma": 0.9, "gae_lambda": 0.98}
@@ -83,7 +83,7 @@ def trained(env_id: str, algorithm: str, layer: SafeLayer | None, seed: int, ste
         return PPO("MlpPolicy" if layer is None else SafePPOPolicy, envs, **settings, **kwargs).learn(steps)
     kwargs = {"gamma": 0.9, "learning_rate": 1e-3, "learning_starts": 1000, "gradient_steps": 8, "device": "cpu"}
     if layer is not None:
-        kwargs |= {"replay_buffer_class": AppliedActionBuffer, "replay_buffer_kwargs": {"limits": plant.input_ends}}
+        kwargs |= {"replay_buffer_class": AppliedActionBuffer}
     policy = own | {"net_arch": [64, 64]}
     model = SAC("MlpPolicy" if layer is None else SafeSACPolicy, envs, seed=seed, policy_kwargs=policy, **kwargs)
     return model.learn(steps)

@@ -104,23 +104,72 @@ class CopiedWhole:
         return copy.deepcopy(self)
 
 
-def setting(name: str, kept_as: str | None = None) -> Any:
+class Setting(property):
+    """A property that is read, and never set; see `setting`."""
+
+    def __init__(self, name: str, kept_as: str, instead: str) -> None:
+        super().__init__(attrgetter(kept_as), self._refuse)
+        self._name, self._instead = name, instead
+
+    def refusal(self, owner: Any) -> str:
+        """Returns why it cannot be set, and how to make another object."""
+        kind = type(owner).__name__
+        way = f", as in {owner.made_by}" if hasattr(owner, "made_by") else ""
+        why = f"{self._name} is a setting of {kind} and cannot be changed: make another {kind} with it{way}"
+        return why + self._instead
+
+    def _refuse(self, owner: Any, value: Any) -> None:
+        raise AttributeError(self.refusal(owner))
+
+
+def setting(name: str, kept_as: str | None = None, instead: str = "") -> Any:
     """Returns a property for what an object is made with, and other parts of it rest on: it is read, and never set.
 
-    Who tries is told how to make another object; a class may say so by its attribute `made_by`.
+    Assigning raises an error that says how to make another object; a class may say so by its attribute `made_by`.
 
     Args:
         name: Of the property.
         kept_as: Attribute that holds the value, also of a part ("part.attribute"); the name after an underscore by
             default.
+        instead: End of the error's sentence, which says what else can be done.
+    """
+    return Setting(name, kept_as or f"_{name}", instead)
+
+
+class AroundEnvironment:
+    """Mixin of wrappers: setting what only something inside has raises an error, since it would have no effect.
+
+    Names that nothing inside has are the wrapper's own, and may be set. Of those, `__init__` sets before `env` what
+    something inside may have too.
     """
 
-    def refuse(owner: Any, value: Any) -> None:
-        kind = type(owner).__name__
-        way = f", as in {owner.made_by}" if hasattr(owner, "made_by") else ""
-        raise AttributeError(f"{name} is a setting of {kind} and cannot be changed: make another {kind} with it{way}")
+    # Attribute that holds what is inside.
+    _inside = "env"
 
-    return property(attrgetter(kept_as or f"_{name}"), refuse)
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name[0] != "_" and name not in self.__dict__ and not hasattr(type(self), name):
+            require_not_inside(name, self.__dict__.get(self._inside), type(self).__name__)
+        object.__setattr__(self, name, value)
+
+
+def require_not_inside(name: str, inside: Any, outside: str) -> None:
+    """Raises AttributeError if setting an attribute outside would have no effect, because something inside has it.
+
+    Args:
+        name: Of the attribute.
+        inside: The outermost of the layers inside; None for none.
+        outside: What it would be set on, for the message.
+    """
+    layer = inside
+    while layer is not None:
+        own = getattr(layer, "__dict__", {})
+        if name in own or hasattr(type(layer), name):
+            kept = getattr(type(layer), name, None)
+            if isinstance(kept, Setting):
+                raise AttributeError(kept.refusal(layer))
+            kind = type(layer).__name__
+            raise AttributeError(f"{name} belongs to the {kind} inside: set on {outside} it would have no effect")
+        layer = own.get("env")
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -134,6 +183,20 @@ def frozen(array: np.ndarray) -> np.ndarray:
     """Returns the array itself, which nobody may write to any more."""
     array.flags.writeable = False
     return array
+
+
+def require_batched_infos(info: Any, outside: str) -> None:
+    """Raises ValueError unless the infos of a vector environment are a dictionary of arrays, as wrappers outside need.
+
+    Args:
+        info: The infos.
+        outside: The wrapper that reads them, for the message.
+    """
+    if not isinstance(info, dict):
+        raise ValueError(
+            f"{outside} reads a dictionary of arrays as infos, and a wrapper inside makes a {type(info).__name__} "
+            f"of them: put it (DictInfoToList, say) outside of {outside}"
+        )
 
 
 def printable(text: str) -> str:
@@ -156,12 +219,25 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as messages quote it: on one line, and not without end; a path as it is."""
+    """Returns a value as messages quote it: on one line, and not without end; a path as it is.
+
+    Of a tensor with gradient, which is no array, it says what to do.
+    """
     try:
         text = " ".join((str(value) if isinstance(value, PurePath) else repr(value)).split())
     except Exception:
         text = f"a {type(value).__name__}"
-    return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+    text = text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+    return f"{text}, which has a gradient: detach it (.detach())" if _has_gradient(value) else text
+
+
+def _has_gradient(value: Any) -> bool:
+    """Returns whether a value is a tensor of torch with gradient, or a list with one, which numpy makes no array of."""
+    try:
+        entries = value if isinstance(value, (list, tuple)) else (value,)
+        return any(getattr(entry, "requires_grad", False) is True for entry in entries)
+    except Exception:  # attributes of other people's objects may raise anything
+        return False
 
 
 def as_setting(value: Any) -> np.ndarray | None:
@@ -173,9 +249,14 @@ def as_setting(value: Any) -> np.ndarray | None:
 def _as_array(value: Any) -> np.ndarray:
     """Returns an array, also of a sparse matrix of scipy, which numpy takes for an object, unless it is too large."""
     array = np.asarray(value)
-    if array.dtype.kind == "O" and array.ndim == 0 and hasattr(value, "toarray") and hasattr(value, "nnz"):
+    if array.dtype.kind == "O" and array.ndim == 0 and _is_sparse(value):
         return value.toarray() if math.prod(value.shape) <= MOST_EXPANDED else array
     return array
+
+
+def _is_sparse(value: Any) -> bool:
+    """Returns whether a value is a sparse matrix of scipy."""
+    return hasattr(value, "toarray") and hasattr(value, "nnz")
 
 
 def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
@@ -190,6 +271,12 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
     matrix = as_setting(value)
+    if matrix is None and _is_sparse(value) and math.prod(value.shape) > MOST_EXPANDED:
+        sizes = " x ".join(map(str, value.shape))
+        raise ValueError(
+            f"{name} is a sparse matrix of {sizes} entries, which is not expanded beyond {MOST_EXPANDED:,} of them: "
+            "reduce the model"
+        )
     if matrix is None:
         raise ValueError(f"{name} must be a matrix of numbers, got {shown(value)}")
     expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"

@@ -146,17 +146,17 @@ class Fallback(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(ReadOnlyArrays):
-    """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
+    """A robust control invariant set S inside the safe box, its gain, and the numbers that prove it.
 
-    It may also have a polytope around S that the same gain keeps invariant; shields keep the state in that then. Where
-    the gain keeps a polytope but no ellipsoid, that is all that is proved, and S is merely an ellipsoid inside
+    It may also have a polytope around E(L) that the same gain keeps invariant, which is S then (`safe_set`). Where
+    the gain keeps a polytope but no ellipsoid, that is all that is proved, and E(L) is merely an ellipsoid inside
     (`keeps_ellipsoid`).
 
     A certificate is not trusted until `shields.verify` has checked it in exact arithmetic. Two certificates are equal
     if their files are, every digit of them. `print(certificate)` says what it is for.
 
     Attributes:
-        L: Shape of the ellipsoid S = E(L), (n, n) [squares of the states' units].
+        L: Shape of the ellipsoid E(L), (n, n) [squares of the states' units].
         K: Gain of the fallback input, shape (m, n) [input per state].
         proofs: One for each error set: under a channel contract for the ages 0..h of the newest sample, otherwise a
             single one.
@@ -247,17 +247,17 @@ class Certificate(ReadOnlyArrays):
 
     @cached_property
     def ellipsoid(self) -> Ellipsoid:
-        """The ellipsoid S = E(L), invariant itself if `keeps_ellipsoid`."""
+        """The ellipsoid E(L), invariant itself if `keeps_ellipsoid`."""
         return Ellipsoid(self.L)
 
     @property
     def keeps_ellipsoid(self) -> bool:
-        """Whether S is claimed to be invariant; otherwise the polytope alone is, and S is an ellipsoid inside it."""
+        """Whether E(L) is claimed to be invariant; otherwise the polytope alone is, and E(L) lies inside it."""
         return all(proof.shares is not None for proof in self.proofs)
 
     @property
     def safe_set(self) -> Ellipsoid | Polytope:
-        """The set that a shield keeps: the polytope if there is one, else the ellipsoid S = E(L)."""
+        """S, the set that a shield keeps: the polytope if there is one, else the ellipsoid E(L)."""
         return self.ellipsoid if self.polytope is None else self.polytope
 
     @property

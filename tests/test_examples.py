@@ -76,7 +76,10 @@ RUNS = {
         ["--steps", "210"],
         [rf"{name}: last return {NUMBER}; 0 violating steps, [1-9]\d* actions" for name in ("PPO", "SAC", "TD3")],
     ),
-    "minari_dataset.py": ([], [re.escape("600 steps in 3 episodes; violating steps of each: [0.0, 0.0, 0.0]")]),
+    "minari_dataset.py": (
+        [],
+        [re.escape("600 steps in 3 episodes; violating steps of each: [0.0, 0.0, 0.0]"), "those applied: True"],
+    ),
     "sb3_processes.py": ([], [r"10 episodes, violating steps: 0\b"]),
     "single_file_ppo.py": (
         ["--total-timesteps", "512", "--num-envs", "2", "--epochs", "2"],

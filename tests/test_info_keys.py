@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import NCSEnv
+from ncs_gym import LinearPlant, NCSEnv
 from shields import SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
 
@@ -38,14 +38,14 @@ def infos(env, steps, share=0.1):
     return [env.reset(seed=0)[1], *(env.step(action)[-1] for _ in range(steps))]
 
 
-def assert_is(value, kind, plant):
+def assert_is(key, value, kind, plant):
     """A value has the shape or the type that the docstring says."""
     if kind in TYPES:
         assert isinstance(value, TYPES[kind])
     else:
         sizes = {"n": plant.n, "m": plant.m, "k": len(plant.box_rows)}
         assert value.shape == tuple(sizes[size] for size in re.findall("[nmk]", kind))
-        assert value.dtype == np.float64
+        assert value.dtype == (np.float32 if key.startswith("action_") else np.float64)
 
 
 @pytest.fixture(params=ENVIRONMENTS)
@@ -73,7 +73,7 @@ def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     for info in infos(env, 4):
         assert set(info) == set(expected)
         for key, kind in expected.items():
-            assert_is(info[key], kind, env.unwrapped.plant)
+            assert_is(key, info[key], kind, env.unwrapped.plant)
         if env.unwrapped.downlink is None:  # else the estimate is that of a later state
             np.testing.assert_array_equal(info["estimation_error"], info["estimate"] - info["state"])
     for info in infos(envs, 4):
@@ -81,7 +81,7 @@ def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
         for key, kind in expected.items():
             assert isinstance(info[key], np.ndarray)
             assert len(info[key]) == NUMBER
-            assert_is(info[key][0], kind, envs.unwrapped.plant)
+            assert_is(key, info[key][0], kind, envs.unwrapped.plant)
 
 
 def test_page_names_what_the_end_of_an_episode_adds():
@@ -90,6 +90,46 @@ def test_page_names_what_the_end_of_an_episode_adds():
     added = set(last) - set(kinds(None))
     assert "final_info" in added
     assert all(f"`{key}`" in PAGE for key in added)
+
+
+def test_actions_of_infos_are_those_that_stand_for_the_inputs(loop):
+    env_id, certificate = loop
+    env, envs = SafetyShield(gym.make(env_id), certificate), VectorSafetyShield(gym.make_vec(env_id, 3), certificate)
+    plant, reported = env.unwrapped.plant, [*infos(env, 60, share=1.0), *infos(envs, 60, share=1.0)]
+    low, high = plant.input_ends
+    for info in reported:
+        for name in ("applied", "committed"):
+            inputs = info["input" if name == "applied" else "input_committed"]
+            np.testing.assert_allclose(info[f"action_{name}"], (2.0 * inputs - low - high) / (high - low), atol=2e-7)
+    overridden = [info for info in reported if np.any(info["shield_intervened"])]
+    assert len(overridden) > 10
+    assert all(np.abs(info["action_committed"]).min() < 1.0 for info in overridden)
+
+
+TWO_ENDED = LinearPlant(
+    A=[[0.9, 0.1], [0.0, 0.8]],
+    B=[[0.0], [0.3]],
+    state_limits=(-1.0, 1.0),
+    input_limits=(-2.0, 1.0),
+    dt=0.1,
+    disturbance_bound=0.02,
+    sensor_bound=0.01,
+    initial_bound=0.01,
+)
+
+
+def test_actions_of_infos_move_another_environment_alike_also_where_limits_have_two_ends():
+    settings = {"plant": TWO_ENDED, "disturbance": "box"}
+    shielded, bare = SafetyShield(NCSEnv(**settings)), NCSEnv(**settings)
+    one, other = shielded.reset(seed=3)[1], bare.reset(seed=3)[1]
+    changed, rng = 0, np.random.default_rng(0)
+    for _ in range(200):
+        one = shielded.step(rng.uniform(-1.0, 1.0, 1).astype(np.float32))[4]
+        other = bare.step(one["action_applied"])[4]
+        np.testing.assert_array_equal(one["state"], other["state"])
+        np.testing.assert_array_equal(one["input"], other["input"])
+        changed += one["shield_intervened"]
+    assert changed > 20
 
 
 def test_correction_is_what_the_docstring_says(loop):

@@ -47,8 +47,8 @@ LAYERS = {
         {"nodes", "torch"},
     ),
     "agents": (
-        {"hyperparams", "pickled_data", "results", "sb3_vec_env"},
-        {"loop"},
+        {"hyperparams", "pickled_data", "results", "step_info"},
+        {"loop", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
         {"normalization", "sb3_zip"},
         {"agent"},

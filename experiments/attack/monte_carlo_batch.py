@@ -33,7 +33,7 @@ from shields.json_documents import digest
 # Modes of the shield, one per batch in turn, where none is chosen.
 _SHIELD_MODES = ("project", "switch", "boundary")
 # Settings that the counts of a batch do not depend on; the plant of a file is known by its certificate.
-_NOT_COUNTED = {*BackendSettings.__dataclass_fields__, "steps", "out", "force", "plant"}
+_NOT_COUNTED = {*BackendSettings.__dataclass_fields__, "steps", "out", "force", "plant", "smoke"}
 
 
 def cases_of(settings: AttackSettings) -> dict[str, AttackCase]:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from ncs_gym import LinearPlant, NCSVectorEnv
+from ncs_gym.validation import AroundEnvironment
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
@@ -241,7 +242,7 @@ FILTERS: dict[str, Callable[..., Rule]] = {
 }
 
 
-class EstimateFilter(VectorWrapper):
+class EstimateFilter(AroundEnvironment, VectorWrapper):
     """Applies what a filter makes of the proposed inputs, given the estimates; it proves nothing.
 
     The infos gain `shield_intervened`, `input_proposed` and `shield_correction` as behind a `VectorSafetyShield`, but
@@ -257,9 +258,10 @@ class EstimateFilter(VectorWrapper):
     """
 
     def __init__(self, env: VectorEnv, rule: Rule, penalty: float = 0.0) -> None:
+        self.penalty = penalty
         super().__init__(env)
         inner = _environment_behind(env)
-        self._limits, self._inputs_of, self._rule, self.penalty = inner.plant.u_max, inner.inputs_of, rule, penalty
+        self._limits, self._inputs_of, self._rule = inner.plant.u_max, inner.inputs_of, rule
         self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
         self._begins_next = inner.autoreset_mode is AutoresetMode.NEXT_STEP
         self._done = self._begun = np.zeros(self.num_envs, np.bool_)

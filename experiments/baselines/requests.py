@@ -14,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from agents.evaluation import Policy
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, VectorRequestActions
+from ncs_gym.validation import AroundEnvironment
 from shields import VectorSafetyShield
 
 # Margins are shown to agents within these limits.
@@ -124,7 +125,7 @@ def with_rule(asking: Asking, rule: RequestRule) -> Policy:
     return act
 
 
-class RequestsOnly(VectorWrapper):
+class RequestsOnly(AroundEnvironment, VectorWrapper):
     """An environment whose actions, (N, 1), only ask for samples, while a controller proposes the inputs.
 
     Observations have one entry more, the margin of what is proposed.

@@ -19,6 +19,7 @@ from experiments.attack.safety_counts import (
     require_within,
 )
 from experiments.backends.execution import results_of
+from experiments.commands import short_version
 from experiments.runs.experiment import lasting_settings
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.provenance import versions
@@ -31,12 +32,16 @@ from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
 
+# Budget of `--smoke`, which attacks the environments' own channels alone unless something else is asked for.
+_SMOKE = {"steps": 1e5, "random_plants": 0}
+_SMOKE_CHANNEL = "its channel"
 # Cases that a line names.
 _MOST_LISTED = 6
 
 
 def attack(settings: AttackSettings) -> None:
     """Runs `ncs attack`."""
+    settings = shortened(settings)
     cases, kinds = cases_of(settings), len(kinds_of_batches(settings))
     if not settings.unshielded:
         _require_claims(cases)
@@ -58,6 +63,8 @@ def attack(settings: AttackSettings) -> None:
             counts[batch.case] += counted
         total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
         print(counts_table(counts, looks_ahead=looks_ahead))
+        if settings.smoke:
+            print(wrapped("A smoke run shows that everything runs; it attacks too little to show anything else."))
         if left_out := [name for name in cases if name not in counts]:
             listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
             budget = f"within {settings.steps:,.0f} steps"
@@ -76,6 +83,12 @@ def attack(settings: AttackSettings) -> None:
             require_within(counts, limits)
         elif not settings.unshielded:
             require_safe(total, looks_ahead=looks_ahead)
+
+
+def shortened(settings: AttackSettings) -> AttackSettings:
+    """Returns the settings of the short version if `--smoke` is given, otherwise the same settings."""
+    chosen = {"channel": settings.channel or _SMOKE_CHANNEL} if settings.env is settings.plant is None else {}
+    return short_version(settings, **_SMOKE, **chosen)
 
 
 def _require_claims(cases: dict[str, AttackCase]) -> None:

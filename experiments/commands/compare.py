@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pandas as pd
 
+from agents.agent_file import has_pretrained
 from agents.loop import LoopConfig
 from experiments.analysis.episodes import (
     arm_summaries,
@@ -24,7 +25,7 @@ from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import decimals_of, scenario_text, summary_text
-from experiments.runs.arms import Arm, by_arm
+from experiments.runs.arms import Arm, by_arm, full_names
 from experiments.runs.experiment import (
     certificate_line,
     certificate_of,
@@ -34,8 +35,10 @@ from experiments.runs.experiment import (
 )
 from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.policies import PRETRAINED
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import CompareSettings
+from experiments.settings.arguments import id_alone
 from experiments.terminal import wrapped
 from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
@@ -44,11 +47,14 @@ from shields.runtime.starts import starts_known
 
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
+# What it trains and evaluates where nothing else is asked for: agents that have hardly learned beside one that has.
+_SMOKE_ARMS = ("unshielded", "shielded")
+_SMOKE_BASELINES = ("zero input", PRETRAINED, f"{PRETRAINED}+shielded")
 
 
 def compare(settings: CompareSettings) -> None:
     """Runs `ncs compare`: prints the table and writes the files."""
-    settings = _with_full_names(short_version(settings, **_SMOKE))
+    settings = _with_full_names(shortened(settings))
     noise = "gaussian" if settings.noise == "gaussian" else None
     loop = loop_config(settings.env, settings.channel, noise=noise, between_samples=settings.between_samples)
     require_trainable(settings, loop)
@@ -77,19 +83,35 @@ def compare(settings: CompareSettings) -> None:
         trained = max(arm["train_steps"] for arm in summary["arms"].values())
         per_run = f"{trained:,} training steps per arm, {settings.episodes} episodes per run"
         print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
-        short = ["A smoke run shows that everything runs; its agents have hardly learned."] if settings.smoke else []
+        short = [_smoke_text(settings)] if settings.smoke else []
         print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
+
+
+def shortened(settings: CompareSettings) -> CompareSettings:
+    """Returns the settings of the short version if `--smoke` is given, otherwise the same settings."""
+    chosen, default = {}, type(settings)
+    if settings.arms == default.arms:
+        chosen["arms"] = _SMOKE_ARMS
+    if settings.baselines == default.baselines and has_pretrained(id_alone(settings.env)):
+        chosen["baselines"] = _SMOKE_BASELINES
+    return short_version(settings, **_SMOKE, **chosen)
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
     """Returns the settings with the full names of arms, each of which is listed once."""
-    arms, baselines = (
-        tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.baselines)
-    )
+    arms, baselines = (full_names(names, settings.mode) for names in (settings.arms, settings.baselines))
     if len(set(arms)) != len(arms) or not arms:
         raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
     baselines = tuple(name for name in dict.fromkeys(baselines) if name not in arms)
     return replace(settings, arms=arms, baselines=baselines)
+
+
+def _smoke_text(settings: CompareSettings) -> str:
+    """Returns what a short version shows."""
+    text = "A smoke run shows that everything runs; the agents that it trains have hardly learned."
+    if PRETRAINED in settings.baselines:
+        text += " What a shield does, the rows of the pretrained agent show."
+    return text
 
 
 def _tables(summary: dict[str, Any]) -> str:

@@ -19,14 +19,19 @@ from experiments.backends.worker import initialize_worker, signals_blocked
 from experiments.commands import short_version
 from experiments.network_loop.log import rows_of
 from experiments.network_loop.processes import (
+    OWN_POLICIES,
+    REFUSED,
     NetworkLoop,
     network_channels,
     run_controller_node,
     run_network,
     run_plant,
+    suspects_text,
 )
 from experiments.runs.loops import registered_env
+from experiments.runs.policies import require_no_statistics
 from experiments.settings import LoopSettings
+from experiments.terminal import wrapped
 from ncs_gym import NCSEnv
 from ncs_gym.network.wire import SHORTEST_KEY
 from ncs_gym.reading import LARGEST_KEY, read_file
@@ -36,6 +41,8 @@ from shields.verification import require_valid
 
 # Budget of `--smoke`.
 _SMOKE = {"steps": 100}
+# What keys of the summary begin with that say how many datagrams were refused, by reason.
+_BY_REASON = "refused, "
 # Seconds that a process may take to end, and between two lines of the view.
 _PATIENCE, _PERIOD = 1.0, 1.0
 
@@ -78,6 +85,10 @@ def loop(settings: LoopSettings) -> None:
     write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
     width = max(map(len, summary))
     print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
+    if refused := {
+        reason: summary[_BY_REASON + words] for reason, words in REFUSED.items() if _BY_REASON + words in summary
+    }:
+        print(wrapped(f"Of the datagrams refused: {suspects_text(refused, settings)}."))
 
 
 def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop) -> None:
@@ -120,6 +131,8 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     key = os.urandom(32) if settings.key_file is None else read_file(settings.key_file, LARGEST_KEY)
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
+    if settings.policy in OWN_POLICIES:
+        require_no_statistics(settings.vec_normalize, settings.policy)
     max_age = 0 if env.contract is None else env.contract.max_age
     return NetworkLoop(settings=settings, uplink=uplink, downlink=downlink, secret=key, max_age=max_age)
 
@@ -174,6 +187,11 @@ class _view:
         self._live.update(table)
 
 
+def _counts(written: str) -> list[list[str]]:
+    """Returns reasons and how many datagrams were refused for each, as a log has them."""
+    return [entry.split(":") for entry in written.split()]
+
+
 def summary_of(folder: Path) -> dict[str, Any]:
     """Returns what the logs of plant and controller say together.
 
@@ -209,6 +227,9 @@ def summary_of(folder: Path) -> dict[str, Any]:
             "overridden": counts["overridden"],
             "decided too late": int(last["skipped"]),
             "datagrams refused": int(last["refused"]),
+            **{
+                _BY_REASON + REFUSED[reason]: int(count) for reason, count in _counts(last["refused_why"]) if int(count)
+            },
             "oldest sample in use": max(ages),
         }
         q = np.quantile(times, [0.5, 0.999, 1.0]).round().astype(int).tolist()

@@ -15,7 +15,7 @@ from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.html import sweep_report
 from experiments.report.text_tables import sweep_table
-from experiments.runs.arms import Arm
+from experiments.runs.arms import full_names
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
 from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, write_results
@@ -43,12 +43,11 @@ def sweep(settings: SweepSettings) -> None:
     """Runs `ncs sweep`."""
     ends = {name: tuple(dict.fromkeys((side[0], side[-1]))) for name in _SIDES if (side := getattr(settings, name))}
     settings = short_version(settings, **_SMOKE, **ends)
+    settings = replace(settings, arms=full_names(settings.arms, settings.mode))
     points = grid_points(settings)
     for name in ("loss", "delay", "burst_length"):
         if settings.channel.get(name) is not None:
             raise ValueError(f"--channel {name} is a side of the grid: give its values there")
-    for name in settings.arms:
-        Arm.of(name, settings.mode)
     loops = [loop_at(settings, point) for point in points]
     require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]

@@ -45,6 +45,20 @@ SILENCE = 5.0
 # Steps between two changes of direction of the controller "push".
 PUSH = 100
 HERE = "127.0.0.1"
+# Policies that other commands have not.
+OWN_POLICIES = ("push",)
+# Why datagrams are refused: the words that nodes count them by, and what they say of a datagram.
+REFUSED = {
+    "length": "of the wrong length",
+    "format": "of another format",
+    "tag": "with a wrong tag",
+    "plant": "of another plant",
+    "value": "with an impossible value",
+    "kind": "for another node",
+    "episode": "of another episode",
+    "ahead": "stamped ahead",
+    "late": "too late",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +270,8 @@ async def _controller(
     inputs = plant.input_names
     columns = ["time", "episode", "step", "guaranteed", "reason", *(f"x_hat_{name}" for name in plant.state_names)]
     columns += [*(f"proposed_{name}" for name in inputs), *(f"u_{name}" for name in inputs)]
-    columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "microseconds"]
+    columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "refused_why"]
+    columns += ["microseconds"]
     log = StepLog(settings.out, "controller", columns)
     packets = StepLog(settings.out, "packets", ["episode", "sent", "received"])
     propose = controller_named(settings.policy, settings.env, env, settings.seed, settings.vec_normalize)
@@ -271,6 +286,7 @@ async def _controller(
         row += [*decision.input.tolist(), int(decision.intervened), float(decision.margin), safe.measurement_age]
         took = node.clock.time_of(safe.steps), asyncio.get_running_loop().time()
         row += [" ".join(map(str, node.arrived)), node.missing, node.skipped, node.refused.total()]
+        row += [" ".join(f"{reason}:{count}" for reason, count in node.refused.items())]
         log.write([*row, round(1e6 * (took[1] - took[0]))])
         for stamp in node.arrived:
             packets.write([node.episode, stamp, safe.steps])
@@ -287,7 +303,7 @@ async def _controller(
         nonlocal is_told
         if node.episode == 0 and not is_told and time.monotonic() - began > SILENCE:
             is_told = True
-            print(waiting_text(node.refused), file=sys.stderr, flush=True)
+            print(waiting_text(node.refused, settings), file=sys.stderr, flush=True)
         return is_over() or steps >= settings.steps
 
     def asks(safe: SafeLoop) -> bool:
@@ -298,15 +314,39 @@ async def _controller(
     packets.close()
 
 
-def waiting_text(refused: Mapping[str, int]) -> str:
+def waiting_text(refused: Mapping[str, int], settings: LoopSettings) -> str:
     """Returns what a controller says that waits, given how many datagrams were refused by reason."""
-    if not refused:
-        return "the controller waits for sensor and actuator; nothing has arrived yet"
-    why = ", ".join(f"{count} by {reason}" for reason, count in refused.items())
-    return (
-        f"the controller waits for sensor and actuator; datagrams were refused: {why}. Where it is the tag, the other "
-        "machine has another key, or another --env, --speed, --room, --channel or --downlink"
+    waits = "the controller waits for sensor and actuator; "
+    if not sum(refused.values()):
+        return f"{waits}nothing has arrived yet"
+    return f"{waits}{refused_text(refused)}; {suspects_text(refused, settings)}"
+
+
+def refused_text(refused: Mapping[str, int]) -> str:
+    """Returns how many datagrams were refused, and why, given how many by reason."""
+    why = [f"{count} {REFUSED[reason]}" for reason, count in refused.items() if count]
+    return f"{sum(refused.values())} datagrams were refused: {', '.join(why)}"
+
+
+def suspects_text(refused: Mapping[str, int], settings: LoopSettings) -> str:
+    """Returns what is known of where refused datagrams come from.
+
+    On one machine all processes have the same key and settings; on two only the plant's knows its --mischief.
+    """
+    share = f"{100.0 * settings.mischief:g} %"
+    made = (
+        f"beside {share} of the datagrams it sends a copy, beside {share} an old one and noise, and it corrupts "
+        f"{share} of the lost ones"
     )
+    if settings.role == "all":
+        if settings.mischief == 0.0:
+            return "--mischief 0 makes none of these"
+        return f"--mischief {settings.mischief:g} makes such: {made}"
+    plants = "--mischief of the plant's machine (0.05 unless it was told otherwise) makes such"
+    if not refused.get("tag"):
+        return plants
+    other = "another key, or another --env, --speed, --room, --channel or --downlink"
+    return f"{plants}, and if all have a wrong tag, that machine has {other}"
 
 
 def controller_named(
@@ -314,7 +354,7 @@ def controller_named(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries."""
     plant = env.plant
-    if name == "push":
+    if name in OWN_POLICIES:
         count = 0
 
         def push(estimate: np.ndarray) -> np.ndarray:

@@ -317,8 +317,10 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
 
 
 def _plane(certificate: Certificate, states: np.ndarray) -> tuple[int, int]:
-    """Returns the two states that are largest in units of the safe set's extent, in ascending order."""
-    furthest = (np.abs(states) / np.sqrt(np.diag(certificate.L))).max(axis=0)
+    """Returns the two states that are farthest from the middle of the safe set, in units of its extent; ascending."""
+    safe_set, axes = certificate.safe_set, np.eye(states.shape[1])
+    high, low = safe_set.support(axes), -safe_set.support(-axes)
+    furthest = (np.abs(2.0 * states - high - low) / (high - low)).max(axis=0)
     first, second = sorted(np.argsort(-furthest, kind="stable")[:2].tolist())
     return first, second
 

@@ -114,6 +114,7 @@ _CONTROLLER_MARKERS = {
     "K x_hat": "1",
     "zero input": "2",
     "untrained": "3",
+    "pretrained": "4",
 }
 # Filters that share the color of another one.
 _HOLLOW = ("trusting:lookahead", "psf:tube")

@@ -8,6 +8,7 @@ from functools import cache
 
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS, EstimateFilterSettings
+from experiments.runs.policies import PRETRAINED
 from experiments.runs.training_run import RunResult
 from experiments.settings import LearningSettings
 from ncs_gym.envs.env import ncs_env
@@ -22,7 +23,7 @@ _KNOWN_ARMS = (
     "unshielded, monitor, penalized, penalized:WEIGHT, lagrangian, FILTER, 'FILTER at test', FILTER+penalty, each also "
     "with +residual; CONTROLLER and CONTROLLER+FILTER, with FILTER one of shielded, shielded:MODE, "
     f"lookahead, {', '.join(FILTERS)} (modes: {', '.join(_SHIELD_MODES)}) and CONTROLLER one of untrained, "
-    f"{', '.join((*CONTROLLERS, *REGULATORS))}"
+    f"{', '.join((PRETRAINED, *CONTROLLERS, *REGULATORS))}"
 )
 
 # Results of the training runs of each arm, in the order of their indices.
@@ -107,6 +108,11 @@ class Arm:
         return training, filtered()
 
 
+def full_names(names: Sequence[str], mode: str) -> tuple[str, ...]:
+    """Returns the full names of arms, under which results are kept; see `Arm.of`."""
+    return tuple(Arm.of(name, mode).name for name in names)
+
+
 def is_shield(mode: str | None) -> bool:
     """Returns whether a mode is one of the shield's that protects: not "monitor", and no other filter."""
     return mode in _SHIELD_MODES
@@ -138,7 +144,7 @@ def _arms(mode: str) -> dict[str, Arm]:
     filters |= {name: name for name in ("lookahead", *FILTERS)}
     trained = list(_trained_arms(filters))
     arms = [*trained, *(replace(arm, name=arm.name + _RESIDUAL, is_residual=True) for arm in trained)]
-    for policy in (*CONTROLLERS, *REGULATORS, "untrained"):
+    for policy in (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED):
         arms += [Arm(policy, policy=policy)]
         arms += [Arm(f"{policy}+{name}", own, policy) for name, own in filters.items()]
     return {arm.name.replace(" ", "-"): arm for arm in arms}

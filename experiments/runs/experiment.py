@@ -7,11 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
 from experiments.baselines import tuned_training
 from experiments.runs.arms import Arm
 from experiments.runs.loops import other_scenarios
+from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, LearningSettings, settings_json
@@ -65,6 +67,7 @@ def run_of_arm(
 
     Raises:
         ValueError: If the arm or a scenario is unknown.
+        AgentError: If the arm is the pretrained agent's, and the package has none for the environment.
     """
     arm, hyperparams = Arm.of(arm_name, settings.mode), settings.all_hyperparams
     if arm.is_trained and getattr(settings, "tuned_arms", False):
@@ -73,6 +76,10 @@ def run_of_arm(
         if "lagrangian" in own:
             own["lagrangian"] = replace(settings.lagrangian, **own["lagrangian"])
         settings = replace(settings, **own)
+    agent_files = {}
+    if arm.policy == PRETRAINED:  # its checksums are verified where it acts
+        folder = pretrained_folder(loop.env)
+        agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
     training_loop, loop = arm.loops(loop, certificate, settings)
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
     origin += "" if certificate.polytope is None else " with a polytope"
@@ -92,6 +99,7 @@ def run_of_arm(
         algorithm=settings.algo,
         settings=hyperparams,
         grid_point=grid_point,
+        agent_files=agent_files,
     )
 
 

@@ -54,7 +54,8 @@ _MOST_LISTED, _MOST_CHARACTERS = 3, 40
 def claim_folder(command: str, settings: Any) -> Iterator[None]:
     """Creates the output folder of a command and writes `settings.json` in it; no other command has it meanwhile.
 
-    An earlier summary, tables, figures and report, which belong together, are removed; files of other names stay.
+    An earlier summary, tables, figures and report, which belong together, are removed; files of other names stay. Where
+    what follows is refused (ValueError, OSError) before anything was computed, the folder is left as it was.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
     or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs attack` or
@@ -74,17 +75,44 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
     folder: Path = settings.out
     if folder.is_dir():
         _require_own_entries(folder)
+    is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    with _locked(folder):
-        patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
-        if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
-            _require_same(folder, command, settings)
-        if not settings.force:
-            _require_own_settings(folder / "settings.json")
-        save_settings(folder / "settings.json", command, settings)
-        for name in _MADE_OF_RESULTS:
-            (folder / name).unlink(missing_ok=True)
+    try:
+        with _locked(folder), _settings_kept(folder, command, settings):
+            yield
+    finally:
+        if is_new:
+            with suppress(OSError):  # as a rule there is something in it
+                folder.rmdir()
+
+
+@contextmanager
+def _settings_kept(folder: Path, command: str, settings: Any) -> Iterator[None]:
+    """Writes `settings.json`, and removes it again if what follows is refused before anything was computed."""
+    file = folder / "settings.json"
+    before = {*folder.rglob("*")}
+    _take(folder, command, settings)
+    try:
         yield
+    except (ValueError, OSError):
+        new = {*folder.rglob("*")} - before
+        if file in new and not any(entry.is_file() for entry in new - {file}):
+            file.unlink()
+            for empty in sorted(new - {file}, reverse=True):  # what is in a folder comes before it
+                empty.rmdir()
+        raise
+
+
+def _take(folder: Path, command: str, settings: Any) -> None:
+    """Writes `settings.json` in a folder that is locked, and removes what earlier results were made into."""
+    patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
+    if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
+        _require_same(folder, command, settings)
+    if not settings.force:
+        _require_own_settings(folder / "settings.json")
+    save_settings(folder / "settings.json", command, settings)
+    for name in _MADE_OF_RESULTS:
+        (folder / name).unlink(missing_ok=True)
 
 
 def write_results(

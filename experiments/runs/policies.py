@@ -43,7 +43,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize
         ValueError: If the folder of a run holds several agents, or statistics are given for what is no zip.
     """
     if name in UNTRAINED_POLICIES:
-        _require_none(vec_normalize, name)
+        require_no_statistics(vec_normalize, name)
         no_gain = np.zeros((env.plant.m, env.plant.n))
         act = controller(_SHORT.get(name, name), env, no_gain, seed, tuned_weights(env_id, name))
         return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
@@ -73,14 +73,15 @@ def agent_named(name: str, env_id: str | None, vec_normalize: Path | None = None
         path = pretrained_folder(env_id)
     if env_id is not None and is_sb3_zip(path):
         return load_sb3_zip(path, env_id, vec_normalize), path
-    _require_none(vec_normalize, name)
+    require_no_statistics(vec_normalize, name)
     agent = Agent.load(path)
     if env_id not in (None, agent.env):
         raise AgentError(f"the agent in {path} was trained in {agent.env}, not in {env_id}")
     return agent, path
 
 
-def _require_none(vec_normalize: Path | None, name: str) -> None:
+def require_no_statistics(vec_normalize: Path | None, name: str) -> None:
+    """Raises ValueError if statistics are given for a policy that is no zip of stable-baselines3."""
     if vec_normalize is not None:
         raise ValueError(f"--vec-normalize is for zips of stable-baselines3, {name} needs no statistics")
 

@@ -98,7 +98,8 @@ class TrainingRun:
 
     Attributes:
         arm: Name of the arm that the run belongs to.
-        policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; the others are
+        policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "pretrained" the one
+            that comes with the package, in `agent_files`; the others are
             controllers (`experiments.baselines.CONTROLLERS` and `REGULATORS`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.

@@ -112,8 +112,10 @@ class AttackSettings(BackendSettings):
     noise has full size in random directions, and agents are random or hostile.
 
     Attributes:
-        steps: Budget: whole batches of `envs` episodes are run as long as they fit. Where it does not allow one per
-            attack case and mode of the shield, batches are smaller, and cases are left out if they get too small.
+        steps: Budget, by default one of about two minutes; the campaign whose results the documentation reports has
+            1e9, of which 1e8 take twenty minutes. Whole batches of `envs` episodes are run as long as they fit. Where
+            it does not allow one per attack case and mode of the shield, batches are smaller, and cases are left out if
+            they get too small.
         out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
         random_plants: Number of random plants, each behind four kinds of channels.
         envs: Number of episodes in a batch, simulated side by side.
@@ -135,9 +137,11 @@ class AttackSettings(BackendSettings):
         channel: Only kind of channel to attack, by its name in the table: "on request", say; all by default.
         force: Replace the finished results of another campaign in the output folder, which otherwise is refused.
         seed: Seed of the campaign, >= 0.
+        smoke: Run a short version, to see that everything works: the registered environments behind their own channels,
+            unless others are asked for, and no random plants; if `--out` is not given, in runs/attack-smoke.
     """
 
-    steps: float = 1e8
+    steps: float = 5e6
     out: Path = Path("runs/attack")
     random_plants: int = 4
     envs: int = 4096
@@ -154,6 +158,7 @@ class AttackSettings(BackendSettings):
     channel: str | None = None
     force: bool = False
     seed: int = 0
+    smoke: bool = False
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)

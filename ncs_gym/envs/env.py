@@ -9,18 +9,19 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
+from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import (
     CHANNELS,
+    channel_setting,
     expect,
     loop_contracts,
     require_suitable,
     start_option,
     starting_set,
 )
-from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
+from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -95,6 +96,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
     | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
+    | `action_applied` | `(m,)` | - | the action in [-1, 1] that stands for `input`, float32 |
+    | `action_committed` | `(m,)` | - | the action that stands for `input_committed`, which clones learn |
     | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in halves of its range; positive is violated |
     | `worst_constraint_values` | `(k + q,)` | - | the largest since the last step, and those of limits of x and u |
     | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
@@ -108,6 +111,10 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `requested` | bool | - | whether a sample was requested in this step; False where samples are not on request |
     | `request_forced` | bool | - | whether that was so because the contract needs it though nobody asked |
     | `packets` | int | packets | samples sent in this episode |
+    | `channel_loss` | float | - | long-run share of samples that this episode's channel loses (`Channel.mean_loss`) |
+    | `channel_delay` | int | steps | longest delay of this episode's channel |
+    | `downlink_loss` | float | - | likewise of its downlink; zero for an ideal one |
+    | `downlink_delay` | int | steps | likewise |
 
     Args:
         plant: The plant with its bounds.
@@ -153,7 +160,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     observation_space: Box
     action_space: Box
     plant: LinearPlant = setting("plant")
-    channel: Channel = setting("channel")
+    channel: Channel = channel_setting("channel")
     task: Task = setting("task")
     disturbance: Disturbance = setting("disturbance")
     initial_set: Ellipsoid = setting("initial_set")
@@ -167,7 +174,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     noise: str = setting("noise")
     observe: tuple[str, ...] = setting("observe")
     process: Process = setting("process", "_process_given")
-    downlink: Channel | None = setting("downlink")
+    downlink: Channel | None = channel_setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract")
     downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
 
@@ -273,6 +280,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         for (_, links), sources in zip(self._links(), read, strict=True):
             links.give(sources)
             links.begin(rng)
+        self._network = channel_infos(self._uplinks, self._downlinks)
         channel = self.episode_channel
         self._channel_state, self._packets = ChannelState(channel, rng), 0
         if self._requests is not None:
@@ -451,7 +459,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
         happened = estimator.mean, self._state, inputs.missing, arrived
-        return loop_info(self._known, *happened, self._contract, constraints, sampled)
+        told = constraints, sampled, self._network, actions_of(inputs, self._plant)
+        return loop_info(self._known, *happened, self._contract, *told)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,20 @@ from gymnasium.vector import VectorWrapper
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
-from ncs_gym.validation import shown
+from ncs_gym.validation import AroundEnvironment, shown
+
+
+class EveryEpisode(NamedTuple):
+    """What the episodes of an environment draw their channels from, also those that begin by themselves.
+
+    Attributes:
+        draw: A function (rng) -> Channel.
+        first: Takes its place in the first of these episodes: a channel, or what draws one; None for nothing. As an
+            option of a vector environment it may be a list of these.
+    """
+
+    draw: Callable[[np.random.Generator], Channel]
+    first: Any = None
 
 
 class EpisodeChannels:
@@ -42,7 +55,8 @@ class EpisodeChannels:
         """Returns the sources that an option of `reset` names, one for each environment.
 
         Args:
-            option: None for the environments' own; a channel, or what draws one, for all; or N of these.
+            option: None for the environments' own; a channel, or what draws one, for all; or N of these. All of them
+                are for one episode, but for `EveryEpisode`.
             name: What the error message calls it.
 
         Raises:
@@ -51,6 +65,9 @@ class EpisodeChannels:
         count = len(self._own)
         if option is None:
             return self._own
+        if isinstance(option, EveryEpisode):
+            firsts = [None] * count if option.first is None else self.read(option.first, name)
+            return [EveryEpisode(option.draw, first) for first in firsts]
         each = [option] * count if isinstance(option, Channel) or callable(option) else option
         if not isinstance(each, (list, tuple)) or len(each) != count:
             several = "" if count == 1 else f", or a list of {count} of these"
@@ -63,7 +80,7 @@ class EpisodeChannels:
     def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
         """Takes what `read` returned for some environments, given by their indices; for all by default."""
         if chosen is None or len(chosen) == len(self._own):
-            self._sources = sources
+            self._sources = list(sources)
             self.is_plain = self._is_uniform and sources is self._own
             self.now = list(self._own)
         elif sources is not self._own or not self.is_plain:
@@ -83,9 +100,25 @@ class EpisodeChannels:
         if self.is_plain:
             return None
         for e in range(len(self.now)) if rows is None else rows.tolist():
-            source = self._sources[e]
+            source, later = self._sources[e], self._own[e]
+            if isinstance(source, EveryEpisode):
+                source, later = source.draw if source.first is None else source.first, EveryEpisode(source.draw)
             self.now[e] = self._checked(source(rng), "what was drawn") if callable(source) else source
+            self._sources[e] = later
         return self.now
+
+    def infos(self, name: str, *, many: bool) -> dict[str, Any]:
+        """Returns what infos say of the channels of the present episodes; floats and ints, or arrays of shape (N,).
+
+        Args:
+            name: What the keys begin with.
+            many: Whether there are N environments.
+        """
+        losses = [0.0 if each is None else each.mean_loss for each in self.now]
+        delays = [0 if each is None else each.longest_delay for each in self.now]
+        if not many:
+            return {f"{name}_loss": losses[0], f"{name}_delay": delays[0]}
+        return {f"{name}_loss": np.array(losses), f"{name}_delay": np.array(delays)}
 
     def _checked(self, channel: Any, name: str) -> Channel:
         if not isinstance(channel, Channel):
@@ -107,6 +140,11 @@ def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol | None) 
     return EpisodeChannels(own, partial(require_fitting_downlink, protocol))
 
 
+def channel_infos(up: EpisodeChannels, down: EpisodeChannels, *, many: bool = False) -> dict[str, Any]:
+    """Returns what infos say of the channels of the present episodes, of N environments arrays of shape (N,)."""
+    return up.infos("channel", many=many) | down.infos("downlink", many=many)
+
+
 def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
     """Returns a channel with the delays of all, and the quantization step that environments were made for."""
     shortest = min(channel.delay for channel in channels)
@@ -114,7 +152,7 @@ def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
     return Channel(quantization_step=declared.quantization_step, delay=shortest, jitter=longest - shortest)
 
 
-class RandomChannel(gym.Wrapper, RecordConstructorArgs):
+class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """Draws a channel at the start of every episode (domain randomization over networks).
 
     The draws come from the environment's own `np_random`, so that a seed determines them. A shield may stand inside or
@@ -142,7 +180,7 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
         return self.env.reset(seed=seed, options=self._drawn | (options or {}))
 
 
-class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
+class VectorRandomChannel(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
     """`RandomChannel` for an `NCSVectorEnv`: one is drawn for every episode of every one, in any autoreset mode.
 
     Args:
@@ -162,9 +200,11 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes; channels among the options take the place of drawn ones."""
+        """Starts episodes; channels among the options take the place of drawn ones, in these episodes."""
+        own = options or {}
+        drawn = {name: EveryEpisode(draw, own.get(name)) for name, draw in self._drawn.items()}
         # gymnasium's annotation leaves out the lists that its own vector environments take.
-        return self.env.reset(seed=seed, options=self._drawn | (options or {}))  # pyright: ignore[reportArgumentType]
+        return self.env.reset(seed=seed, options=own | drawn)  # pyright: ignore[reportArgumentType]
 
 
 def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:

@@ -65,6 +65,8 @@ def loop_info(
     contract: ChannelContract | None,
     constraints: Constraints,
     sampled: Requested,
+    network: dict[str, Any],
+    actions: tuple[np.ndarray, np.ndarray],
 ) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
@@ -77,6 +79,8 @@ def loop_info(
         contract: What the channel guarantees, if anything.
         constraints: How the safe box is kept; `values`, `cost` and `violations` are fresh arrays.
         sampled: What was requested in the step.
+        network: What `EpisodeChannels.infos` says.
+        actions: Those that stand for the inputs applied and committed, fresh arrays of shape (m,) or (N, m).
     """
     values, worst, cost, violations = constraints
     many, oldest = state.ndim > 1, np.inf if contract is None else contract.max_age
@@ -91,6 +95,8 @@ def loop_info(
         "error_shape": known.error_shape.copy(),
         "input": known.applied.copy().T,
         "input_committed": known.committed.copy().T,
+        "action_applied": actions[0],
+        "action_committed": actions[1],
         "constraint_values": values.T,
         "worst_constraint_values": worst.copy().T,
         "cost": cost,
@@ -104,4 +110,5 @@ def loop_info(
         "requested": own(sampled.requested),
         "request_forced": own(sampled.forced),
         "packets": own(sampled.packets),
+        **({key: value.copy() for key, value in network.items()} if many else network),
     }

@@ -12,10 +12,10 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.validation import as_number, as_numbers, shown
+from ncs_gym.validation import AroundEnvironment, as_number, as_numbers, require_batched_infos, shown
 
 
-class RequestActions(gym.Wrapper, RecordConstructorArgs):
+class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """Lets an agent decide when samples are taken, at a price (docs/requests.md).
 
     The action has one entry more, in [-1, 1]: a sample is asked for where it is positive. The observation has two
@@ -34,9 +34,9 @@ class RequestActions(gym.Wrapper, RecordConstructorArgs):
 
     def __init__(self, env: gym.Env, cost: float = 0.0) -> None:
         RecordConstructorArgs.__init__(self, cost=cost)
+        self.cost = as_number(cost, "cost", low=0.0)
         gym.Wrapper.__init__(self, env)
         self._inner = _on_request(env)
-        self.cost = as_number(cost, "cost", low=0.0)
         self._most = self._inner.request_limits
         self.action_space = _with_request(env.action_space)
         self.observation_space = _wider(env.observation_space, np.zeros(2), self._most)
@@ -65,7 +65,7 @@ class RequestActions(gym.Wrapper, RecordConstructorArgs):
         return np.concatenate([observation, more.astype(np.float32)])
 
 
-class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
+class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
     """`RequestActions` for an `NCSVectorEnv`, possibly behind a shield.
 
     Args:
@@ -78,13 +78,13 @@ class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
 
     def __init__(self, env: Any, cost: float = 0.0) -> None:
         RecordConstructorArgs.__init__(self, cost=cost)
+        self.cost = as_number(cost, "cost", low=0.0)
         VectorWrapper.__init__(self, env)
         self._inner = _on_request(env)
         if not isinstance(self._inner, NCSVectorEnv):
             raise ValueError(f"expected an NCSVectorEnv inside, got {type(self._inner).__name__}")
         if self._inner.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("with SAME_STEP autoreset the age at an episode's end is not known: use NEXT_STEP")
-        self.cost = as_number(cost, "cost", low=0.0)
         self._most = self._inner.single.request_limits
         self.single_action_space = _with_request(env.single_action_space)
         self.single_observation_space = _wider(env.single_observation_space, np.zeros(2), self._most)
@@ -98,6 +98,7 @@ class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
         """Starts episodes; see `NCSVectorEnv.reset`."""
         # gymnasium's annotation leaves out the lists that its own vector environments take.
         observations, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        require_batched_infos(info, "VectorRequestActions")
         self._packets = info["packets"]
         return self._seen(observations), info
 

@@ -13,7 +13,7 @@ from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.linear_plant import LinearPlant, inputs_under_way, weight_of
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_numbers, as_vector, shown
+from ncs_gym.validation import as_numbers, as_vector, setting, shown
 
 T = TypeVar("T")
 
@@ -21,6 +21,12 @@ T = TypeVar("T")
 CHANNELS = "channel", "downlink"
 # The default start covers this fraction of the half-width of the safe box in every direction.
 START_FRACTION = 0.1
+
+
+def channel_setting(name: str, kept_as: str | None = None) -> Any:
+    """Returns a `setting` whose error also says how episodes get other channels."""
+    option = f'reset(options={{"{name}": ...}})'
+    return setting(name, kept_as, f"; episodes get other ones by RandomChannel, a single one by {option}")
 
 
 def loop_contracts(

@@ -10,6 +10,7 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.info import Known
 from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.network.downlink import Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -105,8 +106,19 @@ def nearest_action(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
         inputs: Shape (..., m) [physical units].
         plant: Gives the limits: -1 stands for the low end of an input, 1 for the high one.
     """
+    if inputs.ndim == 1:  # of one environment, in a third of the time
+        scales = zip(inputs.tolist(), plant.input_middle.tolist(), plant.input_half.tolist(), strict=True)
+        return np.array([min(max((u - middle) / half, -1.0), 1.0) for u, middle, half in scales], np.float32)
     actions = (inputs - plant.input_middle) / plant.input_half
     return np.minimum(np.maximum(actions, -1.0), 1.0).astype(np.float32)
+
+
+def actions_of(inputs: Inputs, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the float32 actions that stand for the inputs applied and committed, shape (m,) or (N, m) each."""
+    applied = nearest_action(inputs.applied.T, plant)
+    if inputs.committed is inputs.applied:  # as without a downlink
+        return applied, applied.copy()
+    return applied, nearest_action(inputs.committed.T, plant)
 
 
 def expressible(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:

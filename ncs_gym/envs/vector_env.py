@@ -11,11 +11,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv
-from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
+from ncs_gym.envs.episode_channels import channel_infos, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.settings import CHANNELS, vector_reset_options
-from ncs_gym.envs.spaces import Observer, read_actions
+from ncs_gym.envs.settings import CHANNELS, channel_setting, vector_reset_options
+from ncs_gym.envs.spaces import Observer, actions_of, read_actions
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
@@ -69,7 +69,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     made_by: ClassVar[str] = "gym.make_vec(id, num_envs, channel=...)"
     single: NCSEnv = setting("single")
     plant: LinearPlant = setting("plant")
-    channel: Channel = setting("channel")
+    channel: Channel = channel_setting("channel")
     task: Task = setting("task")
     disturbance: Disturbance = setting("disturbance", "_single.disturbance")
     initial_set: Ellipsoid = setting("initial_set", "_single.initial_set")
@@ -82,7 +82,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     contract: ChannelContract | None = setting("contract")
     certificate_contract: ChannelContract | None = setting("certificate_contract")
     error_set: ErrorSet = setting("error_set")
-    downlink: Channel | None = setting("downlink")
+    downlink: Channel | None = channel_setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract", "_single.downlink_contract")
     downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
@@ -181,8 +181,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             seed: Seeds `np_random`, the only source of randomness of all environments.
             options: {"state": x0} starts at x0, shape (n,) or (N, n); {"reset_mask": (N,)} says which environments.
                 {"channel": c}, {"downlink": c} give these environments other channels, one for all or a list of N, in
-                which None stands for an environment's own; see `NCSEnv.reset`. Episodes that begin by themselves keep
-                them, or draw anew; every call of `reset` without the option goes back to the environments' own.
+                which None stands for an environment's own; see `NCSEnv.reset`. They are for these episodes; those that
+                begin by themselves have the environments' own again (`VectorRandomChannel` draws for every episode).
 
         Raises:
             ValueError: If an option is unknown or wrong, or the environments cannot have the channel.
@@ -367,6 +367,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         states, known = self._process.start_many(rng, states, initial, mask)
         task_state, memory = self._task.begin_many(rng, self._plant, count), self._process.begin(rng, count)
         channels, downlinks = self._uplinks.begin(rng, rows), self._downlinks.begin(rng, rows)
+        if count == self.num_envs or not (self._uplinks.is_plain and self._downlinks.is_plain):
+            self._network = channel_infos(self._uplinks, self._downlinks, many=True)
         if count == self.num_envs:
             self._task_state, self._disturbance_memory = task_state, memory
             self._channel_state = VectorChannelState(channels or self._channel, rng, count)
@@ -444,7 +446,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             asked, forced = self._requests.requested, self._requests.forced
         happened = self._estimator.mean, self._state, inputs.missing, arrived
         sampled = Requested(asked, forced, self._packets)
-        return loop_info(self._known, *happened, self._contract, constraints, sampled)
+        told = constraints, sampled, self._network, actions_of(inputs, self._plant)
+        return loop_info(self._known, *happened, self._contract, *told)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""

@@ -124,6 +124,14 @@ class Channel:
         return 0 if never else self.max_consecutive_losses
 
     @property
+    def mean_loss(self) -> float:
+        """Long-run share of samples that are lost, leaving out what `max_consecutive_losses` saves."""
+        if not isinstance(self.loss, GilbertElliott):
+            return self.loss
+        bad = self.loss.stationary_bad
+        return (1.0 - bad) * self.loss.loss_good + bad * self.loss.loss_bad
+
+    @property
     def longest_delay(self) -> int:
         """The largest number of steps between a sample and its arrival."""
         return self.delay + self.jitter

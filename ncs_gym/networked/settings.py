@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from ncs_gym.envs.episode_channels import EpisodeChannels
+from ncs_gym.envs.episode_channels import EpisodeChannels, EveryEpisode
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of
@@ -33,6 +33,7 @@ class NetworkSettings:
     Attributes:
         parts: The parts of observations that have a channel of their own.
         channels: Their channels.
+        channel: The only one of them, or a dictionary of them by the keys of their parts.
         downlink: The network of the actions; None for an ideal one.
         fill: "last", "zero" or a predictor.
         late: "apply", "drop" or "queue".
@@ -55,6 +56,8 @@ class NetworkSettings:
                 raise ValueError(f"{shown(part.space)} has no floats to quantize: leave out quantization_step")
         if len({channel.on_request for channel in self.channels}) > 1:
             raise ValueError("samples are taken on request on all channels or on none")
+        keys = [part.key for part in self.parts]
+        self.channel = self.channels[0] if keys[0] is None else dict(zip(keys, self.channels, strict=True))
         self.downlink = as_channel(settings["downlink"], "downlink")
         downlink_protocol(self.downlink, None)  # raises where a setting makes no sense there
         self.fill: Any = settings["fill"]
@@ -96,12 +99,16 @@ class NetworkSettings:
             ValueError: If it is no channel, or of keys that observations do not have.
         """
         option = options.pop("channel", None)
-        if isinstance(option, Mapping):
+        given = option.first if isinstance(option, EveryEpisode) else option
+        each = [given] * len(self.parts)
+        if isinstance(given, Mapping):
             keys = [part.key for part in self.parts]
-            if unknown := [key for key in option if key not in keys]:
+            if unknown := [key for key in given if key not in keys]:
                 raise ValueError(f"the option channel has the key {shown(unknown[0])}, the channels' are {keys}")
-            return [links.read(option.get(key), "channel") for key, links in zip(keys, uplinks, strict=True)]
-        return [links.read(option, "channel") for links in uplinks]
+            each = [given.get(key) for key in keys]
+        if isinstance(option, EveryEpisode):
+            each = [EveryEpisode(option.draw, first) for first in each]
+        return [links.read(one, "channel") for one, links in zip(each, uplinks, strict=True)]
 
     def _memory(self) -> int:
         """Returns how many actions the newest sample may lack: what the contracts allow, or without any the delays."""

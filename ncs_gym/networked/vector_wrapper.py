@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from copy import deepcopy
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ncs_gym.envs.settings import channel_setting
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor
-from ncs_gym.networked.wrapper import NETWORK_STREAM, nothing
+from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
+from ncs_gym.validation import AroundEnvironment, require_batched_infos
 
 
-class VectorNetworked(VectorWrapper, RecordConstructorArgs):
+class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
     """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
 
     Each environment has a network of its own; all draw from one generator, so that N = 1 is what `Networked` does. It
@@ -41,6 +44,10 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
     Raises:
         ValueError: If a setting is wrong, or does not fit the environments' spaces.
     """
+
+    made_by: ClassVar[str] = "VectorNetworked(envs, channel=...)"
+    channel: Any = channel_setting("channel", "_settings.channel")
+    downlink: Channel | None = channel_setting("downlink", "_settings.downlink")
 
     def __init__(
         self,
@@ -87,9 +94,9 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
 
         Args:
             seed: Seeds the networks (a list by its first entry) and the environments.
-            options: "channel" and "downlink" as for `Networked`, also lists with one for each environment; they hold
-                for the episodes that begin by autoreset, too. "reset_mask", bool (N,), starts some. The rest is the
-                environments'.
+            options: "channel" and "downlink" as for `Networked`, also lists with one for each environment; episodes
+                that begin by autoreset have the environments' own again. "reset_mask", bool (N,), starts some. The
+                rest is the environments'.
         """
         own, count = dict(options or {}), self.num_envs
         chosen = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
@@ -98,6 +105,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
         observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
+        require_batched_infos(info, "VectorNetworked")
         first = seed[0] if isinstance(seed, list) else seed
         if first is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
@@ -106,6 +114,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
         everywhere = bool(chosen.all())
         if everywhere:
             self._make()
+            self._describe()
         self._begin(np.flatnonzero(chosen), self._snapshots.taken(observations), anew=not everywhere)
         return self._seen(), self._with_network(info)
 
@@ -141,6 +150,8 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
                 arrivals.link.begin(rng, rows, links.begin(rng, rows))
             if self._actuator is not None:
                 self._actuator.begin(rng, rows, self._downlinks.begin(rng, rows))
+            if not all(links.is_plain for links in (*self._uplinks, self._downlinks)):
+                self._describe()
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             arrivals.begin(rows, part.of(samples))
         self._steps[rows] = self._packets[rows] = self._action_age[rows] = 0
@@ -149,6 +160,12 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             self._earned[rows] = self._told[rows] = 0.0
         if self._keeps_actions:
             self._decided[rows] = self._nothing
+
+    def _describe(self) -> None:
+        """Keeps what infos say of the networks of the present episodes."""
+        keys = [part.key for part in self._settings.parts]
+        several = None if keys[0] is None else keys
+        self._network = network_infos(several, self._uplinks, self._downlinks, many=True)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Sends the actions, steps the environments with those that act now, and sees what arrives."""
@@ -215,6 +232,7 @@ class VectorNetworked(VectorWrapper, RecordConstructorArgs):
             "action_age": self._action_age.copy(),
             "action_applied": self._applied.copy(),
             "packets": self._packets.copy(),
+            **deepcopy(self._network),
         }
 
 

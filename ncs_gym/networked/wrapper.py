@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs, seeding
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos
+from ncs_gym.envs.settings import channel_setting
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor
-from ncs_gym.validation import warn_caller
+from ncs_gym.validation import AroundEnvironment, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
 PATIENCE = 10
@@ -24,7 +26,7 @@ PATIENCE = 10
 NETWORK_STREAM = 0x6E6574
 
 
-class Networked(gym.Wrapper, RecordConstructorArgs):
+class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """Puts a network between an environment and its agent: observations and actions are late, lost, rare or rounded.
 
     It needs no model and proves nothing; where there is a linear model, `NCSEnv` has an estimator and a shield for it.
@@ -47,6 +49,10 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
     | `action_age` | int | steps | how long ago the action that acted in this step was decided; 0 at reset |
     | `action_applied` | of the actions | - | that action; at reset the neutral one, or zeros |
     | `packets` | int | packets | samples sent in this episode |
+    | `channel_loss` | float | - | long-run share of samples that this episode's channel loses; with several likewise |
+    | `channel_delay` | int | steps | longest delay of this episode's channel; with several likewise |
+    | `downlink_loss` | float | - | of this episode's downlink; zero for an ideal one |
+    | `downlink_delay` | int | steps | likewise |
 
     Args:
         env: Any environment but an `NCSEnv`, which has its own network.
@@ -71,6 +77,8 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
             taken, and at the end of an episode the rest.
 
     Attributes:
+        channel: The channel of the observations; with several a dictionary of them.
+        downlink: The channel of the actions; None for an ideal one.
         episode_channel: The channel of this episode; with several a dictionary of them. `reset` takes another one as
             its option "channel" (and "downlink"), or what draws one (`RandomChannel`).
 
@@ -80,6 +88,10 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
     Raises:
         ValueError: If a setting is wrong, or does not fit the environment's spaces.
     """
+
+    made_by: ClassVar[str] = "Networked(env, channel=...)"
+    channel: Any = channel_setting("channel", "_settings.channel")
+    downlink: Channel | None = channel_setting("downlink", "_settings.downlink")
 
     def __init__(
         self,
@@ -119,16 +131,6 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
         return self._rng
 
     @property
-    def channel(self) -> Any:
-        """The channel of the observations; with several a dictionary of them."""
-        return self._by_part(self._settings.channels)
-
-    @property
-    def downlink(self) -> Channel | None:
-        """The channel of the actions; None for an ideal one."""
-        return self._settings.downlink
-
-    @property
     def episode_channel(self) -> Any:
         """The channel of this episode; with several a dictionary of them."""
         return self._by_part([links.now[0] for links in self._uplinks])
@@ -156,6 +158,7 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
         for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
             links.give(given)
             links.begin(rng)
+        self._network = network_infos(self._keys, self._uplinks, self._downlinks)
         self._snapshots.begin()
         self._step = self._packets = 0
         sample = self._snapshots.taken(observation)
@@ -269,10 +272,22 @@ class Networked(gym.Wrapper, RecordConstructorArgs):
             "action_age": action_age,
             "action_applied": applied.copy() if isinstance(applied, np.ndarray) else applied,
             "packets": self._packets,
+            **self._network,
         }
 
     def _by_part(self, values: list[Any]) -> Any:
         return values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
+
+
+def network_infos(
+    keys: list[Any] | None, uplinks: list[EpisodeChannels], downlinks: EpisodeChannels, *, many: bool = False
+) -> dict[str, Any]:
+    """Returns what infos say of the networks of the present episodes; by the keys of the parts, where there are any."""
+    infos = channel_infos(uplinks[0], downlinks, many=many)
+    if keys is not None:
+        parts = [links.infos("channel", many=many) for links in uplinks]
+        infos |= {name: {key: part[name] for key, part in zip(keys, parts, strict=True)} for name in parts[0]}
+    return infos
 
 
 class _Arrivals:

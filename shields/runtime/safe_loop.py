@@ -296,6 +296,7 @@ class SafeLoop(CopiedWhole):
         Args:
             proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; clipped to the limits.
                 What is no finite input (None, say, if the controller failed) is replaced by u = K x_hat.
+                What is neither None nor numbers of that shape (a batch, a tensor with gradient) is told of.
             ask: Whether your controller asks for a sample, where samples are on request: that of the next step, behind
                 a downlink that of c steps later. See `request`.
 
@@ -309,6 +310,8 @@ class SafeLoop(CopiedWhole):
         if as_flag(ask, "ask"):
             requests = require_on_request(requests)
         u = _as_input(proposed, low.shape)  # what is none is decided as such
+        if u is None and proposed is not None:
+            self._tell_of_proposal(proposed, low.shape)
         self._phase = _Phase.STOPPED
         u = np.full_like(low, np.nan) if u is None else np.minimum(np.maximum(u, low), high)
         decision = self._monitored.decide(u)
@@ -435,6 +438,18 @@ class SafeLoop(CopiedWhole):
             warn_caller(
                 f"a packet was discarded: {texts[name]} (`discarded` counts such packets)", UnusedPacketsWarning
             )
+
+    def _tell_of_proposal(self, proposed: Any, shape: tuple[int, ...]) -> None:
+        """Warns once of proposals that are no numbers of the shape of an input, as mistakes in programs make them."""
+        numbers = as_numbers(proposed)
+        is_input = numbers is not None and (numbers.shape == shape or (numbers.ndim == 0 and shape == (1,)))
+        if is_input or "proposal" in self._told_of:  # NaN comes from a controller that failed
+            return
+        self._told_of = self._told_of | {"proposal"}
+        warn_caller(
+            f"decide takes one input, numbers of shape {shape}, got {shown(proposed)}; u = K x_hat is applied instead",
+            UserWarning,
+        )
 
     def _require_started(self) -> _Phase:
         if self._phase is _Phase.STOPPED:

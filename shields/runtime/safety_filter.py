@@ -253,7 +253,7 @@ class SafetyFilter(ReadOnlyArrays):
         """Warns the caller of `decide` that estimate or input is not a single one, for which it decides K x_hat."""
         for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self._single, strict=True):
             if (array := _as_array(value)).shape != (size,):
-                got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"
+                got = f"shape {array.shape}" if array.size else shown(value)
                 warn_caller(
                     f"decide takes one {name}, numbers of shape ({size},), got {got}: it falls back to K x_hat "
                     "(decide_many takes batches, shields.torch.SafeLayer tensors)",

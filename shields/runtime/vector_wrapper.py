@@ -15,7 +15,7 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.validation import own_error_state
+from ncs_gym.validation import own_error_state, require_batched_infos
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
@@ -42,7 +42,7 @@ class Clock(NamedTuple):
     ticks: int
 
 
-class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
+class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
     """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
 
     Every info value has N as its first axis; `shield_reason` is an array of str objects, read-only while
@@ -118,6 +118,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
             if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
                 self._clock = before  # refused before anything moved
             raise
+        require_batched_infos(info, "VectorSafetyShield")
         self._require_same()
         self._look_at({*self._inner.episode_channels})
         now = self._read_clock()

@@ -15,9 +15,10 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
+from ncs_gym.envs.settings import channel_setting
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import as_number, own_error_state, setting, shown, warn_caller
+from ncs_gym.validation import AroundEnvironment, as_number, own_error_state, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
@@ -38,7 +39,7 @@ INTERRUPTED = (-1, -1)
 PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
 
-class BaseShield(RecordConstructorArgs, Generic[E]):
+class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
     """What the shields have in common: their settings, and that what they wrap stays what they were made for."""
 
     certificate: Certificate = setting("certificate")
@@ -46,7 +47,7 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
     mode: str = setting("mode", "_filter.mode")
     horizon: int | None = setting("horizon", "_filter.horizon")
     on_unproved: str = setting("on_unproved", "_lost.on_unproved")
-    channel: Channel = setting("channel", "_inner.channel")
+    channel: Channel = channel_setting("channel", "_inner.channel")
 
     # Class of the innermost environment, base class of the wrappers around it, and those that may not be inside.
     _wanted: type[E]
@@ -71,8 +72,8 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
         for space in ("action_space", "single_action_space"):
             if getattr(env, space, None) != getattr(inner, space, None):
                 raise ValueError(f"a wrapper inside the shield changes the action space to {getattr(env, space)}")
-        self._wrappers.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
+        self._wrappers.__init__(self, env)
         self._lost = LostGuarantee(on_unproved, getattr(inner, "num_envs", 1))
         self._certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
@@ -141,7 +142,7 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
         )
 
 
-class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
+class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
     """Overrides an action whenever the safe set could be left (docs/shield.md).
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest

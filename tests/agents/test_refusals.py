@@ -59,7 +59,10 @@ HYPERPARAMS = [
     ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values, got 'learning_rate': nan"),
     *(("PPO", {"policy_kwargs": {"net_arch": value}}, "net_arch must be widths >= 1") for value in
       ("64", 64, [64.0], [True], [0], [-1], [[64], [64]], [64, {"pi": [64]}], {"pi": 64}, {"pi": {"64": 64}})),
-    ("DQN", {}, "unknown algorithm 'DQN'"),
+    ("DQN", {}, "unknown algorithm 'DQN'; known are PPO"),
+    ("ppo", {}, "unknown algorithm 'ppo'; it is written 'PPO'; known are"),
+    ("crossq", {}, "unknown algorithm 'crossq'; it is written 'CrossQ'; known are"),
+    (["PPO"], {}, r"unknown algorithm \['PPO'\]; known are"),
     ("SAC", {"n_epochs": 2}, "unknown hyperparameter 'n_epochs'"),
 ]  # fmt: skip
 

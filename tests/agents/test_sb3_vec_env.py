@@ -127,29 +127,52 @@ def test_options_reach_the_environment_once():
             env.reset()
 
 
-def test_infos_hold_the_cost_without_being_asked_for():
-    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3))
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_sums_over_the_infos_are_those_over_the_arrays(mode):
+    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20, autoreset_mode=mode))
+    env = SB3VecEnv(shield)
     env.reset()
-    for _ in range(30):
-        *_, infos = env.step(np.ones((3, 1), np.float32))
-        assert all(set(info) == {"cost"} for info in infos)
-        assert [info["cost"] for info in infos] == env.batch_info["cost"].tolist()
-    assert max(info["cost"] for info in infos) == 1.0
+    sums, arrays, ends = dict.fromkeys(SUMMED, 0.0), dict.fromkeys(SUMMED, 0.0), 0
+    for _ in range(60):
+        *_, done, infos = env.step(np.ones((3, 1), np.float32))
+        ends += done.sum()
+        for key in SUMMED:
+            sums[key] += sum(info.get(key, 0) for info in infos)
+            arrays[key] += env.batch_info[key].sum()
+        assert all(env.batch_info.keys() - {"final_obs", "final_info"} >= info.keys() - ENDS for info in infos)
+    assert sums == arrays
+    assert ends == 9
+    assert sums["shield_intervened"] > 20
+    assert sums["shield_correction"] > 10.0
 
 
-def test_infos_hold_what_is_asked_for():
-    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3))
-    env = SB3VecEnv(shield, info_keys=("shield_intervened",))
+SUMMED = "cost", "shield_intervened", "shield_correction", "shield_guaranteed", "packet_arrived", "contract_broken"
+ENDS = {"episode", "terminal_observation", "TimeLimit.truncated"}
+
+
+def test_infos_of_arrays_that_are_written_over_are_those_of_their_step():
+    class Reused(gym.vector.VectorEnv):
+        num_envs, metadata = 2, {"autoreset_mode": AutoresetMode.SAME_STEP}
+        single_observation_space = single_action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+        count = np.zeros(2)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros((2, 1), np.float32), {"count": self.count}
+
+        def step(self, actions):
+            self.count += 1.0
+            return (
+                np.zeros((2, 1), np.float32),
+                np.zeros(2),
+                np.zeros(2, bool),
+                np.zeros(2, bool),
+                {"count": self.count},
+            )
+
+    env = SB3VecEnv(Reused())
     env.reset()
-    *_, infos = env.step(np.ones((3, 1), np.float32))
-    assert all(set(info) == {"cost", "shield_intervened"} for info in infos)
-    assert {"estimate", "shield_reason"} <= set(env.batch_info)
-
-
-def test_infos_that_no_step_has_are_refused():
-    env = SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3)), info_keys=("intervened", "cost"))
-    with pytest.raises(ValueError, match=r"names 'intervened', which no info has; known are .*shield_intervened"):
-        env.reset()
+    infos = [env.step(np.zeros((2, 1)))[3] for _ in range(3)]
+    assert [info["count"] for _, info in infos] == [1.0, 2.0, 3.0]
 
 
 def test_last_infos_of_sync_environments_are_complete_when_all_end_at_once():
@@ -166,7 +189,7 @@ def test_last_infos_of_sync_environments_are_complete_when_all_end_at_once():
         wrappers=[Extra],
         vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
     )
-    env = SB3VecEnv(vector, info_keys=("k",))
+    env = SB3VecEnv(vector)
     env.seed(0)
     env.reset()
     for step in range(1, 9):
@@ -227,7 +250,7 @@ def test_evaluate_policy_counts_episodes_by_its_infos():
 
 
 def test_actions_are_those_that_were_handed_over_whatever_is_written_into_them_later():
-    env = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2), info_keys=["input"])
+    env = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2))
     env.reset()
     actions = np.full((2, 1), 0.25, np.float32)
     env.step_async(actions)

@@ -142,6 +142,9 @@ def test_setting_of_an_environment_is_read_and_setting_it_says_how_to_make_anoth
         for name in {*inspect.signature(NCSEnv.__init__).parameters} - FREE | more:
             value = getattr(each, name)
             sentence = f"{name} is a setting of {kind} and cannot be changed: make another {kind} with it, as in {way}"
+            if name in ("channel", "downlink"):
+                options = f'reset(options={{"{name}": ...}})'
+                sentence += f"; episodes get other ones by RandomChannel, a single one by {options}"
             with pytest.raises(AttributeError) as refused:
                 setattr(each, name, value)
             assert str(refused.value) == sentence

@@ -14,7 +14,7 @@ from experiments.attack.monte_carlo_batch import MonteCarloBatch, cases_of, kind
 from experiments.attack.safety_counts import SafetyCounts, gaussian_table, require_safe, require_within
 from experiments.attack.worst_case import GaussianVectorEnv, HostileRequests, WorstCaseVectorEnv
 from experiments.commands import attack as command
-from experiments.commands.attack import attack
+from experiments.commands.attack import attack, shortened
 from experiments.errors import ResultsError, RunError, SafetyBroken
 from experiments.runs.run_store import RunStore
 from experiments.settings.certificates import AttackSettings
@@ -267,6 +267,27 @@ def test_more_exits_than_the_bound_allows_are_an_error():
     with pytest.raises(SafetyBroken, match=r"case: 20 of 100 episodes left S, more than the bound 0\.11? "):
         require_within(counts, {"case": 0.1})
     assert "[1.3e-01, 2.9e-01]   0.15" in gaussian_table(counts, limits)
+
+
+def test_a_smoke_run_attacks_the_environments_own_channels_unless_others_are_asked_for():
+    def attacked(**given):
+        short = shortened(AttackSettings(smoke=True, **given))
+        assert short.steps <= 1e5
+        assert short.out == Path("runs/attack-smoke")
+        return cases_of(short)
+
+    assert {name.rpartition(", ")[2] for name in attacked()} == {"its channel"}
+    assert len(attacked()) > 10
+    assert {name.rpartition(", ")[2] for name in attacked(channel="perfect")} == {"perfect"}
+    kinds = {name.rpartition(", ")[2] for name in attacked(env="ncs_gym/CartPole-v0")}
+    assert kinds > {"its channel", "late"}
+    assert shortened(AttackSettings()) == AttackSettings()
+
+
+def test_a_smoke_run_says_what_it_is(tmp_path, small, capsys, without_workers):
+    attack(settings(tmp_path, smoke=True))
+    assert "attacks too little to show anything else" in " ".join(capsys.readouterr().out.split())
+    assert document(tmp_path)["total"]["steps"] <= 1e5
 
 
 @pytest.fixture

@@ -166,6 +166,16 @@ def test_finished_study_is_not_overwritten(command, smoke):
     assert digests(out) == before
 
 
+def test_sweep_takes_arms_with_hyphens_and_refuses_one_twice(tmp_path, without_workers):
+    given = ("--losses", 0.3, "--delays", 0, "--burst-lengths", 0, "--seeds", 1, "--episodes", 2)
+    with without_pictures():
+        run = ncs("sweep", *given, "--arms", "K-x_hat", "--out", tmp_path / "out")
+    assert run.returncode == 0, run.stderr
+    assert [*json.loads((tmp_path / "out" / "summary.json").read_text())["cells"][0]["arms"]] == ["K x_hat"]
+    twice = ncs("sweep", *given, "--arms", "K-x_hat", "K x_hat", "--out", tmp_path / "twice")
+    assert_one_sentence(twice, "--arms must be different values")
+
+
 @pytest.mark.slow
 def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
     (tmp_path / "episode.gif").write_text("mine")

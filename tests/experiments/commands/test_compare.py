@@ -4,14 +4,15 @@ from dataclasses import replace
 import pytest
 
 from agents import tuned_hyperparams
+from agents.agent_file import AgentError
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
-from experiments.commands.compare import findings_of
+from experiments.commands.compare import findings_of, shortened
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import by_arm
-from experiments.runs.experiment import run_of_arm
+from experiments.runs.experiment import certificate_of, run_of_arm
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
@@ -35,6 +36,30 @@ def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_oth
     assert {len(pairs) for pairs in seeds.values()} == {1}
     flat = [number for pairs in seeds.values() for pair in pairs for number in pair]
     assert len(set(flat)) == len(flat) == 6
+
+
+def test_a_smoke_run_evaluates_the_pretrained_agent_unless_something_else_is_asked_for():
+    short = shortened(CompareSettings(smoke=True))
+    assert short.arms == ("unshielded", "shielded")
+    assert {"pretrained", "pretrained+shielded"} <= set(short.baselines)
+    own = shortened(CompareSettings(smoke=True, arms=("shielded",), baselines=("lqr",)))
+    assert (own.arms, own.baselines) == (("shielded",), ("lqr",))
+    without = shortened(CompareSettings(smoke=True, env="plants:plants/Own-v0"))
+    assert without.baselines == CompareSettings().baselines
+    assert shortened(CompareSettings()) == CompareSettings()
+
+
+def test_the_pretrained_agent_needs_its_shield_which_the_arms_of_a_smoke_run_show():
+    settings, loop = shortened(CompareSettings(smoke=True)), LoopConfig(env=CRUISE)
+    proved = certificate_of(loop)
+    alone, behind = (run_of_arm(settings, loop, proved, name, 0) for name in ("pretrained", "pretrained+shielded"))
+    assert not any(run.trains for run in (alone, behind))
+    alone, behind = (run.execute(lambda steps: None) for run in (alone, behind))
+    assert sum(episode.violation_steps > 0 for episode in alone.episodes) > 5
+    assert sum(episode.violation_steps for episode in behind.episodes) == 0
+    assert sum(episode.interventions for episode in behind.episodes) > 10
+    with pytest.raises(AgentError, match="there is no pretrained agent of 'ncs_gym/LinearNCS-v0'"):
+        run_of_arm(settings, LoopConfig(env="ncs_gym/LinearNCS-v0"), proved, "pretrained", 0)
 
 
 def test_another_seed_draws_everything_anew(certificate):

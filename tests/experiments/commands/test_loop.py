@@ -1,12 +1,15 @@
 """A control loop over UDP in processes of its own: what the logs say holds at any speed of the machine."""
 
 import csv
+import inspect
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import pandas as pd
@@ -14,9 +17,11 @@ import pytest
 import tyro
 from PIL import Image
 
+import ncs_gym.network.wire
+import shields.nodes.nodes
 from experiments.commands.loop import summary_of
 from experiments.network_loop.log import StepLog, rows_of
-from experiments.network_loop.processes import NetworkLoop, network_channels, waiting_text
+from experiments.network_loop.processes import REFUSED, NetworkLoop, network_channels, waiting_text
 from experiments.runs.loops import registered_env
 from experiments.settings import LoopSettings
 from ncs_gym import Channel
@@ -62,7 +67,9 @@ def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     assert done.returncode == 0, done.stderr
     summary, controller = check(out)
     assert summary["steps of the controller"] == len(controller) == 100
-    assert summary["datagrams refused"] > 0
+    by_reason = [value for name, value in summary.items() if name.startswith("refused, ")]
+    assert summary["datagrams refused"] == sum(by_reason) > 0
+    assert "--mischief 0.3 makes such: beside 30 % of the datagrams" in " ".join(done.stdout.split())
     assert controller["guaranteed"].iloc[0] == 1
     assert "outside although proved" in done.stdout
     assert "overridden" in done.stdout
@@ -127,7 +134,31 @@ def test_machines_that_were_told_other_things_have_other_keys(changes):
     untold = told | {"settings": LoopSettings(seed=7, out=Path("elsewhere"))}
     assert NetworkLoop(**told).key == NetworkLoop(**untold).key
     assert NetworkLoop(**told).key != NetworkLoop(**other).key
-    assert "--speed, --room" in waiting_text({"tag": 3})
+    assert "--speed, --room" in waiting_text({"tag": 3}, two_machines())
+
+
+def two_machines():
+    return LoopSettings(role="controller", key_file=Path("key"))
+
+
+def test_messages_about_refused_datagrams_say_what_is_known():
+    refused = Counter({"tag": 700, "length": 20, "episode": 5, "late": 0})
+    alone = waiting_text(refused, LoopSettings(mischief=0.1))
+    assert "725 datagrams were refused: 700 with a wrong tag, 20 of the wrong length, 5 of another episode" in alone
+    assert "--mischief 0.1 makes such: beside 10 % of the datagrams" in alone
+    assert "another key" not in alone  # on one machine there is only one
+    assert "--mischief 0 makes none of these" in waiting_text(refused, LoopSettings(mischief=0.0))
+    apart = waiting_text(refused, two_machines())
+    assert "makes such, and if all have a wrong tag, that machine has another key" in apart
+    assert "another key" not in waiting_text({"episode": 3}, two_machines())
+    assert waiting_text(Counter({"late": 0}), two_machines()).endswith("nothing has arrived yet")
+
+
+def test_every_reason_to_refuse_a_datagram_has_words():
+    nodes, wire = (inspect.getsource(module) for module in (shields.nodes.nodes, ncs_gym.network.wire))
+    reasons = {*re.findall(r'refused\["(\w+)"\]', nodes), *re.findall(r'WireError\("(\w+)"\)', wire)}
+    assert len(reasons) > 5
+    assert reasons == set(REFUSED)
 
 
 def test_controller_that_waits_says_what_it_waits_for(tmp_path):

@@ -22,6 +22,13 @@ def plant_file(tmp_path):
     return tmp_path / "plant.json"
 
 
+def test_requirements_that_are_refused_leave_nothing(plant_file, tmp_path):
+    run = ncs("requirements", "--plant", plant_file, "--losses", -1, "--out", tmp_path / "out")
+    assert run.returncode == 2
+    assert "max_consecutive_losses must be a whole number" in run.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_requirements_leave_table_figure_certificates_and_are_resumed(plant_file, tmp_path, without_workers):
     asked = ("--send-periods", 1, 2, "--losses", 0, 20, "--out", tmp_path / "r")
     arguments = ("requirements", "--plant", plant_file, *asked)

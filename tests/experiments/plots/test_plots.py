@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
 from agents.results import TrainingPoint
+from experiments.plots import comparison_figures as figures
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
     comparison_figures,
@@ -24,6 +25,7 @@ from experiments.plots.comparison_figures import (
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
 from experiments.settings.learning import REGULATED_ARMS
 from ncs_gym import Ellipsoid, LinearPlant
+from shields.polytope import Polytope
 from tests.command import without_pictures
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
@@ -58,7 +60,12 @@ def by_color(axis):
     return {to_hex(line.get_color()).lower(): line for line in lines(axis)}
 
 
-BALL = SimpleNamespace(L=np.eye(2), polytope=None)
+def keeping(L):
+    """What figures take of a certificate of an ellipsoid."""
+    return SimpleNamespace(L=L, polytope=None, safe_set=Ellipsoid(L))
+
+
+BALL = keeping(np.eye(2))
 
 
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
@@ -179,11 +186,36 @@ def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
 
 def test_of_many_states_the_largest_are_shown_and_the_caption_speaks_of_projections():
     states = np.array([[0.0, 0.1, 0.0, 0.1], [0.1, 0.9, 0.2, 0.3]])
-    certificate = SimpleNamespace(L=np.diag([1.0, 1, 1, 0.1]), polytope=None)
+    certificate = keeping(np.diag([1.0, 1, 1, 0.1]))
     figure = phase_figure(random_plant(0, 4, 1), certificate, arms("shielded", trajectory=trajectory(states)))
     assert "x2 and x4" in figure.caption
     assert "projection" in figure.caption
     assert any("projection of the safe set" in text for text in texts(figure))
+
+
+def test_phase_plane_draws_the_set_that_the_shield_keeps_and_chooses_states_by_it():
+    """The ellipsoid inside is small and long in other directions: neither outline nor choice is its."""
+    polytope = Polytope(rows=np.diag([0.5, 0.5, 10.0]), multipliers=np.zeros((4, 3)))
+    certificate = SimpleNamespace(L=np.diag([0.01, 1.0, 1e-4]), polytope=polytope, safe_set=polytope)
+    states = np.array([[0.0, 0.0, 0.0], [1.5, 1.0, 0.09]])
+    plant = random_plant(0, 3, 1)
+    figure = phase_figure(plant, certificate, arms("shielded", trajectory=trajectory(states)))
+    assert "x1 and x3" in figure.caption
+    drawn = [line.get_xydata() for line in figure.axes[0].get_lines() if line.get_linestyle() == "-"]
+    assert any(np.allclose(np.abs(points).max(axis=0), [2.0, 0.1]) for points in drawn)
+    shifted = np.array([[10.0, 0.0, 0.0], [10.5, 0.4, 0.05]])  # close to the middle of a set elsewhere
+    moved = SimpleNamespace(L=certificate.L, polytope=None, safe_set=_Moved(np.array([10.0, 0.0, 0.0])))
+    assert figures._plane(moved, shifted) == (1, 2)
+
+
+class _Moved:
+    """A box around another point, with half-widths 2, 1 and 0.1."""
+
+    def __init__(self, center):
+        self.center = center
+
+    def support(self, directions):
+        return directions @ self.center + np.abs(directions) @ np.array([2.0, 1.0, 0.1])
 
 
 @pytest.mark.parametrize("seed", range(3))

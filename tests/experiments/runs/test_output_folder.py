@@ -38,6 +38,42 @@ def finished(command, settings, file="summary.json"):
     return settings
 
 
+@pytest.mark.parametrize("error", [ValueError("no"), FileNotFoundError("no"), RuntimeError("no"), KeyboardInterrupt()])
+@pytest.mark.parametrize("computed", [False, True])
+def test_a_command_that_refuses_before_it_computed_anything_leaves_nothing(error, computed, tmp_path):
+    settings = CompareSettings(out=tmp_path / "runs" / "out")
+
+    def failing():
+        with folder_of("compare", settings):
+            (settings.out / "runs" / "empty").mkdir(parents=True)
+            if computed:
+                (settings.out / "runs" / "a.json").write_text("{}")
+            raise error
+
+    with pytest.raises(type(error)):
+        failing()
+    is_refused = isinstance(error, (ValueError, OSError)) and not computed
+    assert settings.out.exists() != is_refused
+    assert (settings.out / "settings.json").exists() != is_refused
+
+
+def test_files_of_ones_own_stay_where_a_command_refuses_and_nothing_is_added(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="no"), folder_of("compare", CompareSettings(out=tmp_path)):
+        raise ValueError("no")
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_settings_of_an_earlier_command_stay_where_a_later_one_refuses(tmp_path):
+    settings = CompareSettings(out=tmp_path / "out")
+    with folder_of("compare", settings):
+        pass
+    before = (settings.out / "settings.json").read_bytes()
+    with pytest.raises(ValueError, match="no"), folder_of("compare", settings):
+        raise ValueError("no")
+    assert (settings.out / "settings.json").read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("command", "kind", "change", "words"),
     [
@@ -54,7 +90,7 @@ def finished(command, settings, file="summary.json"):
         ("attack", AttackSettings, {"mode": "switch"}, "mode"),
         ("study", StudySettings, {"budget": 0.5}, "budget"),
         ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
-        ("attack", AttackSettings, {"steps": 1e7}, "steps"),
+        ("attack", AttackSettings, {"steps": 1e6}, "steps"),
         ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
     ],
 )
@@ -186,10 +222,10 @@ def test_folder_is_free_again_when_its_command_is_killed_or_interrupted_or_ends(
 
 
 def test_a_failure_gives_the_folder_back(tmp_path):
-    for error in (ValueError, KeyboardInterrupt):
+    for error, left in ((ValueError, []), (KeyboardInterrupt, ["settings.json"])):
         with pytest.raises(error), folder_of("compare", CompareSettings(out=tmp_path)):
             raise error
-        assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+        assert [path.name for path in tmp_path.iterdir()] == left
 
 
 def test_the_lock_is_no_file_that_stays(tmp_path):

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
 from ncs_gym import (
     Channel,
@@ -13,8 +14,10 @@ from ncs_gym import (
     GilbertElliott,
     NCSEnv,
     NCSVectorEnv,
+    Networked,
     RandomChannel,
     SpeedTracking,
+    VectorNetworked,
     VectorRandomChannel,
     cart_pole,
     truck_trailer,
@@ -63,14 +66,76 @@ def test_vector_with_a_channel_for_each_environment_equals_scalar_ones(channels,
     assert env.episode_channels == tuple(channels)
 
 
-def test_channels_of_a_reset_equal_scalar_ones_and_are_kept_by_episodes_that_begin_by_themselves():
+def test_channels_of_a_reset_equal_scalar_ones_and_last_for_one_episode():
     env = NCSVectorEnv(3, plant=PLANT, channel=Channel(quantization_step=0.02), max_episode_steps=31)
     compare(env, 90, {"channel": LATE})
-    assert env.episode_channels == tuple(LATE)
+    assert set(env.episode_channels) == {env.channel}
+    env.reset(seed=0, options={"channel": LATE})
     env.reset(seed=0, options={"reset_mask": np.array([True, False, False])})
     assert env.episode_channels == (Channel(quantization_step=0.02), *LATE[1:])
     env.reset(seed=0)
     assert set(env.episode_channels) == {env.channel}
+
+
+def losses(envs, steps=9, length=3):
+    """What infos say of the channels of consecutive episodes of a vector environment of ours, shape (N,) each."""
+    reset = envs.reset(seed=0, options={"channel": Channel(loss=0.5), "downlink": Channel(loss=0.25, delay=1)})[1]
+    assert reset["downlink_loss"].tolist() == [0.25] * envs.num_envs
+    found = [reset["channel_loss"]]
+    for _ in range(steps):
+        *_, terminated, truncated, info = envs.step(envs.action_space.sample())
+        if "final_info" in info:
+            found.append(info["channel_loss"])
+        elif (terminated | truncated).any() and envs.unwrapped.autoreset_mode is AutoresetMode.DISABLED:
+            found.append(envs.reset(options={"reset_mask": terminated | truncated})[1]["channel_loss"])
+        elif not envs.unwrapped.steps.any():
+            found.append(info["channel_loss"])
+    return found
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_channel_of_an_option_lasts_one_episode_in_every_mode_of_autoreset(mode):
+    loop = {"channel": Channel(loss=0.3), "downlink": Channel(delay=2)}
+    envs = NCSVectorEnv(2, plant=PLANT, max_episode_steps=3, autoreset_mode=mode, **loop)
+    first, *others = losses(envs)
+    assert first.tolist() == [0.5, 0.5]
+    assert len(others) > 1
+    assert {loss for each in others for loss in each} == {0.3}
+    drawn = VectorRandomChannel(envs, [Channel(loss=0.1), Channel(loss=0.2)])
+    first, *others = losses(drawn, 40)
+    assert first.tolist() == [0.5, 0.5]
+    assert {loss for each in others for loss in each} == {0.1, 0.2}
+
+
+def test_infos_say_which_channel_an_episode_has():
+    env = RandomChannel(gym.make("ncs_gym/TruckTrailer-v0"), [Channel(loss=BURSTS, delay=1, jitter=2)])
+    info = env.reset(seed=0)[1]
+    assert (info["channel_loss"], info["channel_delay"]) == (pytest.approx(0.4), 3)
+    assert (info["downlink_loss"], info["downlink_delay"]) == (0.0, 0)
+    rng, state, lost = np.random.default_rng(0), True, []
+    for _ in range(40_000):  # the chain itself, in place of its stationary distribution
+        state = rng.random() < (BURSTS.p_bad_to_good if not state else 1.0 - BURSTS.p_good_to_bad)
+        lost.append(not state)
+    assert np.mean(lost) == pytest.approx(info["channel_loss"], abs=0.02)
+    parts = gym.spaces.Dict({"a": gym.spaces.Box(-1.0, 1.0, (1,)), "b": gym.spaces.Box(-1.0, 1.0, (1,))})
+    several = Networked(Nothing(parts), channel={"a": Channel(loss=0.2), "b": Channel(delay=2)}, downlink=Channel())
+    info = several.reset(options={"downlink": Channel(loss=0.5)})[1]
+    assert info["channel_loss"] == {"a": 0.2, "b": 0.0}
+    assert info["channel_delay"] == {"a": 0, "b": 2}
+    assert info["downlink_loss"] == 0.5
+    many = VectorNetworked(gym.make_vec("CartPole-v1", num_envs=2), Channel(loss=0.2))
+    info = many.reset(options={"channel": [Channel(loss=0.4), None]})[1]
+    assert info["channel_loss"].tolist() == [0.4, 0.2]
+
+
+class Nothing(gym.Env):
+    """An environment in which nothing happens."""
+
+    def __init__(self, space):
+        self.observation_space, self.action_space = space, gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
 
 
 def test_downlinks_for_each_environment_equal_scalar_ones():

@@ -7,10 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers.vector import DictInfoToList
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 
-from agents import SafetyCallback
+from agents import SafetyCallback, SB3VecEnv
 from agents.loop import CostPenalty
 from ncs_gym import (
     Actuator,
@@ -19,12 +20,16 @@ from ncs_gym import (
     Estimator,
     LinearPlant,
     NCSEnv,
+    NCSVectorEnv,
     Packet,
+    RequestActions,
     UnusedPacketsWarning,
+    VectorNetworked,
+    VectorRequestActions,
     cart_pole,
     truck_trailer,
 )
-from shields import SafeLoop, SafetyFilter, SafetyShield, synthesize
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from tests.certificates import certificate_of
 
 PLANT = truck_trailer(mass=4000.0)
@@ -52,7 +57,7 @@ def test_stepping_after_the_end_of_an_episode_is_refused():
     [
         (np.zeros((5, 2)), np.zeros((5, 1)), r"one estimate, numbers of shape \(2,\), got shape \(5, 2\).*decide_many"),
         (np.zeros(2), np.zeros((5, 1)), r"one input, numbers of shape \(1,\), got shape \(5, 1\)"),
-        (np.zeros(2), torch.zeros(1, requires_grad=True), "one input, .* got a Tensor.*SafeLayer"),
+        (np.zeros(2), torch.zeros(1, requires_grad=True), "one input, .* got tensor.* detach it .*SafeLayer"),
     ],
 )
 def test_batches_and_tensors_handed_to_a_filter_are_told_of(certificate, estimate, proposed, words):
@@ -60,6 +65,57 @@ def test_batches_and_tensors_handed_to_a_filter_are_told_of(certificate, estimat
     with pytest.warns(UserWarning, match=words):
         decision = shield.decide(estimate, certificate.Sigma, proposed)
     assert decision.reason == "invalid"
+
+
+@pytest.mark.filterwarnings("error")
+def test_proposals_that_are_no_input_by_mistake_are_told_of_once_and_not_applied(certificate):
+    wrong = {
+        r"got tensor\(\[0.5000\], requires_grad=True\), which has a gradient: detach it": torch.tensor(
+            [0.5], requires_grad=True
+        ),
+        r"got .* which has a gradient: detach it": [torch.tensor(0.5, requires_grad=True)],
+        r"got array\(\[\[0.5\]\]\)": np.full((1, 1), 0.5),
+        "got 'full throttle'": "full throttle",
+    }
+    for words, proposed in wrong.items():
+        loop = SafeLoop(certificate, PLANT, Channel())
+        loop.start([0.5, 0.0])
+        with pytest.warns(UserWarning, match=rf"one input, numbers of shape \(1,\), {words}.*K x_hat is applied"):
+            decision = loop.step(proposed)
+        assert decision.reason == "invalid"
+        np.testing.assert_allclose(decision.input, certificate.K @ loop.estimate, atol=1e-6)
+        loop.step(proposed)
+    for failed in (None, np.nan, np.array([np.inf])):  # a controller that failed is no mistake
+        assert loop.step(failed).reason == "invalid"
+
+
+@pytest.mark.parametrize("wrong", [torch.zeros(1, requires_grad=True), [torch.tensor(0.0, requires_grad=True)]])
+def test_actions_with_a_gradient_are_refused_with_what_to_do(certificate, wrong):
+    env, envs = NCSEnv(PLANT), NCSVectorEnv(1, plant=PLANT)
+    asks = Channel(on_request=True)
+    asking, many = RequestActions(NCSEnv(PLANT, asks)), VectorRequestActions(NCSVectorEnv(1, plant=PLANT, channel=asks))
+    shields = SafetyShield(NCSEnv(PLANT), certificate), VectorSafetyShield(NCSVectorEnv(1, plant=PLANT), certificate)
+    for each in (env, envs, asking, many, *shields):
+        each.reset(seed=0)
+        with pytest.raises(ValueError, match=r"which has a gradient: detach it"):
+            each.step(wrong)
+
+
+def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certificate):
+    inside = DictInfoToList(NCSVectorEnv(2, plant=PLANT))
+    asked = DictInfoToList(NCSVectorEnv(2, plant=PLANT, channel=Channel(on_request=True)))
+    classic = DictInfoToList(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
+    around = {
+        "VectorSafetyShield": VectorSafetyShield(inside, certificate),
+        "VectorRequestActions": VectorRequestActions(asked),
+        "VectorNetworked": VectorNetworked(classic),
+        "SB3VecEnv": SB3VecEnv(inside),
+    }
+    for name, env in around.items():
+        with pytest.raises(ValueError, match=rf"{name} reads .* makes a list .* outside of {name}"):
+            env.reset()
+    outside = DictInfoToList(VectorSafetyShield(NCSVectorEnv(2, plant=PLANT), certificate))
+    assert outside.reset()[1][1]["shield_guaranteed"]
 
 
 def test_infos_without_cost_are_named():

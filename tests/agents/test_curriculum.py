@@ -1,0 +1,107 @@
+"""Curricula: what would have no effect is refused, and what has one has the same one everywhere."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from agents import SB3VecEnv
+from agents.loop import CostPenalty, ResidualActions
+from ncs_gym import (
+    Channel,
+    Networked,
+    RandomChannel,
+    RequestActions,
+    VectorNetworked,
+    VectorRandomChannel,
+    VectorRequestActions,
+)
+from shields import SafetyShield, VectorSafetyShield
+
+ID, CLASSIC = "ncs_gym/TruckTrailerCruise-v0", "CartPole-v1"
+ASKS = {"channel": Channel(on_request=True, max_consecutive_losses=1)}
+
+
+def shield():
+    return SafetyShield(gym.make(ID))
+
+
+def shields():
+    return VectorSafetyShield(gym.make_vec(ID, num_envs=2))
+
+
+# Our wrappers around environments, each with what only something inside has.
+WRAPPED = {
+    "shield": (shield, ("channel", "disturbance", "plant", "steps", "episode_channel")),
+    "random": (lambda: RandomChannel(shield(), [Channel()]), ("channel", "downlink", "penalty", "certificate")),
+    "requests": (lambda: RequestActions(gym.make(ID, **ASKS)), ("channel", "noise", "task")),
+    "network": (lambda: Networked(gym.make(CLASSIC)), ("channel", "downlink", "gravity")),
+    "around": (lambda: RandomChannel(Networked(gym.make(CLASSIC)), [Channel()]), ("channel", "downlink", "gravity")),
+    "networks": (lambda: VectorNetworked(gym.make_vec(CLASSIC, num_envs=2)), ("channel", "downlink", "gravity")),
+    "shields": (shields, ("channel", "disturbance", "rendered_env")),
+    "randoms": (lambda: VectorRandomChannel(shields(), [Channel()]), ("channel", "penalty")),
+    "asking": (lambda: VectorRequestActions(gym.make_vec(ID, num_envs=2, **ASKS)), ("channel", "noise")),
+    "penalty": (lambda: CostPenalty(shields(), 1.0), ("channel", "certificate")),
+    "residual": (lambda: ResidualActions(shields(), np.zeros((1, 2))), ("channel", "initial_set")),
+    "adapter": (lambda: SB3VecEnv(shields()), ("channel", "disturbance", "penalty", "certificate")),
+}
+
+
+@pytest.mark.parametrize("kind", WRAPPED)
+def test_what_only_something_inside_has_is_not_set_on_a_wrapper(kind):
+    make, names = WRAPPED[kind]
+    env = make()
+    for each in (env, pickle.loads(pickle.dumps(env))):
+        for name in names:
+            with pytest.raises(
+                AttributeError, match=r"and cannot be changed|set on \w+ it would have no effect"
+            ) as refused:
+                setattr(each, name, 1)
+            assert name not in vars(each)
+            assert (name in ("channel", "downlink")) == ("episodes get other ones" in str(refused.value))
+            if name in ("channel", "downlink"):
+                assert f'reset(options={{"{name}": ...}})' in str(refused.value)
+        each.my_own_mark = 3
+        assert each.my_own_mark == 3
+    if kind == "adapter":
+        with pytest.raises(AttributeError, match="episodes get other ones by RandomChannel"):
+            env.set_attr("channel", Channel())
+        with pytest.raises(AttributeError, match="penalty belongs to the VectorSafetyShield inside"):
+            VecNormalize(env).set_attr("penalty", 3.0)
+    if kind == "penalty":  # which algorithms with multipliers change
+        env.penalty = 2.0
+        assert env.penalty == 2.0
+        assert env.env.penalty == 0.0
+
+
+def test_stable_baselines3_sets_no_channel_on_a_shield_and_asks_through_its_monitor():
+    shielded = DummyVecEnv([lambda: SafetyShield(gym.make(ID))])
+    with pytest.raises(AttributeError, match="episodes get other ones by RandomChannel"):
+        shielded.set_attr("channel", Channel(loss=0.5))
+    monitored = DummyVecEnv([lambda: Monitor(gym.make(ID))])
+    with pytest.raises(AttributeError, match="episodes get other ones by RandomChannel"):
+        monitored.env_method("set_wrapper_attr", "channel", Channel(loss=0.5))
+
+
+def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_and_under_our_adapter():
+    def episodes(env):
+        env.set_options({"channel": Channel(loss=0.5, delay=4)})
+        env.reset()
+        seen = [env.reset_infos[0]]
+        for _ in range(9):
+            *_, done, infos = env.step(np.zeros((2, 1), np.float32))
+            if done.all():
+                assert infos[0]["channel_loss"] == seen[-1]["channel_loss"]
+                seen.append(env.reset_infos[0])
+        return [(info["channel_loss"], info["channel_delay"]) for info in seen]
+
+    made = {"max_episode_steps": 3, "channel": Channel(loss=0.3, delay=1)}
+    theirs = episodes(DummyVecEnv([lambda: gym.make("ncs_gym/TruckTrailer-v0", **made)] * 2))
+    assert theirs == [(0.5, 4), (0.3, 1), (0.3, 1), (0.3, 1)]
+    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
+        ours = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, autoreset_mode=mode, **made))
+        assert episodes(ours) == theirs
