@@ -307,14 +307,14 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, an earlier step failed half-way, or ended the episode.
         """
-        _, decided = read_action(self._plant, action)
+        read = read_action(self._plant, action)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         if self._over:
             raise gym.error.ResetNeeded("the episode is over, as the step before said: call reset")
         self._consistent = False
         rng = self.np_random
-        inputs = self._downlink_state.exchange(rng, self.steps, decided)
+        inputs = self._downlink_state.exchange(rng, self.steps, read[1])
         u, before = inputs.applied, self._state
         if self._requests is not None:
             self._requests.decide(self._estimator.age)
@@ -330,7 +330,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._estimator.advance(u, packets)
         reward = float(self._task.reward(self._plant, self._task_state, self._state, u))
         worst = self._plant.worst_constraint_values(before, u, self._state)
-        info = self._info(inputs, worst, arrived=bool(packets))
+        info = self._info(inputs, worst, arrived=bool(packets), read=read)
         terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         self._consistent, self._over = True, terminated or self._process.truncated
         if self.renderer is not None:
@@ -441,7 +441,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             task_state = self._task.predict(self._plant, task_state, u)
         return self._observer.observation(self._known, self._task.observe(task_state))
 
-    def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:
+    def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool, read: Any = None) -> dict[str, Any]:
         values = worst if self._worst_is_now else self._plant.constraint_values(self._state)
         cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
         self._violations += cost
@@ -459,7 +459,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
         happened = estimator.mean, self._state, inputs.missing, arrived
-        told = constraints, sampled, self._network, actions_of(inputs, self._plant)
+        told = constraints, sampled, self._network, actions_of(inputs, self._plant, read)
         return loop_info(self._known, *happened, self._contract, *told)
 
 

@@ -698,6 +698,11 @@ class LinearPlant(ReadOnlyArrays):
             half = np.where(beyond, np.nextafter(half, 0.0), half)
 
     @cached_property
+    def input_scales(self) -> tuple[tuple[float, float], ...]:
+        """`input_middle` and `input_half` of each input as numbers."""
+        return tuple(zip(self.input_middle.tolist(), self.input_half.tolist(), strict=True))
+
+    @cached_property
     def largest_input(self) -> np.ndarray:
         """The largest |u_i| within the limits, shape (m,)."""
         return read_only(np.maximum(-self.input_low, self.input_high))
