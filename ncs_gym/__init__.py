@@ -24,6 +24,7 @@ from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
+from ncs_gym.processes.linearization import NoEquilibriumWarning
 from ncs_gym.registration import register_all, register_plant
 from ncs_gym.rendering import Annotation
 from ncs_gym.tasks.base_task import Task
@@ -72,6 +73,7 @@ __all__ = [
     "NCSEnv",
     "NCSVectorEnv",
     "Networked",
+    "NoEquilibriumWarning",
     "NoNoiseWarning",
     "Packet",
     "PacketLog",

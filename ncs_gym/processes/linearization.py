@@ -14,7 +14,7 @@ from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, own_error_state, shown
+from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, own_error_state, shown, warn_caller
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
 HELD_OUT = 0.25
@@ -31,6 +31,8 @@ MOST_UPDATES = 10_000
 THINNEST = 1e-4
 # No sample loses all of its weight.
 SMALLEST_WEIGHT = 1e-9
+# The operating point is no equilibrium if a step moves it by more, in half-widths of the box.
+NO_EQUILIBRIUM = 1e-6
 # Results keep this many digits, so that other machines find the same numbers.
 DIGITS = 9
 
@@ -76,6 +78,9 @@ def linear_model(
         settings: Other arguments of `LinearPlant`. A and B, given together, are taken in place of fitted ones; a
             disturbance is declared beside the remainder.
 
+    Warns:
+        NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far and the nearest point that stays.
+
     Raises:
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
             cannot be put into a state, is no function of it although a proof is asked for, or an argument is wrong.
@@ -106,6 +111,8 @@ def linear_model(
         basis = f"from {samples:,} samples with safety factor {factor:g}"
     largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
     basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
+    if (off := float((np.abs(origin) / widths).max())) > max(NO_EQUILIBRIUM, spread):
+        warn_caller(_moving_origin(off, origin, (A, B), common), NoEquilibriumWarning)
     reached = np.sqrt(np.diag(bound.shape_matrix)) / widths
     if reached.max() >= 1.0:
         raise ValueError(
@@ -114,6 +121,28 @@ def linear_model(
         )
     remainder = Remainder(bound, jacobian_bounds is not None, basis)
     return LinearPlant(A=A, B=B, remainder=remainder, **common, **settings)
+
+
+class NoEquilibriumWarning(UserWarning):
+    """The point that deviations are counted from does not stay where it is, and the remainder has to hold that."""
+
+
+def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.ndarray], common: Any) -> str:
+    """Returns the sentence about f(0, 0), shape (n,), that is `off` half-widths long at its largest entry."""
+    (A, B), widths, limits = model, common["box"], common["u_max"]
+    balance = np.hstack([(np.eye(len(A)) - A) * widths, -B * limits]) / widths[:, None]
+    point = np.linalg.lstsq(balance, origin / widths)[0]
+    state, applied = widths * point[: len(A)], limits * point[len(A) :]
+    sentence = (
+        f"the operating point is no equilibrium: a step from (0, 0) moves it by {off:.3g} half-widths of the box, "
+        "which the remainder has to hold"
+    )
+    if np.abs(balance @ point - origin / widths).max() > 0.1 * off:
+        return f"{sentence}, and by the linear model no point nearby stays where it is"
+    return (
+        f"{sentence}; by the linear model the state {shown(exact.rounded(state, 4).tolist())} stays where it is with "
+        f"the input {shown(exact.rounded(applied, 4).tolist())}: count deviations from there"
+    )
 
 
 def _steps_of(

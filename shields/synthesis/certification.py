@@ -9,12 +9,13 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import as_flag, own_error_state, shown
+from ncs_gym.validation import as_flag, as_vector, own_error_state, shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
@@ -46,7 +47,13 @@ from shields.synthesis.polytope_gain import (
     needs_of,
     regulators,
 )
-from shields.synthesis.resting_point import at_operating_point, farthest_from_limits, improved, limits_around
+from shields.synthesis.resting_point import (
+    at_operating_point,
+    farthest_from_limits,
+    improved,
+    limits_around,
+    resting_at,
+)
 from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
@@ -95,6 +102,7 @@ def synthesize(
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
     search_gain: bool = False,
+    resting_state: ArrayLike | None = None,
     progress: Progress | None = None,
     candidates: Sequence[Certificate] = (),
 ) -> Certificate:
@@ -112,6 +120,9 @@ def synthesize(
             time the ellipsoid stays, and the printed certificate says why. None is "polytope".
         search_gain: Also seek the gain whose polytope is the largest, which takes about as long again, longer for
             polytopes of many rows. That gain keeps the polytope alone.
+        resting_state: Equilibrium around which the fallback works, shape (n,) [deviations from the operating point],
+            for a polytope; by default the operating point where limits are symmetric about it, else one that leaves
+            much of the box.
         progress: Called with a line of text per stage: what is sought, and the volume reached so far.
         candidates: Certificates of tighter problems (closer limits, larger bounds, an older age, a coarser
             quantization). The search is local; no set that one of them proves here is larger than the result's, so that
@@ -139,10 +150,14 @@ def synthesize(
             f"None, got {shown(contract)}"
         )
     report = progress or (lambda line: None)
-    if _needs_resting_point(plant):
+    if resting_state is not None or _needs_resting_point(plant):
         if safe_set == "ellipsoid":
-            raise ValueError("only a polytope is sought where limits are not symmetric, or not all states have any")
-        return _around_resting_point(plant, contract, report, candidates, search_gain=search_gain)
+            raise ValueError(
+                "only a polytope is sought where limits are not symmetric, not all states have any, some are of states "
+                "and inputs together, or resting_state is given"
+            )
+        rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
+        return _around_resting_point(plant, contract, report, candidates, rest, search_gain=search_gain)
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if safe_set == "ellipsoid":
         known = [each.without_polytope() for each in known if each.keeps_ellipsoid]
@@ -163,20 +178,23 @@ def _around_resting_point(
     contract: ChannelContract | None,
     progress: Progress,
     candidates: Sequence[Certificate],
+    fixed: Rest | None = None,
     *,
     search_gain: bool,
 ) -> Certificate:
     """Returns a verified certificate of a polytope for limits that are not symmetric about the operating point.
 
-    The gain is sought within symmetric limits around the equilibrium that is farthest from all limits; where the share
-    of the box is known, a better resting point then, and with `search_gain` a better gain.
+    The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
+    fixed one; where the share of the box is known, a better resting point then, and with `search_gain` a better gain.
 
     Raises:
         Infeasible: If none is found.
     """
     progress("resting point")
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
-    rest = farthest_from_limits(plant)
+    if fixed is not None:
+        known = [each for each in known if np.array_equal(each.resting_state, fixed.state)]
+    rest = fixed or farthest_from_limits(plant)
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     shapes = np.array([proof.Sigma for proof in _proofs(errors)])
     points = points_of_box(plant, _POINTS_OF_REST_LOG2)
@@ -186,14 +204,16 @@ def _around_resting_point(
 
     tried = []
     for K in _gains_around(plant, problem, progress):
-        needs = needs_of(feedback(K, rest), plant)
+        needs = None if fixed else needs_of(feedback(K, rest), plant)
         tried.append(feedback(K, rest if needs is None else farthest_from_limits(plant, needs)))
     if points is not None and tried:
         shares = [share_of_points(each, plant, points) for each in tried]
         tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
         K, first = tried[0].K, tried[0].rest
         progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
-        better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
+        better = tried[0]
+        if not fixed:
+            better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
         larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
         tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
     for each in tried:

@@ -1,10 +1,13 @@
 """Linear models of processes: the fit, the bound on the remainder, and how it is known."""
 
+import re
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, linear_model
+from ncs_gym import Ellipsoid, NoEquilibriumWarning, linear_model
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import surrounding_shape
 
@@ -72,6 +75,7 @@ def test_linear_process_leaves_nothing_out():
     assert np.sqrt(plant.remainder.bound.shape_matrix.max()) < 1e-9
 
 
+@pytest.mark.filterwarnings("ignore::ncs_gym.NoEquilibriumWarning")
 @pytest.mark.parametrize("offset", [0.0, 0.02, -0.02])
 def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
     """A kink attains the mean value theorem's bound, and what happens at rest comes on top of that."""
@@ -143,3 +147,23 @@ def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
             largest = max(largest, plant.disturbance.gauge(left_out))
     inner.close()
     assert 0.999 < largest <= 1.0
+
+
+def test_operating_point_that_does_not_stay_is_told_with_the_nearest_one_that_does():
+    """A tank that runs dry: with the named input the named level stays, and counted from there nothing is told."""
+
+    def tank(x, u):
+        return x + 0.1 * (u - 0.5 * np.sqrt(np.maximum(x + 1.0, 0.0)))
+
+    settings = {"disturbance_bound": 0.001, "sensor_bound": 0.01, "initial_bound": 0.01}
+    with pytest.warns(NoEquilibriumWarning, match=r"moves it by 0\.1 half-widths") as told:
+        model = linear_model(tank, [0.5], [0.6], 0.1, samples=500, **settings)
+    state, applied = (float(each) for each in re.findall(r"\[(-?[\d.e-]+)\]", str(told[0].message)))
+    assert abs(tank(np.array([state]), np.array([applied]))[0] - state) < 0.01
+    assert abs(state) < 0.5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", NoEquilibriumWarning)
+        moved = linear_model(lambda x, u: tank(x, u + 0.5), [0.5], [0.6], 0.1, samples=500, **settings)
+    assert moved.remainder.bound.shape_matrix.item() < model.remainder.bound.shape_matrix.item()
+    with pytest.warns(NoEquilibriumWarning, match="no point nearby stays"):
+        linear_model(lambda x, u: x + 0.01 + 0.0 * u, [0.5], [0.6], 0.1, samples=500, **settings)

@@ -526,6 +526,28 @@ def test_ends_of_rows_that_are_swapped_are_refused():
             )
 
 
+def test_resting_state_is_taken_where_it_is_one():
+    plant = ANGLE
+    state = np.array([0.1, 0.0])
+    found = synthesize(plant, contract=CONTRACT, resting_state=state)
+    np.testing.assert_array_equal(found.resting_state, state)
+    np.testing.assert_allclose(plant.A @ state + plant.B @ found.resting_input, state, atol=1e-12)
+    assert verify(found, plant).valid
+    assert verify_again(found, plant).valid
+    symmetric = synthesize(plant.symmetric, contract=CONTRACT, resting_state=[0.05, 0.0])
+    assert symmetric.resting_state.tolist() == [0.05, 0.0]
+    assert verify_again(symmetric, plant.symmetric).valid
+    for wrong, words in (
+        ([0.1, 0.1], "must be an equilibrium, and no input holds"),
+        ([0.9, 0.0], "strictly within the limits"),
+        ([0.1], "resting_state must have shape"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            synthesize(plant, contract=CONTRACT, resting_state=wrong)
+    with pytest.raises(ValueError, match="resting_state is given"):
+        synthesize(plant.symmetric, contract=CONTRACT, resting_state=[0.05, 0.0], safe_set="ellipsoid")
+
+
 def test_candidate_of_another_plant_is_carried_over_and_never_returned_as_it_is():
     """A tighter problem's certificate belongs to its own plant; the result is always one of the plant asked for."""
     tighter = replace(ANGLE, disturbance_bound=Ellipsoid(1.5 * ANGLE.disturbance_bound.shape_matrix))
