@@ -1,7 +1,8 @@
-"""Prints what certificates keep of the published plants: `python -m experiments.published [names]`."""
+"""Prints what certificates keep of the published plants: `python -m experiments.published [--attack STEPS] [names]`."""
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 import warnings
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.published.attack import Attacked, attack
 from experiments.published.plants import contract_of_plant, plant_of, published
 from ncs_gym import LinearPlant
 from shields import Certificate, Infeasible, synthesize, verify
@@ -17,18 +19,27 @@ _COLUMNS = ("plant", "n, m", "age", "limits", "share", "rows", "time [s]")
 _WIDTHS = (18, 6, 4, 12, 8, 6, 9)
 
 
-def main(names: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Prints a row for every plant, and in the end how many have a certificate.
+
+    With `--attack` each certificate is attacked for so many steps, too.
 
     Raises:
         SystemExit: If a name is none of theirs.
     """
+    parser = argparse.ArgumentParser(prog="python -m experiments.published", description=__doc__)
+    parser.add_argument("names", nargs="*", help="plants; all by default")
+    parser.add_argument("--attack", type=int, default=0, metavar="STEPS", help="attacked steps of each certificate")
+    options = parser.parse_args(arguments)
+    names, total, outside = options.names, 0, 0
     if unknown := [name for name in names if name not in published()]:
         raise SystemExit(f"no published plant is called {unknown[0]}; there are {', '.join(published())}")
     print(_row(*_COLUMNS))
     found = 0
     for name in names or published():
-        began, plant = time.perf_counter(), plant_of(name)
+        with warnings.catch_warnings():  # the page says where operating points move
+            warnings.simplefilter("ignore")
+            began, plant = time.perf_counter(), plant_of(name)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -40,7 +51,18 @@ def main(names: list[str]) -> None:
         assert verify(certificate, plant).valid
         found += 1
         print(_row(name, *_sizes(name, plant), *_kept(certificate), f"{time.perf_counter() - began:.1f}"), flush=True)
+        if options.attack:
+            found_by = attack(name, plant, certificate, options.attack)
+            total, outside = total + found_by.guaranteed, outside + found_by.outside
+            print(f"  attacked for {found_by.steps:,} steps: {_said(found_by)}", flush=True)
+    if options.attack:
+        print(f"{outside} of {total:,} guaranteed steps broke a limit")
     print(f"{found} of {len(names or published())} have a certificate")
+
+
+def _said(found: Attacked) -> str:
+    guaranteed = f"{100.0 * found.guaranteed / found.steps:.4g} % guaranteed"
+    return f"{guaranteed}, {found.outside} of these outside, the closest {-found.closest:.1e} half ranges within"
 
 
 def _sizes(name: str, plant: LinearPlant) -> tuple[str, str, str]:
