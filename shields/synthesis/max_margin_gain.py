@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg import lu_solve
+from scipy.linalg.lapack import dgetrf
 from scipy.optimize import minimize
 
 from ncs_gym.plants.lqr import regulator_gain
@@ -127,7 +128,7 @@ class _GainSearch:
         source = BK @ self._Sigma @ BK.T / ((1.0 - lx) * fraction) + problem.D_u / ((1.0 - lx) * (1.0 - fraction))
         F = (problem.A + BK) / np.sqrt(lx)
         kronecker = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)
-        factors = lu_factor(np.eye(n * n) - kronecker, check_finite=False)
+        *factors, _ = dgetrf(np.eye(n * n) - kronecker)  # of a singular one L is not finite, and nothing is said
         L = lu_solve(factors, source.ravel(), check_finite=False).reshape(n, n)
         return 0.5 * (L + L.T), F, factors
 
