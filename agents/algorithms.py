@@ -21,7 +21,7 @@ from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
 from ncs_gym.installation import install_command
-from ncs_gym.validation import shown
+from ncs_gym.validation import reason_of, shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
 _NO_HYPERPARAMS = ("env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
@@ -76,9 +76,8 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         known = [*_not_the_librarys(name), *(each for each in _parameters(cls) if each not in _NO_HYPERPARAMS)]
-        raise ValueError(f"{name}: {reason}; its hyperparameters are {', '.join(known)}") from error
+        raise ValueError(f"{name}: {reason_of(error)}; its hyperparameters are {', '.join(known)}") from error
 
 
 def _not_the_librarys(name: str) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text, require_moderate
-from ncs_gym.validation import shown
+from ncs_gym.validation import reason_of, shown
 
 # The package of each algorithm, which has a class of the same name.
 ALGORITHMS = {
@@ -211,7 +211,7 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
     try:
         document = json_values(text) if path.suffix == ".json" else _yaml(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"hyperparameters {path} are damaged: {' '.join(str(error).split())}") from error
+        raise ValueError(f"hyperparameters {path} are damaged: {reason_of(error)}") from error
     entries = document if isinstance(document, dict) else {}
     entry = entries.get(env_id, entries.get("default"))
     if not isinstance(entry, dict):
@@ -222,7 +222,7 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
     try:
         return _as_json({name: value_of(name, value) for name, value in entry.items() if name not in RL_ZOO_KEYS})
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {reason_of(error)}") from error
 
 
 def _yaml(text: str) -> Any:
@@ -251,7 +251,7 @@ def _as_json(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
             copied |= json.loads(json.dumps({name: value}, allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             given = f"{shown(name)}: {shown(value)}"
-            raise ValueError(f"hyperparameters must be JSON values, got {given} ({error})") from error
+            raise ValueError(f"hyperparameters must be JSON values, got {given} ({reason_of(error)})") from error
     return copied
 
 

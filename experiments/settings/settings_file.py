@@ -12,7 +12,7 @@ from experiments.errors import SettingsError
 from experiments.json_values import from_json
 from experiments.settings.arguments import id_alone
 from ncs_gym.reading import json_values, read_file
-from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
+from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
@@ -89,8 +89,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
-        raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason}") from error
+        raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason_of(error)}") from error
 
 
 def _is_near(folder: Path, path: Path) -> bool:
