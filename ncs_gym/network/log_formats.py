@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from ncs_gym.reading import LARGEST_LOG, MOST_LINES, json_values, read_file, require_packets
-from ncs_gym.validation import shown
+from ncs_gym.validation import reason_of, shown
 
 
 class Record(NamedTuple):
@@ -68,7 +68,7 @@ def read_record(path: str | os.PathLike[str], period: float | None, step: float)
             raise ValueError(f"a row of a table has at most {_LONGEST_ROW:,} characters, a longer one is no record")
         return _of_table(rows, period, step)
     except csv.Error as error:
-        raise ValueError(f"{shown(path)} is no CSV file: {error}") from error
+        raise ValueError(f"{shown(path)} is no CSV file: {reason_of(error)}") from error
     except ValueError as error:
         raise ValueError(f"{shown(path)}: {error}") from None
 
@@ -93,7 +93,7 @@ def _decoded(content: bytes) -> str:
 _MILLISECONDS = r"(?P<time>\d+(?:[.,]\d+)?) ?ms"
 # A line of ping: the stamp that -D prints, the number of the packet, and the time until its answer.
 _PING = re.compile(
-    rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?.*?\b(?:icmp_)?seq[= ](?P<number>\d+)\b(?:.*?[^\W\d]+[=<]{_MILLISECONDS})?"
+    rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?.*?\b(?:icmp_)?seq[= ](?P<number>\d+)\b(?:.*?[^\W\d][=<]{_MILLISECONDS})?"
 )
 _FPING = re.compile(
     rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?(?P<host>\S+) +: \[(?P<number>\d+)\], (?:timed out|\d+ bytes, {_MILLISECONDS})"
@@ -107,6 +107,8 @@ _WINDOWS_FRAME = re.compile(r"Pinging |Ping statistics for |Packets: |Approximat
 _ANY_PING = re.compile(r"\bicmp_seq[= ]\d|\bseq=\d+ (?:ttl|hlim)=|^PING ", re.MULTILINE)
 _ANY_FPING = re.compile(r"^(?:\[\d+\.\d+\] ?)?\S+ +: \[\d+\], ", re.MULTILINE)
 _ANY_WINDOWS = re.compile(r"^(?:Pinging \S+ |Reply from \S+: |Request timed out)|\d ?ms TTL=\d", re.MULTILINE)
+# A number that nobody counts to, and no clock shows.
+_ENDLESS = re.compile(r"(?<![\w.])\d{19}")
 # How many packets were sent and answered, and how long ping ran; by Linux, BusyBox and macOS, Windows, and fping.
 _SUMMARIES = (
     re.compile(r"\s*(\d+) [^\d,]+, (\d+) [^\d,%]+,.*?%(?:.*, [^\d,]+ (\d+) ?ms)?"),
@@ -122,6 +124,7 @@ _NUMBERS, _LATEST, _MOST_LATE = 65536, 1024, 16
 _PRINTED = 1.0
 # Windows waits so long for an answer before it sends the next packet, unless told otherwise [s].
 _WINDOWS_TIMEOUT = 4.0
+_BEFORE = "the packet arrived before it was sent: the clocks of sender and receiver differ, set one by the other"
 _WAY_AND_BACK = "delays are those of the whole way and back"
 
 
@@ -137,6 +140,8 @@ def _of_ping(text: str, period: float | None) -> Record:
     for number, line in enumerate(lines, 1):
         if len(line) > _LONGEST_LINE:
             raise ValueError(f"line {number} is longer than any of ping")
+        if found := _ENDLESS.search(line):
+            raise ValueError(f"line {number} has a number that is too large, {shown(line[found.start() :])}")
     if "time of day goes back" in text:
         raise ValueError("ping warns that the clock was set back: record anew, or cut the record there")
     if sum(line.startswith(("PING", "Pinging ")) for line in lines) > 1:
@@ -385,7 +390,7 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
             raise ValueError(f"the column {shown(names[columns['delay'].index])} has no unit: name it rtt_ms or rtt_s")
         return _of_list(rows, period, columns)
     raise ValueError(
-        f"it has the columns {', '.join(map(shown, names))}; a log needs sent and received, or sent and delay, or one "
+        f"it has the columns {shown(names)[1:-1]}; a log needs sent and received, or sent and delay, or one "
         "column of round trips, rtt_ms, with the units in their names (_s, _ms, _us, _ns)"
     )
 
@@ -531,6 +536,8 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
     _require_order(moments, np.where(np.isnan(delays), np.nan, arrived), places)
     if flagged:
         delays[flagged] = np.nan
+    if (delays < 0.0).any():
+        raise ValueError(f"line {places[int(np.argmax(delays < 0.0))]}: {_BEFORE}")
     order = np.argsort(moments, kind="stable")
     moments, delays = moments[order], delays[order]
     guessed = not sent_at.unit and unit == "s" and not until.unit
@@ -652,12 +659,20 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
 def _of_steps(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column], dt: float) -> Record:
     """Returns the packets of a log of `ncs loop`: the steps at which those that arrived were sent and received."""
     arrivals: dict[str, dict[int, int]] = {}
+    last, newest = None, 0
     for number, row in rows:
         try:
             sent, received = (_count(row[columns[role].index]) for role in ("sent", "received"))
-            arrived = arrivals.setdefault(row[columns["episode"].index], {})
+            episode = row[columns["episode"].index]
         except (ValueError, IndexError):
             raise ValueError(f"line {number} is not an episode, a step sent and one received") from None
+        if not 0 <= sent <= received:
+            raise ValueError(f"line {number}: {_BEFORE}")
+        if episode in arrivals and (episode != last or received < newest):
+            raise ValueError(
+                f"line {number}: episode {shown(episode)} begins twice: put each log into a file of its own"
+            )
+        last, newest, arrived = episode, received, arrivals.setdefault(episode, {})
         arrived[sent] = min(received, arrived.get(sent, received))  # a second one is a duplicate
     require_packets(sum(max(*arrived, 0) for arrived in arrivals.values()))
     delays = [arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)]
@@ -711,7 +726,7 @@ def _of_json(text: str) -> Record:
     try:
         document = json_values(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"it is no JSON document that can be read: {error}") from None
+        raise ValueError(f"it is no JSON document that can be read: {reason_of(error)}") from None
     trips = document.get("round_trips") if isinstance(document, dict) else None
     if isinstance(trips, list):
         return _of_irtt(trips)
@@ -720,7 +735,7 @@ def _of_json(text: str) -> Record:
             "iperf3 counts packets per interval and records no times, from which no age follows: record with irtt, or "
             "with ping -D"
         )
-    keys = ", ".join(map(shown, document)) if isinstance(document, dict) else "no names"
+    keys = shown([*document])[1:-1] if isinstance(document, dict) else "no names"
     raise ValueError(f"it is JSON with {keys}; of JSON documents only those of irtt are read (round_trips)")
 
 
@@ -733,8 +748,8 @@ def _of_irtt(trips: list[Any]) -> Record:
             moment = moments.get("monotonic", moments.get("wall"))
             lost = trip["lost"] not in ("false", False)
             delay = np.nan if lost else trip["delay"]["rtt"] / 1e9
-            if not abs(int(moment)) < 2**63:
-                raise ValueError("too large")
+            if not (abs(int(moment)) < 2**63 and (lost or 0.0 <= delay < np.inf)):
+                raise ValueError("out of range")
             sent.append(int(moment))
             delays.append(float(delay))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):

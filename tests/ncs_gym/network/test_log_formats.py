@@ -8,6 +8,7 @@ import json
 import math
 import pickle
 import re
+import time
 from decimal import Decimal
 from fractions import Fraction
 from typing import NamedTuple
@@ -401,12 +402,36 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ),
         (irtt_sent(0, 20, 10), "round trip 2 of irtt: the clock was set back by 0.01 s"),
         (irtt_sent(0, 10**400), "round trip 1 of irtt has no time sent"),
+        *(
+            (irtt_sent(0, 9).replace("1000000", delay, 1), "round trip 0 of irtt has no time sent")
+            for delay in ("NaN", "Infinity", "-Infinity", "-1")
+        ),
+        (ping([(1, 2), (2, 900 * "9")]), "line 2 has a number that is too large"),
+        (ping([(1, 2), (900 * "9", 2)]), "line 2 has a number that is too large"),
+        (f"[{900 * '1'}.0] {ping([(1, 2)])}[{900 * '9'}.5] {ping([(2, 2)])}", "line 1 has a number that is too large"),
+        (f"{ping([(1, 2)])}{900 * '9'} packets transmitted, 1 received, 0% packet loss", "line 2 has a number that"),
+        (f"Reply from 192.0.2.1: bytes=32 time={900 * '9'}ms TTL=1\n", "line 1 has a number that is too large"),
+        (f"h : [{900 * '9'}], 64 bytes, 1 ms (1 avg, 0% loss)\n", "line 1 has a number that is too large"),
+        ("sent,received\n0,0.1\n1,\n2,1.9\n", "line 4: the packet arrived before it was sent: the clocks of sender"),
+        ("sent,delay\n0,0.1\n1,-0.5\n", "line 3: the packet arrived before it was sent"),
+        ("episode,sent,received\n0,1,2\n0,4,3\n", "line 3: the packet arrived before it was sent"),
+        ("episode,sent,received\n0,-5,2\n0,4,4\n", "line 2: the packet arrived before it was sent"),
+        ("episode,sent,received\n7,1,2\n7,4,5\n7,1,2\n7,4,5\n", "line 4: episode '7' begins twice"),
+        ("episode,sent,received\n7,1,2\n8,1,2\n7,4,5\n", "line 4: episode '7' begins twice"),
     ],
 )
 def test_file_that_is_not_understood_is_refused_in_one_sentence(content, words, written):
     with pytest.raises(ValueError, match=re.escape(words)) as refusal:
         PacketLog.load(written(content))
     assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 500
+
+
+def test_long_lines_of_ping_take_no_longer_than_their_length(written):
+    line = f"icmp_seq=1 {980 * 'a'}\n"
+    began = time.process_time()
+    PacketLog.load(written(f"icmp_seq=1 time=2 ms\n{300 * line}icmp_seq=2 time=1 ms"))
+    assert time.process_time() - began < 1.0  # of a quadratic search: 5 s
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
