@@ -368,7 +368,7 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     separator = next((each for each in ",;\t|" if each in line), " ")
     if separator == " ":
         line = re.sub(r"\s+(?=[(\[])", "", line)  # a unit in brackets belongs to the name before it
-    names = next(iter(_rows([line], separator, 1)))[1]
+    names = next(_rows([line], separator, 1, with_empty=True))[1]
     if all(_is_number(name) for name in names):
         if len(names) == 1:
             return _of_list(_rows(lines, separator, 1, with_empty=True), period)
