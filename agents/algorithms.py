@@ -11,12 +11,14 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import numpy as np
+import torch
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch import nn
 from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
@@ -106,9 +108,9 @@ def _arguments(
         raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
     if stored == "applied":
         own["replay_buffer_class"] = AppliedActionBuffer
-        own["replay_buffer_kwargs"] = {"limits": env.get_attr("plant")[0].input_ends}
-    if (noise_type := hyperparams.get("noise_type")) not in (None, "normal"):
-        raise ValueError(f"noise_type cannot be {shown(noise_type)}")
+        own["replay_buffer_kwargs"] = (own.get("replay_buffer_kwargs") or {}) | {
+            "limits": env.get_attr("plant")[0].input_ends
+        }
     if (deviation := hyperparams.get("noise_std")) is not None:
         if not _fits(deviation, float) or not 0.0 <= deviation < float("inf"):
             raise ValueError(f"noise_std must be >= 0, got {shown(deviation)}")
@@ -121,15 +123,22 @@ def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the hyperparameter `policy_kwargs` as policies take it: with the class of its activation function.
 
     Raises:
-        ValueError: If torch has no activation function of that name.
+        ValueError: If torch has no activation function of that name, or one that changes the number of entries.
     """
     found, name = dict(given), given.get("activation_fn")
-    if isinstance(name, str):
-        name = name.removeprefix("nn.")
-        if name not in activation.__all__:
-            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)}")
-        found["activation_fn"] = getattr(activation, name)
+    if name is not None:
+        own = str(name).removeprefix("nn.")
+        if own not in activation.__all__ or not _keeps_entries(getattr(activation, own)):
+            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)} of single numbers")
+        found["activation_fn"] = getattr(activation, own)
     return found
+
+
+def _keeps_entries(function: type[nn.Module]) -> bool:
+    try:
+        return function()(torch.zeros(3, 4)).shape == (3, 4)
+    except (RuntimeError, TypeError, ValueError):  # of images, or of what is more than a function
+        return False
 
 
 def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:

@@ -185,6 +185,14 @@ def test_yaml_that_expands_is_refused(text, write):
         read_hyperparams(write("laughs.yml", text), "default")
 
 
+@pytest.mark.parametrize("number", [f"1{120_000 * ':1'}", f"!!float '1{120_000 * ':1'}.5'", 100_000 * "9"])
+def test_numbers_of_yaml_are_of_moderate_length(number, write):
+    from agents.hyperparams import read_hyperparams
+
+    with little_memory(), pytest.raises(ValueError, match="are damaged: it has a number of more than 1,000 letters"):
+        read_hyperparams(write("long.yml", f"default:\n  gamma: {number}\n"), "default")
+
+
 def test_yaml_with_moderate_aliases_is_read(write):
     from agents.hyperparams import read_hyperparams
 
