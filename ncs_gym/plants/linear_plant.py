@@ -704,7 +704,11 @@ class LinearPlant(ReadOnlyArrays):
 
     @cached_property
     def grid_rows(self) -> between_samples.GridRows | None:
-        """What the box says of states and inputs between samples; None if only the sampling instants count."""
+        """What the box says of states and inputs between samples; None if only the sampling instants count.
+
+        Raises:
+            OverflowError: If it is out of reach of float64, which the message says.
+        """
         if self.between_samples is None or self.continuous_model is None:
             return None
         return between_samples.grid_rows(
