@@ -264,21 +264,28 @@ def _between_stamps(numbers: np.ndarray, stamps: dict[int, float]) -> np.ndarray
     known = np.array(sorted(stamps))
     # None was sent after a later one: where stamps were printed late the earlier time is nearer.
     times = np.minimum.accumulate([stamps[each] for each in known[::-1].tolist()])[::-1]
+    _require_time(known, times)
     steps, gaps = np.diff(known), np.diff(times)
-    if (steps == 1).any():
-        expected = steps * np.quantile(gaps[steps == 1], 0.05)
-        hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
-        if len(hurried):
-            raise ValueError(
-                f"between the packets {known[hurried[0]]} and {known[hurried[0] + 1]} its stamps leave too little time "
-                "for the lost ones: the clock was set back there, cut the record"
-            )
     slope = float(np.median(gaps / steps))
     sent = np.interp(numbers, known, times)
     before, after = numbers < known[0], numbers > known[-1]
     sent[before] = times[0] - slope * (known[0] - numbers[before])
     sent[after] = times[-1] + slope * (numbers[after] - known[-1])
     return sent
+
+
+def _require_time(numbers: np.ndarray, sent: np.ndarray) -> None:
+    """Raises ValueError if there is too little time between two packets for those that are missing between them."""
+    steps, gaps = np.diff(numbers), np.diff(sent)
+    if not (steps == 1).any():
+        return
+    expected = steps * np.quantile(gaps[steps == 1], 0.05)
+    hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
+    if len(hurried):
+        raise ValueError(
+            f"between the packets {numbers[hurried[0]]} and {numbers[hurried[0] + 1]} its stamps leave too little time "
+            "for the lost ones: the clock was set back there, cut the record"
+        )
 
 
 def _period_of(summary: _Summary | None, period: float | None) -> tuple[float, str]:
@@ -371,7 +378,7 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     names = next(_rows([line], separator, 1, with_empty=True))[1]
     if all(_is_number(name) for name in names):
         if len(names) == 1:
-            return _of_list(_rows(lines, separator, 1, with_empty=True), period)
+            return _of_list(_with_decimals(_rows(lines, separator, 1, with_empty=True), [0]), period)
         raise ValueError(
             "its columns have no names, and neither their order nor their unit can be guessed safely: write them into "
             "the first line, as in sent_ms,received_ms"
@@ -422,23 +429,36 @@ def _rows(
         yield number, cells
 
 
+# A number that may have groups of three digits, and one that has none.
+_GROUPS = re.compile(r"[+-]?[1-9]\d{0,2}(?:([.,])\d{3})?")
+_NO_GROUPS = re.compile(r"[+-]?(?:\d+([.,])\d+|\d{4,})")
+
+
 def _with_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]) -> Iterator[tuple[int, list[str]]]:
-    """Yields the rows, and raises ValueError after the last one if all commas may separate thousands."""
-    doubtful, is_decimal = None, False
+    """Yields the rows, and raises ValueError after the last one if commas or points may separate thousands.
+
+    All commas may, and points in a column whose numbers below 1000 have none, unless larger ones have none, either.
+    """
+    doubtful: dict[tuple[int, str], tuple[int, str]] = {}
+    decimal, small, large = set[str](), set[int](), set[int]()
     for line, cells in rows:
-        for cell in [] if is_decimal else [cells[index] for index in indices if index < len(cells)]:
-            if "," not in cell or not re.fullmatch(r"[+-]?\d+,\d+", cell):
+        for index in indices:
+            if index >= len(cells) or ("." in decimal and "," not in cells[index]):
                 continue
-            if re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell):
-                doubtful = doubtful or (line, cell)
-            else:
-                is_decimal = True
+            if found := _GROUPS.fullmatch(cells[index]):
+                if found[1]:
+                    doubtful.setdefault((index, found[1]), (line, cells[index]))
+                else:
+                    small.add(index)
+            elif found := _NO_GROUPS.fullmatch(cells[index]):
+                decimal.add(found[1]) if found[1] else large.add(index)
         yield line, cells
-    if doubtful is not None and not is_decimal:
-        line, cell = doubtful
-        raise ValueError(
-            f"line {line}: the comma in {shown(cell)} may be that of decimals or of thousands: write decimal points"
-        )
+    for (index, separator), (line, cell) in doubtful.items():
+        if separator not in decimal and (separator == "," or index in small - large):
+            name, way = ("comma", "decimal points") if separator == "," else ("point", "numbers without those")
+            raise ValueError(
+                f"line {line}: the {name} in {shown(cell)} may be that of decimals or of thousands: write {way}"
+            )
 
 
 def _columns(names: Sequence[str]) -> dict[str, _Column]:
@@ -540,6 +560,7 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         raise ValueError(f"line {places[int(np.argmax(delays < 0.0))]}: {_BEFORE}")
     order = np.argsort(moments, kind="stable")
     moments, delays = moments[order], delays[order]
+    _require_receiver(moments, delays, np.array(places)[order])
     guessed = not sent_at.unit and unit == "s" and not until.unit
     missing = 0
     if "number" in columns:
@@ -610,6 +631,27 @@ def _require_order(sent: np.ndarray, arrived: np.ndarray, lines: Sequence[int]) 
     )
 
 
+def _require_receiver(sent: np.ndarray, delays: np.ndarray, lines: np.ndarray) -> None:
+    """Raises ValueError if a packet overtakes another, and many before took longer than as many from it on.
+
+    The clock of the receiver alone was set back there, or the network became faster at once by more than a period.
+    """
+    known = np.flatnonzero(~np.isnan(delays))
+    taken, arrived, many = delays[known], (sent + delays)[known], _MOST_LATE + 1
+    if len(known) < 2 * many:
+        return
+    stretches = np.lib.stride_tricks.sliding_window_view(taken, many)
+    faster = stretches[:-many].min(axis=1) - stretches[many:].max(axis=1)
+    back = (faster > 0.0) & (arrived[many : 1 - many] < arrived[many - 1 : -many])
+    if back.any():
+        at = int(np.argmax(back))
+        raise ValueError(
+            f"line {lines[known[at + many]]}: from here on packets take {faster[at]:.3g} s less or more, and this one "
+            "overtakes the one before: if the clock of the receiver was set back, or the network changed, cut the "
+            "record there"
+        )
+
+
 def _count(cell: str) -> int:
     value = int(cell)
     if abs(value) > _LARGEST_COUNT:
@@ -645,6 +687,7 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
             f"by its time packet {numbers[back[0] + 1]} was sent after packet {numbers[back[0]]}: a clock was set "
             "back, or numbers come twice"
         )
+    _require_time(numbers, sent)
     steps = np.diff(numbers)
     gaps = np.where(steps > 1, steps - 1, 0)
     require_packets(len(sent) + int(np.minimum(gaps, 10**9).sum()))

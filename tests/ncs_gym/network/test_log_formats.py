@@ -396,6 +396,17 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent,received\n261126100000,261126100000\n261126100001,\n", "no time since 1970"),
         ("sent_ms,received_ms\n20261126100000020,20261126100000025\n20261126100000040,\n", "no time since 1970"),
         ("sent_ms\treceived_ms\n980\t985\n1,000\t1,005\n1,020\t1,025\n", "line 3: the comma in '1,000' may be"),
+        ("rtt_ms\n980\n1.020\n1.040\n", "line 3: the point in '1.020' may be that of decimals or of thousands"),
+        ("980\n1.020\n1.040\n", "line 2: the point in '1.020' may be"),
+        ("sent_ms,rtt_ms\n1000,980\n2000,1.020\n3000,990\n", "line 3: the point in '1.020' may be"),
+        (
+            rows("seq,sent,received", [(n, n if n < 20 else n - 6) for n in range(60) if not 20 <= n < 30]),
+            "between the packets 19 and 30 its stamps leave too little time",
+        ),
+        (
+            "sent,received\n" + "".join(f"{0.1 * n:.2f},{0.1 * n + (0.5 if n < 40 else 0.2):.2f}\n" for n in range(80)),
+            "line 42: from here on packets take 0.3 s less or more, and this one overtakes the one before",
+        ),
         ("rtt_ms\n1,020\n1,040\n", "line 2: the comma in '1,020' may be"),
         (
             "sent,received\n46352.4000000000,46352.4000000579\n46352.4000002315,46352.4000002894\n",
