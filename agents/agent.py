@@ -34,7 +34,7 @@ from agents.sb3_vec_env import SB3VecEnv
 from agents.sb3_zip import parameters_of, read_model, require_same_spaces
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
-from ncs_gym.validation import reason_of
+from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
 
 
@@ -209,13 +209,13 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     env_id, algorithm = content["env"], content["algorithm"]
     if env_id not in gym.registry:
         raise AgentError(
-            f"the agent was trained in {env_id}, which is not registered here: import the module that registers it, or "
-            f"on the command line give --env module:{env_id}, with the name of that module"
+            f"the agent was trained in {shown(str(env_id))[1:-1]}, which is not registered here: import the module "
+            "that registers it, or on the command line give --env module:id, with the name of that module"
         )
     if not _is_for_plant_of(env_id, content["plant"]):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
-        raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
+        raise AgentError(f"the agent is of an unknown algorithm, {shown(algorithm)}")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))

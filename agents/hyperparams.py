@@ -116,7 +116,7 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
             `MOST_WEIGHTS`.
     """
     if algorithm not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm {algorithm!r}; known are {', '.join(ALGORITHMS)}")
+        raise ValueError(f"unknown algorithm {shown(algorithm)}; known are {', '.join(ALGORITHMS)}")
     if not isinstance(given, Mapping | None):
         raise ValueError(f"hyperparameters must be a dictionary, got {type(given).__name__}")
     hyperparams = with_changes(DEFAULTS[algorithm], _as_json(given or {}))

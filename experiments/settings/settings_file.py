@@ -72,7 +72,8 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise SettingsError(f"{path} is not of format {FORMAT!r}")
     if document.get("command") != command or not isinstance(document.get("settings"), dict):
-        raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
+        other = shown(str(document.get("command")))[1:-1]
+        raise SettingsError(f"{path} holds settings of ncs {other}, not of ncs {command}")
     values = {name: value for name, value in document["settings"].items() if name not in _OF_THE_MACHINE}
     envs = values.get("envs")
     for env_id in (values.get("env"), *(envs if isinstance(envs, list) else ())):

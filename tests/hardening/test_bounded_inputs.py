@@ -29,6 +29,7 @@ from ncs_gym.reading import (
     read_text,
 )
 from shields import Certificate, CertificateError
+from shields.json_documents import document_of
 from shields.verification.between_samples import between_conditions
 from tests.certificates import certificate_of
 
@@ -439,6 +440,78 @@ def test_pickles_of_many_objects_are_refused_before_they_are_made(operation, wri
         read_model(path)
     with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
         read_statistics(write("v.pkl", pickled))
+
+
+def places(value, path=()):
+    """The paths to all values in a JSON document, of a list to the first one alone."""
+    yield path
+    for key in value if isinstance(value, dict) else range(min(len(value), 1)) if isinstance(value, list) else ():
+        yield from places(value[key], (*path, key))
+
+
+def with_long(document, path, change):
+    """A document with a long text in the place of a value, or as the name of one more beside those in it."""
+    document = at = json.loads(json.dumps(document))
+    for key in path[:-1]:
+        at = at[key]
+    if change == "value" and path:
+        at[path[-1]] = 10_000 * "x"
+    elif change == "name":
+        at = at[path[-1]] if path else at
+        if isinstance(at, dict):
+            at[10_000 * "x"] = 1
+    return document
+
+
+def documents(folder):
+    """The content of each kind of document, and what loads such a content, whose checksum is right."""
+    from agents import Agent, agent_file
+    from agents.agent_file import pretrained_folder
+    from agents.hyperparams import complete_hyperparams, read_hyperparams, tuned_hyperparams
+    from experiments.settings import CompareSettings, config_defaults, settings_json
+
+    plant = truck_trailer(mass=4000.0)
+    certificate = json.loads(json.dumps(certificate_of(plant).document))
+    agent, path = pretrained_folder("ncs_gym/CSTR-v0"), folder / "agent.json"
+    (folder / "model.zip").write_bytes((agent / "model.zip").read_bytes())
+
+    def as_file(load):
+        return lambda document: (path.write_text(json.dumps(document)), load(path))
+
+    return {
+        "plant": (json.loads(json.dumps(plant.document)), as_file(LinearPlant.load)),
+        "certificate": (
+            certificate["certificate"],
+            lambda content: Certificate.read(document_of("certificate", certificate["format"], content)),
+        ),
+        "agent": (
+            json.loads((agent / "agent.json").read_text())["agent"],
+            lambda content: (path.write_bytes(agent_file.document_of(content)), Agent.load(folder)),
+        ),
+        "hyperparameters": (
+            {"default": tuned_hyperparams("ncs_gym/CSTR-v0")},
+            as_file(lambda path: complete_hyperparams("PPO", read_hyperparams(path, "default"))),
+        ),
+        "settings": (
+            settings_json("compare", CompareSettings()),
+            as_file(lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings)),
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "hyperparameters", "settings"])
+def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
+    pytest.importorskip("stable_baselines3")
+    document, load = documents(tmp_path)[name]
+    refused = 0
+    for path in places(document):
+        for change in ("value", "name"):
+            try:
+                load(with_long(document, path, change))
+            except (ValueError, OSError) as error:
+                refused += 1
+                assert len(str(error)) < 1000 + len(str(tmp_path)), (path, change, str(error)[:200])  # noqa: PT017
+    assert refused > 3
 
 
 def test_settings_name_no_more_runs_and_processes_than_there_may_be():
