@@ -632,7 +632,7 @@ def _require_order(sent: np.ndarray, arrived: np.ndarray, lines: Sequence[int]) 
 
 
 def _require_receiver(sent: np.ndarray, delays: np.ndarray, lines: np.ndarray) -> None:
-    """Raises ValueError if a packet overtakes another, and many before took longer than as many from it on.
+    """Raises ValueError if a packet overtakes another, and from it on packets take less by more than they differ.
 
     The clock of the receiver alone was set back there, or the network became faster at once by more than a period.
     """
@@ -641,8 +641,9 @@ def _require_receiver(sent: np.ndarray, delays: np.ndarray, lines: np.ndarray) -
     if len(known) < 2 * many:
         return
     stretches = np.lib.stride_tricks.sliding_window_view(taken, many)
-    faster = stretches[:-many].min(axis=1) - stretches[many:].max(axis=1)
-    back = (faster > 0.0) & (arrived[many : 1 - many] < arrived[many - 1 : -many])
+    least, most = stretches.min(axis=1), stretches.max(axis=1)
+    faster, spread = least[:-many] - most[many:], most - least
+    back = (faster > np.maximum(spread[:-many], spread[many:])) & (arrived[many : 1 - many] < arrived[many - 1 : -many])
     if back.any():
         at = int(np.argmax(back))
         raise ValueError(
