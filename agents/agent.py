@@ -16,7 +16,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from agents.agent_file import (
     AGENT_FILES,
@@ -32,9 +31,10 @@ from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.normalization import Normalization, read_statistics, statistics_beside
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
-from agents.sb3_zip import read_model, require_moderate_zip, require_same_spaces
+from agents.sb3_zip import parameters_of, read_model, require_same_spaces
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
+from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
 
 
@@ -177,8 +177,7 @@ class Agent:
         except (AgentError, ModuleNotFoundError):  # the second is nothing wrong with the files
             raise
         except Exception as error:  # a forged file may break any part of the libraries that read it
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise AgentError(f"the agent in {folder} is damaged: {reason}") from error
+            raise AgentError(f"the agent in {folder} is damaged: {reason_of(error)}") from error
 
 
 def pretrained(env_id: str) -> Agent:
@@ -210,19 +209,18 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     env_id, algorithm = content["env"], content["algorithm"]
     if env_id not in gym.registry:
         raise AgentError(
-            f"the agent was trained in {env_id}, which is not registered here: import the module that registers it, or "
-            f"on the command line give --env module:{env_id}, with the name of that module"
+            f"the agent was trained in {shown(str(env_id))[1:-1]}, which is not registered here: import the module "
+            "that registers it, or on the command line give --env module:id, with the name of that module"
         )
     if not _is_for_plant_of(env_id, content["plant"]):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
-        raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
+        raise AgentError(f"the agent is of an unknown algorithm, {shown(algorithm)}")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
-    require_moderate_zip(weights)
+    parameters = parameters_of(weights)
     model = build_model(algorithm, SB3VecEnv(loop.vector(2)), hyperparams, seed=0)  # as in `untrained`
-    _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
@@ -282,13 +280,10 @@ def load_sb3_zip(path: Path, env_id: str, vec_normalize: str | Path | None = Non
     try:
         env = SB3VecEnv(LoopConfig(env=env_id).vector(2))
         doubt = require_same_spaces(saved, env.observation_space, env.action_space)
-        _, parameters, _ = load_from_zip_file(io.BytesIO(saved.file), load_data=False, device="cpu")
         model = cls("MlpPolicy", env, policy_kwargs=policy_arguments(saved.policy_kwargs), device="cpu", **rest)
-        weights: Any = parameters["policy"]
-        model.policy.load_state_dict(weights)
+        model.policy.load_state_dict(parameters_of(saved.file)["policy"])
     except Exception as error:  # a forged file may break any part of the libraries that read it
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise AgentError(f"the agent in {path} does not fit {env_id}: {reason}") from error
+        raise AgentError(f"the agent in {path} does not fit {env_id}: {reason_of(error)}") from error
     if doubt:
         warnings.warn(f"the agent in {path} {doubt}", stacklevel=2)
     entries = int(np.prod(env.observation_space.shape or ()))

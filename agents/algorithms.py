@@ -11,17 +11,19 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import numpy as np
+import torch
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch import nn
 from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
 from ncs_gym.installation import install_command
-from ncs_gym.validation import shown
+from ncs_gym.validation import reason_of, shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
 _NO_HYPERPARAMS = ("env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
@@ -76,9 +78,8 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
         known = [*_not_the_librarys(name), *(each for each in _parameters(cls) if each not in _NO_HYPERPARAMS)]
-        raise ValueError(f"{name}: {reason}; its hyperparameters are {', '.join(known)}") from error
+        raise ValueError(f"{name}: {reason_of(error)}; its hyperparameters are {', '.join(known)}") from error
 
 
 def _not_the_librarys(name: str) -> tuple[str, ...]:
@@ -107,8 +108,6 @@ def _arguments(
         raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
     if stored == "applied":
         own["replay_buffer_class"] = AppliedActionBuffer
-    if (noise_type := hyperparams.get("noise_type")) not in (None, "normal"):
-        raise ValueError(f"noise_type cannot be {shown(noise_type)}")
     if (deviation := hyperparams.get("noise_std")) is not None:
         if not _fits(deviation, float) or not 0.0 <= deviation < float("inf"):
             raise ValueError(f"noise_std must be >= 0, got {shown(deviation)}")
@@ -121,15 +120,22 @@ def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the hyperparameter `policy_kwargs` as policies take it: with the class of its activation function.
 
     Raises:
-        ValueError: If torch has no activation function of that name.
+        ValueError: If torch has no activation function of that name, or one that changes the number of entries.
     """
     found, name = dict(given), given.get("activation_fn")
-    if isinstance(name, str):
-        name = name.removeprefix("nn.")
-        if name not in activation.__all__:
-            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)}")
-        found["activation_fn"] = getattr(activation, name)
+    if name is not None:
+        own = str(name).removeprefix("nn.")
+        if own not in activation.__all__ or not _keeps_entries(getattr(activation, own)):
+            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)} of single numbers")
+        found["activation_fn"] = getattr(activation, own)
     return found
+
+
+def _keeps_entries(function: type[nn.Module]) -> bool:
+    try:
+        return function()(torch.zeros(3, 4)).shape == (3, 4)
+    except (RuntimeError, TypeError, ValueError):  # of images, or of what is more than a function
+        return False
 
 
 def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from ncs_gym.reading import LARGEST_HYPERPARAMS, MOST_HYPERPARAMS, json_values, read_text, require_moderate
-from ncs_gym.validation import shown
+from ncs_gym.validation import reason_of, shown
 
 # The package of each algorithm, which has a class of the same name.
 ALGORITHMS = {
@@ -46,10 +46,15 @@ ALGORITHMS = {
 RL_ZOO_KEYS = ("env_wrapper", "vec_env_wrapper", "frame_stack", "env_kwargs", "monitor_kwargs", "callback")
 # Names of torch.nn as rl-zoo3's files write them, and what is no part of a literal.
 _OF_TORCH = re.compile(r"(?:(?:torch|th)\.)?nn\.([A-Za-z]\w*)")
-_NO_LITERALS = (ast.Call, ast.Name, ast.Attribute, ast.Lambda, ast.comprehension, ast.Starred)
+_NO_LITERALS = (ast.Call, ast.Name, ast.Attribute, ast.Lambda, ast.comprehension, ast.Starred, ast.BinOp)
+# Longest number in YAML, which multiplies those with colons in them (1:30 is 90) [letters].
+_LONGEST_NUMBER = 1000
 # The largest: of ten million transitions a buffer takes gigabytes.
 MOST_TRANSITIONS = 10_000_000
 _COUNTS = {"n_envs": 100_000, "n_steps": MOST_TRANSITIONS, "n_epochs": 100_000, "buffer_size": MOST_TRANSITIONS}
+_COUNTS |= {"batch_size": MOST_TRANSITIONS}
+# What is had here of that which stable-baselines3 and rl-zoo3 have more of.
+_HAD = {"policy": ("MlpPolicy",), "noise_type": ("normal", None)}
 # Most weights of the networks of an agent together, and most outputs of each.
 MOST_WEIGHTS, MOST_OUTPUTS = 20_000_000, 1000
 # Algorithms that learn from whole rollouts of `n_steps` steps in every environment.
@@ -106,7 +111,8 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
 
     Raises:
         ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, `gamma` or a count
-            (`n_envs`, `n_steps`, `n_epochs`, `buffer_size`) is out of range, or networks are larger than
+            (`n_envs`, `n_steps`, `n_epochs`, `batch_size`, `buffer_size`) is out of range, `policy` or `noise_type` is
+            one that is not had here, or networks are larger than
             `MOST_WEIGHTS`.
     """
     if not (isinstance(algorithm, str) and algorithm in ALGORITHMS):
@@ -120,6 +126,11 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
         if name in hyperparams and (type(value := hyperparams[name]) is not int or not 1 <= value <= most):
             at_most = f" and at most {most:,}" if type(value) is int and value > most else ""
             raise ValueError(f"{name} must be a whole number >= 1{at_most}, got {shown(value)}")
+    for name, had in _HAD.items():
+        if hyperparams.get(name, had[0]) not in had:
+            raise ValueError(f"{algorithm}: {name} must be {had[0]!r} here, got {shown(hyperparams[name])}")
+    if hyperparams.get("noise_type") is not None and hyperparams.get("noise_std") is None:
+        raise ValueError(f"{algorithm}: noise_type needs noise_std, without which there is no noise")
     if hyperparams["n_envs"] * hyperparams.get("n_steps", 1) > MOST_TRANSITIONS:
         raise ValueError(f"n_envs times n_steps must be at most {MOST_TRANSITIONS:,}")
     require_moderate_networks(hyperparams.get("policy_kwargs") or {})
@@ -213,7 +224,7 @@ def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
     try:
         document = json_values(text) if path.suffix == ".json" else _yaml(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"hyperparameters {path} are damaged: {' '.join(str(error).split())}") from error
+        raise ValueError(f"hyperparameters {path} are damaged: {reason_of(error)}") from error
     entries = document if isinstance(document, dict) else {}
     entry = entries.get(env_id, entries.get("default"))
     if not isinstance(entry, dict):
@@ -240,7 +251,13 @@ def _yaml(text: str) -> Any:
 
 
 def _parts_of_node(node: Any) -> list[Any]:
-    """Returns the nodes in a node of YAML: of a list its entries, of a dictionary keys and values."""
+    """Returns the nodes in a node of YAML: of a list its entries, of a dictionary keys and values.
+
+    Raises:
+        ValueError: If it is a number of too many digits or parts.
+    """
+    if node is not None and node.tag.endswith((":int", ":float")) and len(node.value) > _LONGEST_NUMBER:
+        raise ValueError(f"it has a number of more than {_LONGEST_NUMBER:,} letters, {shown(node.value)}")
     parts = node.value if node is not None and isinstance(node.value, list) else []
     return [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
 
@@ -253,7 +270,7 @@ def _as_json(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
             copied |= json.loads(json.dumps({name: value}, allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             given = f"{shown(name)}: {shown(value)}"
-            raise ValueError(f"hyperparameters must be JSON values, got {given} ({error})") from error
+            raise ValueError(f"hyperparameters must be JSON values, got {given} ({reason_of(error)})") from error
     return copied
 
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.agent_file import AgentError
 from agents.pickled_data import Made, array_of, pickled_data
 from ncs_gym.reading import read_file
+from ncs_gym.validation import reason_of
 
 _STATISTICS = re.compile(r"vec_?normalize", re.IGNORECASE)
 _VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
@@ -82,7 +83,7 @@ def read_statistics(path: Path) -> Normalization | None:
     except OSError as error:
         raise AgentError(f"cannot read {path}: {error.strerror}") from error
     except (KeyError, TypeError, ValueError) as error:
-        raise AgentError(f"{path} has no statistics that VecNormalize.save wrote: {error}") from error
+        raise AgentError(f"{path} has no statistics that VecNormalize.save wrote: {reason_of(error)}") from error
 
 
 def _statistics(saved: dict[str, Any]) -> Normalization | None:

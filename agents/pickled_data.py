@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.reading import require_moderate
+from ncs_gym.validation import reason_of
 
 # How numpy's arrays and numbers are pickled, by numpy 1 and 2, and the types of those that are read.
 _ARRAYS = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
@@ -27,10 +28,20 @@ _VALUES |= {"SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "SHORT_BINBYTES", "
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "EMPTY_SET": set}
 # Most values in a key of a dictionary, shared ones counted wherever they stand: hashes take as long.
-_MOST_IN_KEYS = 1000
+_MOST_IN_KEYS = 20
+# A dictionary that is called for instead.
+_ORDERED = "collections.OrderedDict"
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+# Longest name of a class with its module [letters], and largest number [bits].
+_LONGEST_NAME, _LARGEST_NUMBER = 200, 4096
+# Most dimensions of an array, and most entries along each.
+_MOST_DIMENSIONS, _LONGEST_AXIS = 32, 1 << 32
 # Most operations of a pickle, each of which may make an object from one byte: statistics and spaces take hundreds.
 _MOST_OPERATIONS = 100_000
+
+
+# Name of what is kept outside of a pickle, as torch keeps numbers.
+STORED = "stored elsewhere"
 
 
 @dataclass(frozen=True)
@@ -65,13 +76,14 @@ class Made:
 
 
 def pickled_data(data: bytes) -> Any:
-    """Returns what a pickle holds, of protocol 3 or later, as Python 3 writes them.
+    """Returns what a pickle holds, of protocol 2 or later, as Python 3 and torch write them.
 
     Returns:
-        Numbers, texts, bytes, lists, tuples, dictionaries and sets; `Named` and `Made` for everything else.
+        Numbers, texts, bytes, lists, tuples, dictionaries and sets; `Named` and `Made` for everything else; what is
+        kept outside of the pickle is `Made` with the name `STORED`, and what says where.
 
     Raises:
-        ValueError: If it is no such pickle, or has more than 100,000 operations.
+        ValueError: If it is no such pickle, has more than 100,000 operations, or a name or number of it is too long.
     """
     try:
         machine = _Machine()
@@ -82,7 +94,7 @@ def pickled_data(data: bytes) -> Any:
                 return machine.pop()
             machine.do(opcode.name, argument)
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"it is no pickle that is read here: {error}") from error
+        raise ValueError(f"it is no pickle that is read here: {reason_of(error)}") from error
     raise ValueError("it is no pickle: it does not end")
 
 
@@ -95,7 +107,7 @@ def array_of(value: Any) -> np.ndarray:
     try:
         return _array_of(value)
     except (ArithmeticError, LookupError) as error:  # a number that is too large, an entry that is missing
-        raise ValueError(f"it has no array that is read here: {error}") from error
+        raise ValueError(f"it has no array that is read here: {reason_of(error)}") from error
 
 
 def _array_of(value: Any) -> np.ndarray:
@@ -117,12 +129,17 @@ def _array(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
     """Returns an array of bytes whose number is right; raises ValueError for anything else."""
     code = dtype.arguments[0] if isinstance(dtype, Made) and dtype.name == "numpy.dtype" and dtype.arguments else None
     byte_order = dtype.state[1] if isinstance(dtype, Made) and isinstance(dtype.state, tuple) else "<"
-    sizes_fit = isinstance(shape, tuple) and all(type(size) is int and size >= 0 for size in shape)
-    if code not in _DTYPES or byte_order not in ("<", ">", "=", "|") or not sizes_fit or order not in ("C", "F"):
+    if code not in _DTYPES or byte_order not in ("<", ">", "=", "|") or not is_shape(shape) or order not in ("C", "F"):
         raise ValueError("it has an array of another kind")
     if not isinstance(raw, bytes | bytearray) or len(raw) != prod(shape) * int(code[1:]):
         raise ValueError("it has an array of another size than it says")
     return np.frombuffer(raw, dtype=byte_order.replace("|", "=") + code).reshape(shape, order=order).astype(np.float64)
+
+
+def is_shape(shape: Any) -> bool:
+    """Returns whether these are the sizes of an array, of which the product can be taken."""
+    fits = isinstance(shape, tuple) and len(shape) <= _MOST_DIMENSIONS
+    return fits and all(type(size) is int and 0 <= size <= _LONGEST_AXIS for size in shape)
 
 
 class _Machine:
@@ -148,6 +165,8 @@ class _Machine:
         """Executes one operation; any that is not listed is refused."""
         push = self.stack.append
         if name in _VALUES:
+            if isinstance(argument, int) and argument.bit_length() > _LARGEST_NUMBER:
+                raise ValueError(f"it has a number of more than {_LARGEST_NUMBER:,} bits")
             push(argument)
         elif name in _CONSTANTS:
             push(_CONSTANTS[name])
@@ -174,15 +193,19 @@ class _Machine:
         elif name in ("BINGET", "LONG_BINGET"):
             push(self.memo[argument])
         elif name == "GLOBAL":
-            push(Named(argument.replace(" ", ".", 1)))
+            push(_named(*argument.split(" ", 1)))
         elif name == "STACK_GLOBAL":
             own, module = self.pop(), self.pop()
-            push(Named(f"{module}.{own}"))
+            push(_named(module, own))
+        elif name == "BINPERSID":
+            push(Made(STORED, (self.pop(),)))
         elif name in ("REDUCE", "NEWOBJ", "NEWOBJ_EX"):
             named = self.pop() if name == "NEWOBJ_EX" else None
             arguments, by = self.pop(), self.pop()
-            more = () if not named else (named,)
-            push(Made(by.name if isinstance(by, Named) else "", (*arguments, *more)))
+            if not isinstance(arguments, tuple):
+                raise ValueError("it calls something with what are no arguments")
+            made = Made(by.name if isinstance(by, Named) else "", (arguments, named) if named else arguments)
+            push({} if made.name == _ORDERED and not arguments else made)
         else:
             self.fill(name)
 
@@ -206,6 +229,13 @@ class _Machine:
             target.extend(entries)
         elif isinstance(target, set):
             target.update(_hashable(entries))
+
+
+def _named(module: Any, own: Any) -> Named:
+    """Returns a name; raises ValueError for one that no class has, before two long ones are put together."""
+    if not all(isinstance(each, str) and len(each) <= _LONGEST_NAME and each.isprintable() for each in (module, own)):
+        raise ValueError("it names a class by what is no name")
+    return Named(f"{module}.{own}")
 
 
 def parts_of(value: Any) -> Iterable[Any]:

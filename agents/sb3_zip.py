@@ -6,17 +6,21 @@ import base64
 import io
 import json
 import zipfile
+from collections.abc import Collection
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.spaces import Box
 
 from agents.agent_file import AgentError
-from agents.pickled_data import Made, Named, array_of, parts_of, pickled_data
+from agents.pickled_data import Made, Named, array_of, is_shape, parts_of, pickled_data
 from ncs_gym.reading import LARGEST_MODEL, MOST_HYPERPARAMS, MOST_MEMBERS, json_values, read_file, require_moderate
+from ncs_gym.validation import reason_of
 
 # Classes of policies, and the algorithms of which each may be; those of a tuple are told apart by their settings.
 _POLICIES: dict[str, tuple[str, ...]] = {
@@ -35,6 +39,13 @@ _NEEDS = {
     "Cnn": "images",
 }
 _ACTIVATIONS = "torch.nn.modules.activation."
+# Ends of the names of files that `torch.save` wrote, and those that hold no weights, which are not read.
+_WEIGHTS, _VARIABLES = ".pth", ("pytorch_variables.pth", "tensors.pth")
+# What torch writes into such a file: a pickle, in which tensors are made from numbers in files of their own.
+_PICKLE, _TENSOR = "data.pkl", "torch._utils._rebuild_tensor_v2"
+_NUMBERS = {"torch.FloatStorage": "<f4", "torch.DoubleStorage": "<f8", "torch.LongStorage": "<i8"}
+# With what the entry of a file in a zip begins, of which each takes memory before it can be counted.
+_MEMBER = b"PK\1\2"
 # Of the arguments of a policy these say how it learns, not how it acts.
 _OF_LEARNING = ("optimizer_class", "optimizer_kwargs")
 
@@ -62,19 +73,67 @@ class SavedModel:
     file: bytes
 
 
-def require_moderate_zip(content: bytes) -> None:
-    """Raises unless a zip, and those that it holds, unpack to no more than files of agents may.
+def _members(archives: Collection[bytes]) -> list[dict[str, bytes]]:
+    """Returns the files in some zips by their names, once it is certain that all unpack to no more than they may.
 
     Raises:
         ValueError: If they would unpack to more.
+        zipfile.BadZipFile: If one is no zip.
+    """
+    too_much = ValueError(f"it unpacks to more than {MOST_MEMBERS} files or {LARGEST_MODEL:,} bytes")
+    if sum(each.count(_MEMBER) for each in archives) > 2 * MOST_MEMBERS:  # also of zips in it
+        raise too_much
+    opened = [zipfile.ZipFile(io.BytesIO(each)) for each in archives]
+    members = [member for archive in opened for member in archive.infolist()]
+    if len(members) > MOST_MEMBERS or sum(each.file_size for each in members) > LARGEST_MODEL:
+        raise too_much
+    return [{member.filename: archive.read(member) for member in archive.infolist()} for archive in opened]
+
+
+def parameters_of(content: bytes) -> dict[str, Any]:
+    """Returns the parameters in a zip that `model.save` wrote, as `set_parameters` takes them; torch reads none of it.
+
+    Raises:
+        ValueError: If they are none, or unpack to more than files of agents may.
         zipfile.BadZipFile: If it is no zip, or one that it holds is none.
     """
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = archive.infolist()
-        if len(members) > MOST_MEMBERS or sum(each.file_size for each in members) > LARGEST_MODEL:
-            raise ValueError(f"it unpacks to more than {MOST_MEMBERS} files or {LARGEST_MODEL:,} bytes")
-        for name in (each.filename for each in members if each.filename.endswith((".pth", ".pt"))):
-            require_moderate_zip(archive.read(name))
+    (files,) = _members([content])
+    named = {name: each for name, each in files.items() if name.endswith(_WEIGHTS) and name not in _VARIABLES}
+    inner = _members(named.values())
+    return {name.removesuffix(_WEIGHTS): _tensors(each) for name, each in zip(named, inner, strict=True)}
+
+
+def _tensors(files: dict[str, bytes]) -> Any:
+    """Returns what `torch.save` wrote into these files of a zip, with tensors whose numbers stand there.
+
+    Each file of numbers belongs to one tensor, so that together they take no more memory than the files.
+    """
+    (folder,) = (name.removesuffix(_PICKLE) for name in files if name.endswith(_PICKLE))
+    if files.get(f"{folder}byteorder", b"little") != b"little":
+        raise ValueError("its numbers were written by a machine with another order of bytes")
+
+    def built(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: built(each) for name, each in value.items()}
+        if isinstance(value, list):
+            return [built(each) for each in value]
+        if isinstance(value, tuple):
+            return tuple(map(built, value))
+        return tensor(*value.arguments) if isinstance(value, Made) and value.name == _TENSOR else value
+
+    def tensor(
+        stored: Made, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_rest: Any
+    ) -> torch.Tensor:
+        ((_, kind, key, *_),) = stored.arguments
+        whole = is_shape(shape) and strides == tuple(prod(shape[at + 1 :]) for at in range(len(shape)))
+        if not whole or offset != 0 or kind.name not in _NUMBERS or (name := f"{folder}data/{key}") not in files:
+            raise ValueError("it has a tensor that is no array of its own of float32, float64 or int64")
+        numbers = np.frombuffer(files.pop(name), dtype=_NUMBERS[kind.name])
+        return torch.from_numpy(numbers.reshape(shape).copy())
+
+    saved = pickled_data(files[f"{folder}{_PICKLE}"])
+    require_moderate(saved, parts_of, MOST_HYPERPARAMS)
+    return built(saved)
 
 
 def read_model(path: Path) -> SavedModel:
@@ -86,14 +145,11 @@ def read_model(path: Path) -> SavedModel:
     """
     try:
         weights = read_file(path, LARGEST_MODEL)
-        require_moderate_zip(weights)
-        with zipfile.ZipFile(io.BytesIO(weights)) as archive:
-            data = json_values(archive.read("data"))
+        (files,) = _members([weights])
+        data = json_values(files["data"])
         content = {name: _entry(data.get(name)) for name in _READ}
     except Exception as error:  # a forged file may break any part of the libraries that read it
-        raise AgentError(
-            f"{path} is no agent that stable-baselines3 saved: {str(error) or type(error).__name__}"
-        ) from error
+        raise AgentError(f"{path} is no agent that stable-baselines3 saved: {reason_of(error)}") from error
     algorithm = _algorithm(path, content["policy_class"], data)
     spaces = {}
     for name, what in (("observation_space", "observations"), ("action_space", "actions")):

@@ -21,6 +21,7 @@ from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
+from ncs_gym.validation import reason_of
 from shields.atomic_write import write_atomically
 
 # Observations that the normalization of an agent to go on from counts as.
@@ -166,7 +167,7 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
         parameters: Any = start.model.get_parameters()
         model.set_parameters(parameters, exact_match=True, device="cpu")
     except (ValueError, RuntimeError) as error:
-        raise ValueError(f"the agent to go on from has other networks: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"the agent to go on from has other networks: {reason_of(error)}") from error
     statistics = env.obs_rms
     if not isinstance(statistics, dict):
         statistics.mean, statistics.var = start.normalization.mean.copy(), start.normalization.variance.copy()

@@ -240,6 +240,12 @@ def _has_gradient(value: Any) -> bool:
         return False
 
 
+def reason_of(error: BaseException) -> str:
+    """Returns what an error says, as messages quote it: on one line, not without end; its type if it says nothing."""
+    text = " ".join(str(error)[: 2 * MAX_QUOTED_LENGTH].split()).rstrip(".") or type(error).__name__
+    return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+
+
 def as_setting(value: Any) -> np.ndarray | None:
     """Returns a new float64 array; None for what is not real numbers: text, truth values, complex or masked ones."""
     numbers = as_numbers(value)

@@ -14,6 +14,7 @@ from experiments.json_values import from_json
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import CHECKPOINT, Start, TrainingRun
 from ncs_gym.reading import LARGEST_MODEL, json_values, read_file
+from ncs_gym.validation import reason_of
 from shields.atomic_write import write_atomically
 
 # Folder of the agent that the training in an output folder went on from.
@@ -72,5 +73,6 @@ def _read(folder: Path) -> Start | None:
             raise ValueError("its steps do not grow")
         return Start({name: read_file(folder / name, LARGEST_MODEL) for name in AGENT_FILES}, history)
     except (OSError, TypeError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ResultsError(f"no training can go on from {folder} ({reason}): remove it, or give --force") from error
+        raise ResultsError(
+            f"no training can go on from {folder} ({reason_of(error)}): remove it, or give --force"
+        ) from error

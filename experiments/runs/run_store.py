@@ -16,7 +16,7 @@ from agents.agent_file import require_names, write_files
 from experiments.errors import ResultsError
 from experiments.json_values import from_json, to_json
 from ncs_gym.reading import LARGEST_MODEL, read_file
-from ncs_gym.validation import MAX_QUOTED_LENGTH
+from ncs_gym.validation import reason_of
 from shields.atomic_write import write_atomically
 from shields.json_documents import document_of, read_content
 
@@ -139,8 +139,9 @@ class RunStore:
             run.require(result)
             return replace(result, files=self._files(run, digests)) if digests else result
         except (KeyError, TypeError, ValueError, RecursionError) as error:
-            reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
-            raise ResultsError(f"{path} is no result of its run ({reason}): delete it to repeat the run") from error
+            raise ResultsError(
+                f"{path} is no result of its run ({reason_of(error)}): delete it to repeat the run"
+            ) from error
 
     def _files(self, run: Run, digests: dict[str, str]) -> dict[str, bytes]:
         files = {}

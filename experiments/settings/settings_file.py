@@ -12,7 +12,7 @@ from experiments.errors import SettingsError
 from experiments.json_values import from_json
 from experiments.settings.arguments import id_alone
 from ncs_gym.reading import json_values, read_file
-from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
+from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
@@ -72,7 +72,8 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise SettingsError(f"{path} is not of format {FORMAT!r}")
     if document.get("command") != command or not isinstance(document.get("settings"), dict):
-        raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
+        other = shown(str(document.get("command")))[1:-1]
+        raise SettingsError(f"{path} holds settings of ncs {other}, not of ncs {command}")
     values = {name: value for name, value in document["settings"].items() if name not in _OF_THE_MACHINE}
     envs = values.get("envs")
     for env_id in (values.get("env"), *(envs if isinstance(envs, list) else ())):
@@ -89,8 +90,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
-        raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason}") from error
+        raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason_of(error)}") from error
 
 
 def _is_near(folder: Path, path: Path) -> bool:

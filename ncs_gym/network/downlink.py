@@ -365,7 +365,7 @@ class AppliedInputs:
 
     def start(self) -> None:
         """Starts an episode."""
-        self.is_other, self._confirmed = False, 0
+        self.is_other, self._confirmed, self._strange = False, 0, -np.inf
         self._digests: tuple[bytes, ...] = (
             NO_INPUTS,
         )  # after the newest number of steps, then one step less, and so on
@@ -379,6 +379,8 @@ class AppliedInputs:
         """Takes in what arrived by a step; echoes from ahead of it, too old or of another episode say nothing."""
         for echo in echoes:
             age = step - echo.steps
+            if echo.episode != episode:
+                self._strange = step
             if echo.episode != episode or self._oldest is None or not 0 <= age < len(self._digests):
                 continue
             if echo.missing or echo.digest != self._digests[age]:
@@ -388,6 +390,10 @@ class AppliedInputs:
     def is_confirmed(self, step: int) -> bool:
         """Returns whether what was applied is known to be what was decided, up to the largest age of an echo."""
         return self._oldest is None or step - self._confirmed <= self._oldest
+
+    def hears_of_others(self, step: int) -> bool:
+        """Returns whether echoes of another episode arrived no longer ago than the largest age of an echo."""
+        return self._oldest is not None and step - self._strange <= self._oldest
 
 
 class Inputs(NamedTuple):

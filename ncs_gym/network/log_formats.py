@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from ncs_gym.reading import LARGEST_LOG, MOST_LINES, json_values, read_file, require_packets
-from ncs_gym.validation import shown
+from ncs_gym.validation import reason_of, shown
 
 
 class Record(NamedTuple):
@@ -68,7 +68,7 @@ def read_record(path: str | os.PathLike[str], period: float | None, step: float)
             raise ValueError(f"a row of a table has at most {_LONGEST_ROW:,} characters, a longer one is no record")
         return _of_table(rows, period, step)
     except csv.Error as error:
-        raise ValueError(f"{shown(path)} is no CSV file: {error}") from error
+        raise ValueError(f"{shown(path)} is no CSV file: {reason_of(error)}") from error
     except ValueError as error:
         raise ValueError(f"{shown(path)}: {error}") from None
 
@@ -93,7 +93,7 @@ def _decoded(content: bytes) -> str:
 _MILLISECONDS = r"(?P<time>\d+(?:[.,]\d+)?) ?ms"
 # A line of ping: the stamp that -D prints, the number of the packet, and the time until its answer.
 _PING = re.compile(
-    rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?.*?\b(?:icmp_)?seq[= ](?P<number>\d+)\b(?:.*?[^\W\d]+[=<]{_MILLISECONDS})?"
+    rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?.*?\b(?:icmp_)?seq[= ](?P<number>\d+)\b(?:.*?[^\W\d][=<]{_MILLISECONDS})?"
 )
 _FPING = re.compile(
     rf"(?:\[(?P<stamp>\d+\.\d+)\] ?)?(?P<host>\S+) +: \[(?P<number>\d+)\], (?:timed out|\d+ bytes, {_MILLISECONDS})"
@@ -107,6 +107,8 @@ _WINDOWS_FRAME = re.compile(r"Pinging |Ping statistics for |Packets: |Approximat
 _ANY_PING = re.compile(r"\bicmp_seq[= ]\d|\bseq=\d+ (?:ttl|hlim)=|^PING ", re.MULTILINE)
 _ANY_FPING = re.compile(r"^(?:\[\d+\.\d+\] ?)?\S+ +: \[\d+\], ", re.MULTILINE)
 _ANY_WINDOWS = re.compile(r"^(?:Pinging \S+ |Reply from \S+: |Request timed out)|\d ?ms TTL=\d", re.MULTILINE)
+# A number that nobody counts to, and no clock shows.
+_ENDLESS = re.compile(r"(?<![\w.])\d{19}")
 # How many packets were sent and answered, and how long ping ran; by Linux, BusyBox and macOS, Windows, and fping.
 _SUMMARIES = (
     re.compile(r"\s*(\d+) [^\d,]+, (\d+) [^\d,%]+,.*?%(?:.*, [^\d,]+ (\d+) ?ms)?"),
@@ -122,6 +124,7 @@ _NUMBERS, _LATEST, _MOST_LATE = 65536, 1024, 16
 _PRINTED = 1.0
 # Windows waits so long for an answer before it sends the next packet, unless told otherwise [s].
 _WINDOWS_TIMEOUT = 4.0
+_BEFORE = "the packet arrived before it was sent: the clocks of sender and receiver differ, set one by the other"
 _WAY_AND_BACK = "delays are those of the whole way and back"
 
 
@@ -137,6 +140,8 @@ def _of_ping(text: str, period: float | None) -> Record:
     for number, line in enumerate(lines, 1):
         if len(line) > _LONGEST_LINE:
             raise ValueError(f"line {number} is longer than any of ping")
+        if found := _ENDLESS.search(line):
+            raise ValueError(f"line {number} has a number that is too large, {shown(line[found.start() :])}")
     if "time of day goes back" in text:
         raise ValueError("ping warns that the clock was set back: record anew, or cut the record there")
     if sum(line.startswith(("PING", "Pinging ")) for line in lines) > 1:
@@ -259,21 +264,28 @@ def _between_stamps(numbers: np.ndarray, stamps: dict[int, float]) -> np.ndarray
     known = np.array(sorted(stamps))
     # None was sent after a later one: where stamps were printed late the earlier time is nearer.
     times = np.minimum.accumulate([stamps[each] for each in known[::-1].tolist()])[::-1]
+    _require_time(known, times)
     steps, gaps = np.diff(known), np.diff(times)
-    if (steps == 1).any():
-        expected = steps * np.quantile(gaps[steps == 1], 0.05)
-        hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
-        if len(hurried):
-            raise ValueError(
-                f"between the packets {known[hurried[0]]} and {known[hurried[0] + 1]} its stamps leave too little time "
-                "for the lost ones: the clock was set back there, cut the record"
-            )
     slope = float(np.median(gaps / steps))
     sent = np.interp(numbers, known, times)
     before, after = numbers < known[0], numbers > known[-1]
     sent[before] = times[0] - slope * (known[0] - numbers[before])
     sent[after] = times[-1] + slope * (numbers[after] - known[-1])
     return sent
+
+
+def _require_time(numbers: np.ndarray, sent: np.ndarray) -> None:
+    """Raises ValueError if there is too little time between two packets for those that are missing between them."""
+    steps, gaps = np.diff(numbers), np.diff(sent)
+    if not (steps == 1).any():
+        return
+    expected = steps * np.quantile(gaps[steps == 1], 0.05)
+    hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
+    if len(hurried):
+        raise ValueError(
+            f"between the packets {numbers[hurried[0]]} and {numbers[hurried[0] + 1]} its stamps leave too little time "
+            "for the lost ones: the clock was set back there, cut the record"
+        )
 
 
 def _period_of(summary: _Summary | None, period: float | None) -> tuple[float, str]:
@@ -363,10 +375,10 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     separator = next((each for each in ",;\t|" if each in line), " ")
     if separator == " ":
         line = re.sub(r"\s+(?=[(\[])", "", line)  # a unit in brackets belongs to the name before it
-    names = next(iter(_rows([line], separator, 1)))[1]
+    names = next(_rows([line], separator, 1, with_empty=True))[1]
     if all(_is_number(name) for name in names):
         if len(names) == 1:
-            return _of_list(_rows(lines, separator, 1, with_empty=True), period)
+            return _of_list(_with_decimals(_rows(lines, separator, 1, with_empty=True), [0]), period)
         raise ValueError(
             "its columns have no names, and neither their order nor their unit can be guessed safely: write them into "
             "the first line, as in sent_ms,received_ms"
@@ -385,7 +397,7 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
             raise ValueError(f"the column {shown(names[columns['delay'].index])} has no unit: name it rtt_ms or rtt_s")
         return _of_list(rows, period, columns)
     raise ValueError(
-        f"it has the columns {', '.join(map(shown, names))}; a log needs sent and received, or sent and delay, or one "
+        f"it has the columns {shown(names)[1:-1]}; a log needs sent and received, or sent and delay, or one "
         "column of round trips, rtt_ms, with the units in their names (_s, _ms, _us, _ns)"
     )
 
@@ -417,23 +429,36 @@ def _rows(
         yield number, cells
 
 
+# A number that may have groups of three digits, and one that has none.
+_GROUPS = re.compile(r"[+-]?[1-9]\d{0,2}(?:([.,])\d{3})?")
+_NO_GROUPS = re.compile(r"[+-]?(?:\d+([.,])\d+|\d{4,})")
+
+
 def _with_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]) -> Iterator[tuple[int, list[str]]]:
-    """Yields the rows, and raises ValueError after the last one if all commas may separate thousands."""
-    doubtful, is_decimal = None, False
+    """Yields the rows, and raises ValueError after the last one if commas or points may separate thousands.
+
+    All commas may, and points in a column whose numbers below 1000 have none, unless larger ones have none, either.
+    """
+    doubtful: dict[tuple[int, str], tuple[int, str]] = {}
+    decimal, small, large = set[str](), set[int](), set[int]()
     for line, cells in rows:
-        for cell in [] if is_decimal else [cells[index] for index in indices if index < len(cells)]:
-            if "," not in cell or not re.fullmatch(r"[+-]?\d+,\d+", cell):
+        for index in indices:
+            if index >= len(cells) or ("." in decimal and "," not in cells[index]):
                 continue
-            if re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell):
-                doubtful = doubtful or (line, cell)
-            else:
-                is_decimal = True
+            if found := _GROUPS.fullmatch(cells[index]):
+                if found[1]:
+                    doubtful.setdefault((index, found[1]), (line, cells[index]))
+                else:
+                    small.add(index)
+            elif found := _NO_GROUPS.fullmatch(cells[index]):
+                decimal.add(found[1]) if found[1] else large.add(index)
         yield line, cells
-    if doubtful is not None and not is_decimal:
-        line, cell = doubtful
-        raise ValueError(
-            f"line {line}: the comma in {shown(cell)} may be that of decimals or of thousands: write decimal points"
-        )
+    for (index, separator), (line, cell) in doubtful.items():
+        if separator not in decimal and (separator == "," or index in small - large):
+            name, way = ("comma", "decimal points") if separator == "," else ("point", "numbers without those")
+            raise ValueError(
+                f"line {line}: the {name} in {shown(cell)} may be that of decimals or of thousands: write {way}"
+            )
 
 
 def _columns(names: Sequence[str]) -> dict[str, _Column]:
@@ -531,8 +556,11 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
     _require_order(moments, np.where(np.isnan(delays), np.nan, arrived), places)
     if flagged:
         delays[flagged] = np.nan
+    if (delays < 0.0).any():
+        raise ValueError(f"line {places[int(np.argmax(delays < 0.0))]}: {_BEFORE}")
     order = np.argsort(moments, kind="stable")
     moments, delays = moments[order], delays[order]
+    _require_receiver(moments, delays, np.array(places)[order])
     guessed = not sent_at.unit and unit == "s" and not until.unit
     missing = 0
     if "number" in columns:
@@ -603,6 +631,28 @@ def _require_order(sent: np.ndarray, arrived: np.ndarray, lines: Sequence[int]) 
     )
 
 
+def _require_receiver(sent: np.ndarray, delays: np.ndarray, lines: np.ndarray) -> None:
+    """Raises ValueError if a packet overtakes another, and from it on packets take less by more than they differ.
+
+    The clock of the receiver alone was set back there, or the network became faster at once by more than a period.
+    """
+    known = np.flatnonzero(~np.isnan(delays))
+    taken, arrived, many = delays[known], (sent + delays)[known], _MOST_LATE + 1
+    if len(known) < 2 * many:
+        return
+    stretches = np.lib.stride_tricks.sliding_window_view(taken, many)
+    least, most = stretches.min(axis=1), stretches.max(axis=1)
+    faster, spread = least[:-many] - most[many:], most - least
+    back = (faster > np.maximum(spread[:-many], spread[many:])) & (arrived[many : 1 - many] < arrived[many - 1 : -many])
+    if back.any():
+        at = int(np.argmax(back))
+        raise ValueError(
+            f"line {lines[known[at + many]]}: from here on packets take {faster[at]:.3g} s less or more, and this one "
+            "overtakes the one before: if the clock of the receiver was set back, or the network changed, cut the "
+            "record there"
+        )
+
+
 def _count(cell: str) -> int:
     value = int(cell)
     if abs(value) > _LARGEST_COUNT:
@@ -638,6 +688,7 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
             f"by its time packet {numbers[back[0] + 1]} was sent after packet {numbers[back[0]]}: a clock was set "
             "back, or numbers come twice"
         )
+    _require_time(numbers, sent)
     steps = np.diff(numbers)
     gaps = np.where(steps > 1, steps - 1, 0)
     require_packets(len(sent) + int(np.minimum(gaps, 10**9).sum()))
@@ -652,12 +703,20 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
 def _of_steps(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column], dt: float) -> Record:
     """Returns the packets of a log of `ncs loop`: the steps at which those that arrived were sent and received."""
     arrivals: dict[str, dict[int, int]] = {}
+    last, newest = None, 0
     for number, row in rows:
         try:
             sent, received = (_count(row[columns[role].index]) for role in ("sent", "received"))
-            arrived = arrivals.setdefault(row[columns["episode"].index], {})
+            episode = row[columns["episode"].index]
         except (ValueError, IndexError):
             raise ValueError(f"line {number} is not an episode, a step sent and one received") from None
+        if not 0 <= sent <= received:
+            raise ValueError(f"line {number}: {_BEFORE}")
+        if episode in arrivals and (episode != last or received < newest):
+            raise ValueError(
+                f"line {number}: episode {shown(episode)} begins twice: put each log into a file of its own"
+            )
+        last, newest, arrived = episode, received, arrivals.setdefault(episode, {})
         arrived[sent] = min(received, arrived.get(sent, received))  # a second one is a duplicate
     require_packets(sum(max(*arrived, 0) for arrived in arrivals.values()))
     delays = [arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)]
@@ -711,7 +770,7 @@ def _of_json(text: str) -> Record:
     try:
         document = json_values(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"it is no JSON document that can be read: {error}") from None
+        raise ValueError(f"it is no JSON document that can be read: {reason_of(error)}") from None
     trips = document.get("round_trips") if isinstance(document, dict) else None
     if isinstance(trips, list):
         return _of_irtt(trips)
@@ -720,7 +779,7 @@ def _of_json(text: str) -> Record:
             "iperf3 counts packets per interval and records no times, from which no age follows: record with irtt, or "
             "with ping -D"
         )
-    keys = ", ".join(map(shown, document)) if isinstance(document, dict) else "no names"
+    keys = shown([*document])[1:-1] if isinstance(document, dict) else "no names"
     raise ValueError(f"it is JSON with {keys}; of JSON documents only those of irtt are read (round_trips)")
 
 
@@ -733,8 +792,8 @@ def _of_irtt(trips: list[Any]) -> Record:
             moment = moments.get("monotonic", moments.get("wall"))
             lost = trip["lost"] not in ("false", False)
             delay = np.nan if lost else trip["delay"]["rtt"] / 1e9
-            if not abs(int(moment)) < 2**63:
-                raise ValueError("too large")
+            if not (abs(int(moment)) < 2**63 and (lost or 0.0 <= delay < np.inf)):
+                raise ValueError("out of range")
             sent.append(int(moment))
             delays.append(float(delay))
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError):

@@ -77,7 +77,19 @@ def grid_rows(
 
     Raises:
         ZeroDivisionError: If the box does not bound every state.
+        OverflowError: If a number of them is out of reach of float64.
     """
+    try:
+        return _grid_rows(model, box, largest_input, dt, points)
+    except OverflowError as error:
+        raise OverflowError(
+            "the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
+        ) from error
+
+
+def _grid_rows(
+    model: np.ndarray, box: tuple[np.ndarray, np.ndarray], largest_input: np.ndarray, dt: float, points: int
+) -> GridRows:
     G, (k, n), h = generator(model), box[0].shape, dt / points
     W = np.concatenate([widest(*box), largest_input])
     rows = np.concatenate([box[0], np.zeros((k, len(largest_input)))], axis=1)

@@ -45,6 +45,7 @@ from ncs_gym.validation import (
     as_setting,
     own_error_state,
     read_only,
+    reason_of,
     shown,
     warn_caller,
 )
@@ -543,7 +544,7 @@ class LinearPlant(ReadOnlyArrays):
         try:
             return cls(**arguments)
         except TypeError as error:  # an argument is missing or unknown
-            raise ValueError(f"{name} is not that of a plant: {error}") from error
+            raise ValueError(f"{name} is not that of a plant: {reason_of(error)}") from error
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -709,7 +710,11 @@ class LinearPlant(ReadOnlyArrays):
 
     @cached_property
     def grid_rows(self) -> between_samples.GridRows | None:
-        """What the box says of states and inputs between samples; None if only the sampling instants count."""
+        """What the box says of states and inputs between samples; None if only the sampling instants count.
+
+        Raises:
+            OverflowError: If it is out of reach of float64, which the message says.
+        """
         if self.between_samples is None or self.continuous_model is None:
             return None
         return between_samples.grid_rows(

@@ -30,10 +30,12 @@ NO_DOWNLINK_CONTRACT = "the downlink has no contract: nothing says that inputs a
 # Of loops that learn from samples where they are, and from echoes what was applied; no monitor says so.
 UNKNOWN_START = "the samples do not yet tell where the state is"
 NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies what is decided"
+OTHER_EPISODE = "the actuator echoes inputs of another episode: tell it the episode of the loop"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NOT_KNOWN_INSIDE,
     LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED, NOT_FINITE,
+    OTHER_EPISODE,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 ON_UNPROVED = ("ignore", "warn", "raise")

@@ -35,6 +35,7 @@ from shields.runtime.guarantee import (
     LATE_INPUT,
     NOT_CONFIRMED,
     NOT_FINITE,
+    OTHER_EPISODE,
     OTHER_INPUT,
     UNKNOWN_START,
     LoopObservation,
@@ -378,8 +379,9 @@ class SafeLoop(CopiedWhole):
         if self._unknown is not None:
             is_finite = all(np.isfinite(y).all() for y in self._unknown[0].values())
             return UNKNOWN_START if is_finite else NOT_FINITE
-        unconfirmed = "" if self._applied.is_confirmed(self.steps) else NOT_CONFIRMED
-        return self._monitored.reason or unconfirmed
+        if self._monitored.reason or self._applied.is_confirmed(self.steps):
+            return self._monitored.reason
+        return OTHER_EPISODE if self._applied.hears_of_others(self.steps) else NOT_CONFIRMED
 
     @property
     def plan_length(self) -> int:

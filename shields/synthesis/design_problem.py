@@ -250,8 +250,7 @@ def _scaled_grid(plant: LinearPlant, transform: np.ndarray, u_max: np.ndarray) -
         if grid is None:
             return ScaledGrid(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0))
     except OverflowError as error:
-        too_long = "(B) the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
-        raise Infeasible(too_long, "B", 1.0) from error
+        raise Infeasible(f"(B) {error}", "B", 1.0) from error
     state, pushed, _ = grid
     taken, disturbed = taken_between_samples(plant, grid, plant.disturbance.shape_matrix)
     left = np.maximum(1.0 - taken, _NOTHING_LEFT)

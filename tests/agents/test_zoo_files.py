@@ -54,6 +54,7 @@ def test_values_of_the_zoo_are_read(text, value):
         ("dict(net_arch=[64], features_extractor_class=mine.Extractor)", "'mine.Extractor'"),
         ("dict(net_arch=[width, 64])", "'width'"),
         ("dict(a=__import__('os').system('true'))", r'"__import__\(.os.\)'),
+        ("dict(net_arch=[64] * 2)", r"'\[64\] \* 2'"),
         ("dict(a=[x for x in (1, 2)])", "'x'"),
         ("dict(a=lambda: 1)", "'lambda: 1'"),
         ("dict(**given)", r"'dict\(\*\*given\)'"),
@@ -120,7 +121,21 @@ def test_activation_function_is_that_of_torch_and_survives_the_files(name, kind,
     np.testing.assert_array_equal(again.act(observations), agent.act(observations))
 
 
-@pytest.mark.parametrize("name", ["nn.Linear", "nn.Module", "os.system", "nn.modules", "nn.__doc__", ""])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "nn.Linear",
+        "nn.Module",
+        "os.system",
+        "nn.modules",
+        "nn.__doc__",
+        "",
+        "GLU",
+        "nn.Softmax2d",
+        3,
+        "nn.MultiheadAttention",
+    ],
+)
 def test_what_is_no_activation_function_is_named(name):
     with pytest.raises(ValueError, match="no activation function") as caught:
         untrained(LoopConfig(env=CRUISE), seed=0, hyperparams={"policy_kwargs": {"activation_fn": name}})

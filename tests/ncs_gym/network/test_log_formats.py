@@ -8,6 +8,7 @@ import json
 import math
 import pickle
 import re
+import time
 from decimal import Decimal
 from fractions import Fraction
 from typing import NamedTuple
@@ -333,6 +334,7 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
     [
         ("0.0,0.1\n0.2,0.3\n", "no names"),
         ("1 2\n3 4\n", "no names"),
+        (",\n0,1\n1,2\n", "no names"),
         ("time,value\n0,1\n1,2\n", "columns 'time', 'value'; a log needs sent and received"),
         ("sent,arrives\n0,1\n1,2\n", "columns 'sent', 'arrives'"),
         ("sent,tx_time,received\n0,0,1\n", "both be what was sent"),
@@ -394,6 +396,17 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent,received\n261126100000,261126100000\n261126100001,\n", "no time since 1970"),
         ("sent_ms,received_ms\n20261126100000020,20261126100000025\n20261126100000040,\n", "no time since 1970"),
         ("sent_ms\treceived_ms\n980\t985\n1,000\t1,005\n1,020\t1,025\n", "line 3: the comma in '1,000' may be"),
+        ("rtt_ms\n980\n1.020\n1.040\n", "line 3: the point in '1.020' may be that of decimals or of thousands"),
+        ("980\n1.020\n1.040\n", "line 2: the point in '1.020' may be"),
+        ("sent_ms,rtt_ms\n1000,980\n2000,1.020\n3000,990\n", "line 3: the point in '1.020' may be"),
+        (
+            rows("seq,sent,received", [(n, n if n < 20 else n - 6) for n in range(60) if not 20 <= n < 30]),
+            "between the packets 19 and 30 its stamps leave too little time",
+        ),
+        (
+            "sent,received\n" + "".join(f"{0.1 * n:.2f},{0.1 * n + (0.5 if n < 40 else 0.2):.2f}\n" for n in range(80)),
+            "line 42: from here on packets take 0.3 s less or more, and this one overtakes the one before",
+        ),
         ("rtt_ms\n1,020\n1,040\n", "line 2: the comma in '1,020' may be"),
         (
             "sent,received\n46352.4000000000,46352.4000000579\n46352.4000002315,46352.4000002894\n",
@@ -401,12 +414,36 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ),
         (irtt_sent(0, 20, 10), "round trip 2 of irtt: the clock was set back by 0.01 s"),
         (irtt_sent(0, 10**400), "round trip 1 of irtt has no time sent"),
+        *(
+            (irtt_sent(0, 9).replace("1000000", delay, 1), "round trip 0 of irtt has no time sent")
+            for delay in ("NaN", "Infinity", "-Infinity", "-1")
+        ),
+        (ping([(1, 2), (2, 900 * "9")]), "line 2 has a number that is too large"),
+        (ping([(1, 2), (900 * "9", 2)]), "line 2 has a number that is too large"),
+        (f"[{900 * '1'}.0] {ping([(1, 2)])}[{900 * '9'}.5] {ping([(2, 2)])}", "line 1 has a number that is too large"),
+        (f"{ping([(1, 2)])}{900 * '9'} packets transmitted, 1 received, 0% packet loss", "line 2 has a number that"),
+        (f"Reply from 192.0.2.1: bytes=32 time={900 * '9'}ms TTL=1\n", "line 1 has a number that is too large"),
+        (f"h : [{900 * '9'}], 64 bytes, 1 ms (1 avg, 0% loss)\n", "line 1 has a number that is too large"),
+        ("sent,received\n0,0.1\n1,\n2,1.9\n", "line 4: the packet arrived before it was sent: the clocks of sender"),
+        ("sent,delay\n0,0.1\n1,-0.5\n", "line 3: the packet arrived before it was sent"),
+        ("episode,sent,received\n0,1,2\n0,4,3\n", "line 3: the packet arrived before it was sent"),
+        ("episode,sent,received\n0,-5,2\n0,4,4\n", "line 2: the packet arrived before it was sent"),
+        ("episode,sent,received\n7,1,2\n7,4,5\n7,1,2\n7,4,5\n", "line 4: episode '7' begins twice"),
+        ("episode,sent,received\n7,1,2\n8,1,2\n7,4,5\n", "line 4: episode '7' begins twice"),
     ],
 )
 def test_file_that_is_not_understood_is_refused_in_one_sentence(content, words, written):
     with pytest.raises(ValueError, match=re.escape(words)) as refusal:
         PacketLog.load(written(content))
     assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 500
+
+
+def test_long_lines_of_ping_take_no_longer_than_their_length(written):
+    lines = "".join(f"icmp_seq={n} {980 * 'a'}\n" for n in range(2, 300))
+    began = time.process_time()
+    PacketLog.load(written(f"icmp_seq=1 time=2 ms\n{lines}icmp_seq=300 time=1 ms"))
+    assert time.process_time() - began < 1.0  # of a quadratic search: 5 s
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -65,6 +65,22 @@ def test_nothing_between_grid_points_is_larger_than_at_them_by_more_than_the_bou
     assert (excess <= plant.grid_rows.remainder).all()
 
 
+def test_bound_that_is_out_of_reach_says_so():
+    angles = np.linspace(0.0, np.pi, 4, endpoint=False)
+    model = ([[0.0, 1.0], [-1e7, -2.0]], [[0.0], [2.0]], np.eye(2), np.zeros((2, 1)))
+    bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    box = np.c_[np.cos(angles), np.sin(angles) / 2]
+    plant = LinearPlant.from_statespace(model, 0.1, box=box, u_max=1.0, between_samples=64, **bounds)
+    for asked in (
+        lambda: plant.grid_rows,
+        lambda: plant.worst_constraint_values(np.zeros(2), np.zeros(1), np.zeros(2)),
+    ):
+        with pytest.raises(
+            OverflowError, match="the bound between samples is out of reach of float64: a shorter dt or"
+        ):
+            asked()
+
+
 def test_bound_is_no_larger_than_it_needs_to_be():
     plant = replace(truck_trailer(mass=4000.0), between_samples=8)
     # The worst second derivative at the beginning of a step, by hand: x2' of the first row, x2'' of the second.

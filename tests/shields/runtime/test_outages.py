@@ -19,7 +19,7 @@ from ncs_gym import (
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.processes import nonlinear_cart_pole
 from shields import SafeLoop
-from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_INPUT, UNKNOWN_START
+from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT, UNKNOWN_START
 from tests import arrays
 from tests.certificates import certificate_of
 
@@ -109,6 +109,20 @@ def test_silent_actuator_is_not_trusted_for_longer_than_asked_for():
             world.echoes = []
     assert {step for step, reason in enumerate(reasons) if reason} == set(range(15, 21))
     assert set(reasons) == {"", NOT_CONFIRMED}
+
+
+def test_echoes_of_another_episode_are_a_reason_of_their_own_while_they_come():
+    loop = loop_with(echo_age=4)
+    world = World(loop)
+    world.start()
+    reasons = []
+    for step in range(40):
+        world.move()
+        reasons.append(loop.reason)
+        if 10 <= step < 30:
+            strange = step < 20
+            world.echoes = [each._replace(episode=loop.episode + 1) for each in world.echoes] if strange else []
+    assert reasons == [""] * 15 + [OTHER_EPISODE] * 10 + [NOT_CONFIRMED] * 6 + [""] * 9
 
 
 def test_what_the_loop_says_is_conditional_where_nothing_is_echoed():
