@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.linalg import lu_solve
-from scipy.linalg.lapack import dgetrf
+from scipy.linalg import get_lapack_funcs, lu_solve
 from scipy.optimize import minimize
 
 from ncs_gym.plants.lqr import regulator_gain
@@ -22,6 +22,8 @@ _ITERATIONS = 300
 _UNSTABLE_USE = 50.0
 # Keeps logarithms and square roots away from 0.
 _TINY = 1e-16
+# LU factors without a warning for a singular matrix.
+_factorize: Any = get_lapack_funcs("getrf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,8 @@ class _GainSearch:
         source = BK @ self._Sigma @ BK.T / ((1.0 - lx) * fraction) + problem.D_u / ((1.0 - lx) * (1.0 - fraction))
         F = (problem.A + BK) / np.sqrt(lx)
         kronecker = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)
-        *factors, _ = dgetrf(np.eye(n * n) - kronecker)  # of a singular one L is not finite, and nothing is said
+        lu, pivots, _ = _factorize(np.eye(n * n) - kronecker)  # of a singular one L is not finite, and nothing is said
+        factors = lu, pivots
         L = lu_solve(factors, source.ravel(), check_finite=False).reshape(n, n)
         return 0.5 * (L + L.T), F, factors
 
