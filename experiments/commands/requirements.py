@@ -29,7 +29,7 @@ from ncs_gym.reading import json_values, read_file
 from shields import Certificate, Network, Requirement, Requirements
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
-from shields.synthesis.network_requirements import Answer, LargestAge, Search
+from shields.synthesis.network_requirements import Answer, LargestAge, Search, kind_of_share
 
 _DEFAULT_ENV = "ncs_gym/CartPole-v0"
 # Steps between samples, and losses in a row, that are asked about by default.
@@ -46,10 +46,11 @@ _AXES = {
     "disturbances": ("disturbance", "size of disturbances"),
     "noises": ("noise", "size of noise"),
 }
-# What the numbers of a table are.
-_QUANTITIES = {
-    "share": "ellipsoid's share of the box [%]",
-    "tolerance": "factor on all radii",
+# What the numbers of a table of shares are, by what has them.
+_SHARES = {
+    "ellipsoid": "ellipsoid's share of the box [%]",
+    "polytope": "polytope's share of the box [%]",
+    "certificate": "100: a certificate, whose share of an open box is not known",
 }
 # Progress is counted in these parts of an age that is searched: workers report a thousand at a time.
 _PARTS = 1000
@@ -247,7 +248,7 @@ class _Table:
     """A quantity of every network: a block per combination of what rows and columns do not show.
 
     Attributes:
-        quantity: What the numbers are, of `_QUANTITIES`.
+        quantity: What the numbers are.
         rows: Name and values of the rows.
         columns: Name and values of the columns.
         blocks: Numbers by title, shape (rows, columns); NaN where no certificate was found.
@@ -279,9 +280,8 @@ class _Table:
                     j = asked[shown[1]].index(getattr(point.network, across))
                     block[i, j] = _number(point, quantity)
             blocks[title], fixed[title] = block, common
-        return cls(
-            quantity, (down_name, asked[shown[0]]), (across_name, asked[shown[1]]), blocks, fixed, (down, across)
-        )
+        title, axes = _title(found, quantity), [(down_name, asked[shown[0]]), (across_name, asked[shown[1]])]
+        return cls(title, axes[0], axes[1], blocks, fixed, (down, across))
 
     @property
     def text(self) -> str:
@@ -293,7 +293,7 @@ class _Table:
                 [_shown(value), *("-" if np.isnan(number) else f"{number:.3g}" for number in line)]
                 for value, line in zip(self.rows[1], block, strict=True)
             ]
-            parts.append(f"{_QUANTITIES[self.quantity]}{', ' if title else ''}{title}\n{text_table([header, *cells])}")
+            parts.append(f"{self.quantity}{', ' if title else ''}{title}\n{text_table([header, *cells])}")
         return "\n\n".join(parts)
 
     def figure(self, today: Network | None) -> Any:
@@ -306,7 +306,15 @@ class _Table:
             if at[0] in self.rows[1] and at[1] in self.columns[1]:
                 marked = title, list(self.rows[1]).index(at[0]), list(self.columns[1]).index(at[1])
         panels = dict(list(self.blocks.items())[:_MOST_PANELS])
-        return requirements_map(panels, self.rows, self.columns, marked, _QUANTITIES[self.quantity])
+        return requirements_map(panels, self.rows, self.columns, marked, self.quantity)
+
+
+def _title(found: Requirements, quantity: str) -> str:
+    """Returns what the numbers of a table are."""
+    if quantity == "tolerance":
+        return "factor on all radii"
+    certificates = (point.certificate for point in found.points if point.certificate is not None)
+    return _SHARES[next(map(kind_of_share, certificates), "ellipsoid")]
 
 
 def _number(point: Requirement, quantity: str) -> float:
@@ -385,8 +393,12 @@ def _description(point: Requirement) -> str:
     if network.quantization_step:
         parts.append(f"rounded to {network.quantization_step:g}")
     parts.append(f"{_rate(network.packets_per_second)} packets/s and {_rate(point.bits_per_second)} bits/s")
-    share = f"an ellipsoid of {100.0 * point.share:.3g} % of the box"
-    return f"{', '.join(parts)}: {'no certificate was found' if point.certificate is None else share}"
+    kept = "no certificate was found"
+    if point.certificate is not None:
+        kind = kind_of_share(point.certificate)
+        kept = {"ellipsoid": "an ellipsoid", "polytope": "a polytope"}.get(kind, "a certificate")
+        kept += "" if kind == "certificate" else f" of {100.0 * point.share:.3g} % of the box"
+    return f"{', '.join(parts)}: {kept}"
 
 
 def _rate(number: float) -> str:

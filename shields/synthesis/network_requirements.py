@@ -143,17 +143,30 @@ class Requirement:
     def share(self) -> float:
         """Share of the safe box that the ellipsoid in the certified set fills, 0 without a certificate.
 
-        Where the box has too many corners to know its volume, the share of its largest ellipsoid.
+        Where limits have two ends, that of the polytope itself. Where the box has too many corners to know its volume,
+        the share of its largest ellipsoid; 1 where nothing is known, as of an open box.
         """
         return _share(self.certificate)
 
 
+def kind_of_share(certificate: Certificate) -> str:
+    """Returns what has the share of the safe box by which certificates of a plant are compared."""
+    return _kind_and_share(certificate)[0]
+
+
 def _share(certificate: Certificate | None) -> float:
-    if certificate is None:
-        return 0.0
-    known = certificate.provenance
-    names = ("share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid")
-    return float(next(known[name] for name in names if name in known))
+    return 0.0 if certificate is None else _kind_and_share(certificate)[1]
+
+
+def _kind_and_share(certificate: Certificate) -> tuple[str, float]:
+    known, polytope = certificate.provenance, certificate.polytope
+    names = ["share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid"]
+    if polytope is not None and not certificate.keeps_ellipsoid and not polytope.is_symmetric:
+        names = ["polytope_share_of_box"]
+    found = next((name for name in names if name in known), None)
+    if found is None:
+        return "certificate", 1.0
+    return "polytope" if found == "polytope_share_of_box" else "ellipsoid", float(known[found])
 
 
 class LargestAge(NamedTuple):

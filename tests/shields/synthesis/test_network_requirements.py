@@ -12,7 +12,7 @@ from ncs_gym import Channel, ChannelContract, LinearPlant, contract_of
 from ncs_gym.processes.gym_pendulum import pendulum
 from shields import Infeasible, Network, requirements, synthesize, verify
 from shields.synthesis.certification import carried_over, nearby_certificate
-from shields.synthesis.network_requirements import BoundarySearch, with_radii
+from shields.synthesis.network_requirements import BoundarySearch, kind_of_share, with_radii
 
 SERVO = (([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]), 0.01)
 BOUNDS = {
@@ -224,3 +224,19 @@ def test_search_for_the_largest_age_asks_before_every_age_whether_it_should_end(
     answers = search(reported.append)
     assert reported == [0] * len(answers) + [2]
     assert len(answers) >= 2
+
+
+def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
+    model = {"A": [[1.0, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 0.1, "input_limits": (-1.0, 2.0)}
+    model |= {"disturbance_bound": [0.02, 0.04], "sensor_bound": 0.01, "initial_bound": 0.01}
+    closed = LinearPlant(state_limits=([-1.0, -1.0], [2.0, 1.5]), **model)
+    free = LinearPlant(state_limits=([-1.0, -np.inf], [2.0, np.inf]), **model)
+    for plant, kind in ((closed, "polytope"), (free, "certificate")):
+        found = requirements(plant, send_periods=[1, 2], losses=[0], sampling_periods=[0.1])
+        certified = [point for point in found.points if point.certificate is not None]
+        assert certified
+        for point in certified:
+            assert kind_of_share(point.certificate) == kind
+            share = point.certificate.provenance.get("polytope_share_of_box", 1.0)
+            assert point.share == share
+            assert 0.5 < share <= 1.0
