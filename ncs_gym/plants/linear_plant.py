@@ -1155,6 +1155,12 @@ def row_limit(plant: LinearPlant, j: int) -> str:
     return _sum_between(row, low, high, plant.operating_state, plant.state_names)
 
 
+def input_limit(plant: LinearPlant, i: int) -> str:
+    """Returns between what input i is."""
+    low, high, center = float(plant.input_low[i]), float(plant.input_high[i]), float(plant.operating_input[i])
+    return _between(plant.input_names[i], low, high, center, plant.input_units[i])
+
+
 def mixed_limit(plant: LinearPlant, j: int) -> str:
     """Returns what row j of the limits of states and inputs together limits."""
     low, high = plant.mixed_ends[:, j].tolist()
