@@ -26,7 +26,7 @@ from ncs_gym.validation import (
 PUBLISHED = "state_limits", "input_limits", "output_limits", "mixed_limits", "u_max", "offset"
 # What to give where an operating point that was not given is outside absolute limits.
 _POINT_TO_GIVE = {
-    f"{name}_limits": f": limits are absolute, so give operating_{name}=, the {name} around which the model was linearized"
+    f"{name}_limits": f": limits are absolute, so give operating_{name}=, around which the model was linearized"
     for name in ("state", "input")
 }
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
