@@ -38,10 +38,6 @@ class ErrorSetError(ValueError):
     """No error set could be computed accurately enough."""
 
 
-class NoErrorSetAtAnyAgeError(ErrorSetError):
-    """No error set exists, or none is found, whatever age is promised."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ErrorSet(ReadOnlyArrays):
     """What the estimation error never leaves: one set for every age, or one per age under a contract.
@@ -100,13 +96,9 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     sets = error_sets_by_age(plant, contract)
     if sets is None:
         if (unseen := _unseen_state(plant)) is not None:
-            raise NoErrorSetAtAnyAgeError(
-                f"no error set exists: the outputs do not show {unseen}, whose errors never decay"
-            )
+            raise ErrorSetError(f"no error set exists: the outputs do not show {unseen}, whose errors never decay")
         if contract.max_age == 0 or error_sets_by_age(plant, replace(contract, max_age=0)) is None:
-            raise NoErrorSetAtAnyAgeError(
-                f"no error set was found, not even for samples of age 0{_least_shown_state(plant)}"
-            )
+            raise ErrorSetError(f"no error set was found, not even for samples of age 0{_least_shown_state(plant)}")
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
-from ncs_gym.estimation.error_bound import NoErrorSetAtAnyAgeError
+from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.plants.linear_plant import input_limit, inputs_under_way, mixed_limit, row_limit
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
@@ -62,10 +62,6 @@ _HOPELESS = 0.8
 _SHARE = "share_of_radii"
 
 
-class OutOfTime(Exception):
-    """The time of a search is over."""
-
-
 class Clock:
     """Ends a search after some time of its own thread: what else a machine does changes no message."""
 
@@ -83,12 +79,12 @@ class Clock:
         return Clock(now + (self._end - now) * min(2.0 / count, 1.0))
 
     def check(self, line: str = "") -> None:
-        """Raises `OutOfTime` if the time is over; may be called as `progress`, with a line of text."""
+        """Raises `TimeoutError` if the time is over; may be called as `progress`, with a line of text."""
         if self.is_over:
-            raise OutOfTime
+            raise TimeoutError
 
 
-# Whether a plant has a certificate under a contract; raises `OutOfTime` once the clock has run out.
+# Whether a plant has a certificate under a contract; raises `TimeoutError` once the clock has run out.
 Certifies = Callable[[LinearPlant, ChannelContract | None, Clock], bool]
 
 
@@ -184,7 +180,7 @@ def with_feasible_bounds(
             larger until it has, or is not named. The quick search decides by default.
         clock: Ends the search; what was found by then is named.
     """
-    if not _may_be_helped(infeasible, contract):
+    if not _may_be_helped(infeasible, plant, contract):
         return infeasible
     clock = Clock(np.inf) if clock is None else clock
     search = _Search(plant, contract, polytope, certifies, clock)
@@ -204,7 +200,7 @@ def with_feasible_bounds(
         progress(f"no certificate: searching for {change.what} that has one")
         try:
             factor = search.promising((change,), clock.part(len(changes) - k))
-        except OutOfTime:
+        except TimeoutError:
             continue
         if factor is None:
             (wider if change.rises else smaller).append(change.what if change.rises else change.name)
@@ -231,10 +227,10 @@ def with_feasible_bounds(
     return Infeasible(text, infeasible.binding, infeasible.shortfall, details)
 
 
-def _may_be_helped(infeasible: Infeasible, contract: ChannelContract | None) -> bool:
+def _may_be_helped(infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> bool:
     """Returns whether a single change of bounds, limits or age may help."""
     if infeasible.binding == "E1":
-        return contract is not None and not isinstance(infeasible.__cause__, NoErrorSetAtAnyAgeError)
+        return contract is not None and error_sets_by_age(plant, replace(contract, max_age=0)) is not None
     return infeasible.binding != "S" and infeasible.details.get(_SHARE) != 0.0
 
 
@@ -409,7 +405,7 @@ class _Search:
         """Returns nearly the smallest factor, at most `widest`, with which a quick search finds all changes enough.
 
         Raises:
-            OutOfTime: If the time is over.
+            TimeoutError: If the time is over.
         """
 
         def is_enough(factor: float) -> bool:
@@ -437,7 +433,7 @@ class _Search:
                 clock.check()
                 if self.certifies(_changed(self.plant, changes, more * factor), self.contract, clock):
                     return more * factor
-        except OutOfTime:
+        except TimeoutError:
             pass
         return None
 
@@ -461,7 +457,7 @@ class _Search:
                 clock.check()
                 if age >= 0 and self.certifies(self.plant, of_age(age), clock):
                     return age
-        except OutOfTime:
+        except TimeoutError:
             pass
         return None
 
@@ -475,7 +471,7 @@ class _Search:
                 if (factor := self.promising(pair, clock, widest)) is not None:
                     pairs.append((pair, factor))
                     widest = factor / _FACTOR_PRECISION
-        except OutOfTime:
+        except TimeoutError:
             pass
         for pair, factor in reversed(pairs):
             if (found := self.enough(pair, factor, self.clock)) is not None:
