@@ -90,8 +90,8 @@ _MORE_DIGITS = (
 )
 # Where no set is found, half-widths of the box that differ by more are named as the reason.
 _WIDEST_SPREAD = 1e6
-# A refusal takes so long at most [s], of its thread's own time; the search for changes that would help ends so much
-# earlier, since what is under way then takes some seconds.
+# A refusal should take so long at most [s], of its thread's own time: the search for changes that would help ends so
+# much earlier, since what is under way then takes some seconds. Searches before it have no such end.
 LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
 _NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
