@@ -37,7 +37,8 @@ class Infeasible(ValueError):
 
     Attributes:
         binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box is
-            unbounded), "U" (the input limits) or "I" (invariance); where a candidate failed in exact verification only,
+            unbounded), "U" (the input limits) or "I" (invariance), "P" (a gain's
+            polytope was not found); where a candidate failed in exact verification only,
             the condition it failed. For method "paper": "C2", "C1", "C5" (the input limit), or "grid" if OP is feasible
             but not at a point of the search grid.
         shortfall: By how much the condition fails: for "E1" the excess of the spectral radius over 1; for "I" and "U"
@@ -45,10 +46,11 @@ class Infeasible(ValueError):
             number of unbounded directions; for "C2" 1 - lambda_min(L)/alpha; where only exact verification failed, the
             violation of that condition.
         details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii for
-            which a design is found; the largest feasible value of each bound that the plant declares, changed alone:
-            `largest_gamma`, and as a fraction of the given one `disturbance_bound_factor`, `process_noise_cov_factor`
-            and so on; the smallest feasible factors on the box, on each of its sides and on each input limit,
-            changed alone: `box_factor`, `box_row_1_factor`, `u_max_1_factor`; where no change alone is enough,
+            which there is a certificate; nearly the largest value of each bound that the plant declares for which there
+            is one, changed alone: `largest_gamma`, and as a fraction of the given one `disturbance_bound_factor`,
+            `process_noise_cov_factor` and so on; nearly the smallest factors on the box, on each of its sides, on each
+            input limit and on each limit of states and inputs together, changed alone: `box_factor`,
+            `box_row_1_factor`, `u_max_1_factor`, `mixed_limit_1_factor`; where no change alone is enough,
             `pair_factor`, that of the two changes in the message; `lost_in_exact_arithmetic`, the violation of a
             candidate's condition where only exact verification failed; under a channel contract also `max_age`. Method
             "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`,

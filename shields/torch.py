@@ -72,6 +72,8 @@ class SafeLayer(nn.Module):
             ValueError: If the actions are no tensor of floats, a shape or a type is wrong, or a number is NaN or
                 infinite: the shield would apply K x_hat, and the model learn nothing of its mistake.
         """
+        if torch.jit.is_tracing():  # pyright: ignore[reportPrivateImportUsage]
+            raise ValueError("a trace would keep one decision for ever: torch.jit.trace cannot hold a SafeLayer")
         if not isinstance(actions, torch.Tensor) or not actions.is_floating_point():
             got = f"one of {actions.dtype}" if isinstance(actions, torch.Tensor) else type(actions).__name__
             raise ValueError(f"actions must be a tensor of floats, shape (N, {self.filter.plant.m}), got {got}")

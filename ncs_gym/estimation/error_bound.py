@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal, overload
 
@@ -96,6 +97,8 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     if sets is None:
         if (unseen := _unseen_state(plant)) is not None:
             raise ErrorSetError(f"no error set exists: the outputs do not show {unseen}, whose errors never decay")
+        if contract.max_age == 0 or error_sets_by_age(plant, replace(contract, max_age=0)) is None:
+            raise ErrorSetError(f"no error set was found, not even for samples of age 0{_least_shown_state(plant)}")
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )
@@ -121,15 +124,25 @@ def _unseen_state(plant: LinearPlant) -> str | None:
 
     The test of Popov, Belevitch and Hautus for detectability, in units of the safe box.
     """
+    shown, state = min(_persistent_modes(plant), default=(1.0, ""))
+    return state if shown <= UNDETECTABLE else None
+
+
+def _least_shown_state(plant: LinearPlant) -> str:
+    """Returns which state the outputs show least, of those whose errors do not decay, as the rest of a sentence."""
+    _, state = min(_persistent_modes(plant), default=(1.0, ""))
+    return f": of the states whose errors do not decay the outputs show {state} least" if state else ""
+
+
+def _persistent_modes(plant: LinearPlant) -> Iterator[tuple[float, str]]:
+    """Yields how much the outputs show of every mode that does not decay, and the state with the largest part in it."""
     widths = plant.half_widths
     A, H = plant.A * widths / widths[:, None], plant.H * widths
     H = H / np.maximum(np.abs(H).max(axis=1, keepdims=True), np.finfo(float).tiny)
     for value in np.linalg.eigvals(A):
         if abs(value) >= 1.0 - UNDETECTABLE:
             _, sizes, modes = np.linalg.svd(np.vstack([A - value * np.eye(plant.n), H]))
-            if sizes[-1] <= UNDETECTABLE * sizes[0]:
-                return plant.state_names[int(np.argmax(np.abs(modes[-1])))]
-    return None
+            yield float(sizes[-1] / sizes[0]), plant.state_names[int(np.argmax(np.abs(modes[-1])))]
 
 
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:

@@ -24,6 +24,11 @@ from ncs_gym.validation import (
 
 # Arguments of the constructor of `LinearPlant` that become fields of other names.
 PUBLISHED = "state_limits", "input_limits", "output_limits", "mixed_limits", "u_max", "offset"
+# What to give where an operating point that was not given is outside absolute limits.
+_POINT_TO_GIVE = {
+    f"{name}_limits": f": limits are absolute, so give operating_{name}=, around which the model was linearized"
+    for name in ("state", "input")
+}
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
 NEARLY_SYMMETRIC = 1e-12
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
@@ -128,6 +133,7 @@ def _from_center(limits: Any, center: np.ndarray, name: str) -> tuple[np.ndarray
     if not ((low < center) & (center < high)).all():
         raise ValueError(
             f"{name} must have the operating point {shown(center.tolist())} strictly between them, got {shown(limits)}"
+            f"{_POINT_TO_GIVE.get(name, '') if not center.any() else ''}"
         )
     low, high = low - center, high - center
     nearest, finite = np.minimum(-low, high), np.isfinite(low) & np.isfinite(high)

@@ -390,6 +390,11 @@ class LinearPlant(ReadOnlyArrays):
         dt = as_number(dt, "dt", low=0.0, low_open=True)
         if abs(dt - self.dt) <= statespace.SAME_STEP * self.dt:
             return self
+        if inputs_under_way(self):
+            raise ValueError(
+                "a plant whose states are past inputs, of input_delay or limits of rates, belongs to its step: make it "
+                f"anew by LinearPlant.from_statespace with dt={dt:g}, and the delay or change of its steps"
+            )
         if self.continuous_model is None or self.remainder is not None:
             raise ValueError(
                 f"only a plant that was sampled from a model in continuous time, without a remainder, can be sampled "
@@ -1158,6 +1163,12 @@ def row_limit(plant: LinearPlant, j: int) -> str:
         terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
         return f"|{terms.removeprefix('+')}| <= 1"
     return _sum_between(row, low, high, plant.operating_state, plant.state_names)
+
+
+def input_limit(plant: LinearPlant, i: int) -> str:
+    """Returns between what input i is."""
+    low, high, center = float(plant.input_low[i]), float(plant.input_high[i]), float(plant.operating_input[i])
+    return _between(plant.input_names[i], low, high, center, plant.input_units[i])
 
 
 def mixed_limit(plant: LinearPlant, j: int) -> str:

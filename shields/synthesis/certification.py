@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -27,7 +28,13 @@ from shields.synthesis.design_problem import (
     SymmetricLimits,
     design_problem,
 )
-from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
+from shields.synthesis.diagnosis import (
+    Clock,
+    infeasibility,
+    infeasibility_around,
+    is_feasible,
+    with_feasible_bounds,
+)
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import (
     Feedback,
@@ -48,10 +55,13 @@ from shields.synthesis.polytope_gain import (
     regulators,
 )
 from shields.synthesis.resting_point import (
+    Farthest,
     at_operating_point,
+    farthest_equilibrium,
     farthest_from_limits,
     improved,
     limits_around,
+    needs_resting_point,
     resting_at,
 )
 from shields.synthesis.round_numbers import in_round_numbers
@@ -82,6 +92,11 @@ _MORE_DIGITS = (
 )
 # Where no set is found, half-widths of the box that differ by more are named as the reason.
 _WIDEST_SPREAD = 1e6
+# A refusal should take so long at most [s], of its thread's own time: the search for changes that would help ends so
+# much earlier, since what is under way then takes some seconds. Searches before it have no such end.
+LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
+# What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
+_NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
 # Called with a line of text: the stage, and the volume reached so far.
 Progress = Callable[[str], object]
 # Alternations of a search that begins near the design of a similar problem.
@@ -149,28 +164,26 @@ def synthesize(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
             f"None, got {shown(contract)}"
         )
-    report = progress or (lambda line: None)
-    if resting_state is not None or _needs_resting_point(plant):
+    report, clock = progress or (lambda line: None), Clock(time.thread_time() + LONGEST_REFUSAL - _UNDER_WAY)
+    if resting_state is not None or needs_resting_point(plant):
         if safe_set == "ellipsoid":
             raise ValueError(
                 "only a polytope is sought where limits are not symmetric, not all states have any, some are of states "
                 "and inputs together, or resting_state is given"
             )
         rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
-        return _around_resting_point(plant, contract, report, candidates, rest, search_gain=search_gain)
+        try:
+            return _around_resting_point(plant, contract, report, candidates, clock, rest, search_gain=search_gain)
+        except Infeasible as infeasible:
+            raise _with_changes(infeasible, plant, contract, report, clock, polytope=True) from infeasible
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if safe_set == "ellipsoid":
         known = [each.without_polytope() for each in known if each.keeps_ellipsoid]
-    largest, *others = _certificates(plant, contract, report, known, polytope=safe_set != "ellipsoid")
+    largest, *others = _certificates(plant, contract, report, known, clock, polytope=safe_set != "ellipsoid")
     if safe_set == "ellipsoid":
         return largest
     found = (with_largest_polytope if search_gain else with_polytope)(largest, plant, report)
     return max([found, *(with_polytope(each, plant, report) for each in others)], key=_polytope_share)
-
-
-def _needs_resting_point(plant: LinearPlant) -> bool:
-    """Returns whether limits are not symmetric about the operating point, or leave a state free."""
-    return not plant.is_symmetric or bool(np.linalg.matrix_rank(plant.box) < plant.n)
 
 
 def _around_resting_point(
@@ -178,6 +191,7 @@ def _around_resting_point(
     contract: ChannelContract | None,
     progress: Progress,
     candidates: Sequence[Certificate],
+    clock: Clock,
     fixed: Rest | None = None,
     *,
     search_gain: bool,
@@ -186,6 +200,7 @@ def _around_resting_point(
 
     The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
     fixed one; where the share of the box is known, a better resting point then, and with `search_gain` a better gain.
+    Once the clock has run out, no further gain is tried.
 
     Raises:
         Infeasible: If none is found.
@@ -202,10 +217,9 @@ def _around_resting_point(
     def feedback(K: np.ndarray, at: Rest) -> Feedback:
         return Feedback(K, shapes, _disturbance_around(plant, at), at)
 
-    tried = []
-    for K in _gains_around(plant, problem, progress):
-        needs = None if fixed else needs_of(feedback(K, rest), plant)
-        tried.append(feedback(K, rest if needs is None else farthest_from_limits(plant, needs)))
+    gains = _gains_around(plant, problem, progress)
+    suited = [(K, Farthest(rest, 1.0, np.empty(0, int)) if fixed else _rest_for(K, plant, errors, rest)) for K in gains]
+    tried = [feedback(K, at.rest) for K, at in sorted(suited, key=lambda pair: pair[1].distance < 1.0)]
     if points is not None and tried:
         shares = [share_of_points(each, plant, points) for each in tried]
         tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
@@ -216,25 +230,43 @@ def _around_resting_point(
             better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
         larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
         tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
+    reasons = []
     for each in tried:
-        found = certify_polytope(plant, each.K, contract, progress, each.rest)
-        if found is not None:
+        try:
+            found = _certified_polytope(plant, each.K, contract, progress, each.rest)
             return max([found, *known], key=_polytope_share)
+        except _NOT_CERTIFIED as failure:
+            reasons.append(str(failure))
+        if clock.is_over:
+            break
     if known:
         return max(known, key=_polytope_share)
-    raise infeasibility(problem, polytope=True)
+    raise infeasibility_around(plant, contract, reasons[0] if reasons else "no gain was found")
 
 
-def _gains_around(plant: LinearPlant, problem: DesignProblem, progress: Progress) -> Iterator[np.ndarray]:
+def _rest_for(K: np.ndarray, plant: LinearPlant, errors: ErrorSet, rest: Rest) -> Farthest:
+    """Returns the resting point that suits a gain, shape (m, n): where the limits leave most of what it needs.
+
+    What the gain needs is there if the nearest limit is 1 away; where that is not known, it is said to be.
+    """
+    shapes = np.array([proof.Sigma for proof in _proofs(errors)])
+    needs = needs_of(Feedback(K, shapes, _disturbance_around(plant, rest), rest), plant)
+    return Farthest(rest, 1.0, np.empty(0, int)) if needs is None else farthest_equilibrium(plant, needs)
+
+
+def _gains_around(
+    plant: LinearPlant, problem: DesignProblem, progress: Progress, *, quick: bool = False
+) -> Iterator[np.ndarray]:
     """Yields gains, shape (m, n), for symmetric limits around a point.
 
-    Those of the largest ellipsoid, of the largest tolerated radii, and of regulators.
+    Those of the largest ellipsoid, which takes longest and is left out if `quick`, of the largest tolerated radii, and
+    of regulators.
     """
 
     def report(stage: str, design: CandidateDesign | None) -> None:
         progress(_progress_text(stage, design))
 
-    found = largest_set(problem, _SLACKS[0], report)
+    found = None if quick else largest_set(problem, _SLACKS[0], report)
     if found is not None:
         yield problem.to_physical(found.L, with_best_gain(problem, found).K)[1]
     progress("gain that tolerates most")
@@ -371,22 +403,34 @@ def certify_polytope(
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
-    rest = at_operating_point(plant) if rest is None else rest
+    try:
+        return _certified_polytope(plant, K, contract, progress, at_operating_point(plant) if rest is None else rest)
+    except _NOT_CERTIFIED as failure:
+        if isinstance(failure, Infeasible) and failure.binding != "P":
+            raise
+        return None
+
+
+def _certified_polytope(
+    plant: LinearPlant, K: np.ndarray, contract: ChannelContract | None, progress: Progress, rest: Rest
+) -> Certificate:
+    """Returns what `certify_polytope` does.
+
+    Raises:
+        Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
+    """
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     K, proofs = exact.rounded(K, _DIGITS, axis=1), _proofs(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
-    try:
-        polytope = invariant_polytope(feedback, plant, progress)
-        faces = polytope.F
-        L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
-        L = _in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
-        others: dict[str, Any] = _of_the_problem(plant, problem, errors) | {"D": feedback.D}
-        others |= {"resting_state": rest.state, "resting_input": rest.input}
-        provenance = _provenance(plant, L, _volume(plant, L))
-        certificate = Certificate(L=L, K=K, proofs=proofs, polytope=polytope, provenance=provenance, **others)
-        return _verified_polytope(certificate, plant, progress)
-    except (Infeasible, ArithmeticError, ValueError, CertificateError):  # numbers that a linear program cannot hold
-        return None
+    polytope = invariant_polytope(feedback, plant, progress)
+    faces = polytope.F
+    L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
+    L = _in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
+    others: dict[str, Any] = _of_the_problem(plant, problem, errors) | {"D": feedback.D}
+    others |= {"resting_state": rest.state, "resting_input": rest.input}
+    provenance = _provenance(plant, L, _volume(plant, L))
+    certificate = Certificate(L=L, K=K, proofs=proofs, polytope=polytope, provenance=provenance, **others)
+    return _verified_polytope(certificate, plant, progress)
 
 
 def _disturbance_around(plant: LinearPlant, rest: Rest) -> np.ndarray:
@@ -437,6 +481,7 @@ def nearby_certificate(
     alternations: int = _FEW_ALTERNATIONS,
     *,
     polytope: bool = True,
+    progress: Progress = lambda line: None,
 ) -> Certificate | None:
     """Returns a verified certificate, found faster and with a slightly smaller set than `synthesize`; None if none is.
 
@@ -446,28 +491,36 @@ def nearby_certificate(
         start: Certificate of a similar problem with as many states and inputs, which the search begins near.
         alternations: How often the set is enlarged at most.
         polytope: Whether a polytope is sought where no ellipsoid is found.
+        progress: Called with a line of text now and then.
     """
-    if _needs_resting_point(plant):
-        return _nearby_around(plant, contract, start)
+    if needs_resting_point(plant):
+        return _nearby_around(plant, contract, start, progress)
     try:
-        certificate = _nearby(plant, contract, start, alternations)
+        certificate = _nearby(plant, contract, start, alternations, progress)
     except Infeasible:
         certificate = None
     carried = None if certificate or start is None else carried_over(start, plant, contract)
-    return certificate or carried or (_polytope_alone(plant, contract) if polytope else None)
+    return certificate or carried or (_polytope_alone(plant, contract, progress) if polytope else None)
 
 
 def _nearby_around(
-    plant: LinearPlant, contract: ChannelContract | None, start: Certificate | None
+    plant: LinearPlant, contract: ChannelContract | None, start: Certificate | None, progress: Progress
 ) -> Certificate | None:
-    """Returns what `nearby_certificate` does, of a polytope around a resting point."""
+    """Returns what `nearby_certificate` does, of a polytope around a resting point: the first that is found."""
     carried = None if start is None else carried_over(start, plant, contract)
     if carried is not None:
         return carried
     try:
-        return _around_resting_point(plant, contract, lambda line: None, (), search_gain=False)
+        rest = farthest_from_limits(plant)
+        problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+        for K in _gains_around(plant, problem, progress, quick=True):
+            suited = _rest_for(K, plant, errors, rest)
+            found = certify_polytope(plant, K, contract, progress, suited.rest) if suited.distance >= 1.0 else None
+            if found is not None:
+                return found
     except Infeasible:
-        return None
+        pass
+    return None
 
 
 def _nearby(
@@ -475,6 +528,7 @@ def _nearby(
     contract: ChannelContract | None,
     start: Certificate | None,
     alternations: int,
+    progress: Progress,
     tightened: tuple[np.ndarray, ...] = (),
 ) -> Certificate | None:
     """Returns what `nearby_certificate` searches, in the boxes of `_found_certificate`.
@@ -484,17 +538,21 @@ def _nearby(
     """
     problem, errors = design_problem(plant, contract, _within(plant, tightened))
     near = None
+
+    def report(stage: str, design: CandidateDesign | None) -> None:
+        progress(_progress_text(stage, design))
+
     if start is not None and (shares := start.proofs[-1].shares) is not None:
         lx, le, ld = shares.tolist()
         near = _design_at(problem, start.L, start.K, (lx, le, ld))
     for slack in _SLACKS:
-        found = largest_set(problem, slack, lambda stage, design: None, near, alternations)
+        found = largest_set(problem, slack, report, near, alternations)
         if found is None:
             return None
         certificate = _certificate(plant, problem, with_best_gain(problem, found), errors, slack)
         box_rows = _tightened_box(certificate, plant, tightened)
         if box_rows is not None:
-            return _nearby(plant, contract, start, alternations, (*tightened, box_rows))
+            return _nearby(plant, contract, start, alternations, progress, (*tightened, box_rows))
         if verify(certificate, plant).valid:
             return certificate
     return None
@@ -515,6 +573,7 @@ def _certificates(
     contract: ChannelContract | None,
     progress: Progress,
     known: Sequence[Certificate],
+    clock: Clock,
     *,
     polytope: bool,
 ) -> list[Certificate]:
@@ -530,12 +589,18 @@ def _certificates(
         known = [_found_certificate(plant, contract, progress), *known]
     except Infeasible as infeasible:
         if not known:
-            known = [_second_search(infeasible, plant, contract, progress, polytope)]
+            known = [_second_search(infeasible, plant, contract, progress, clock, polytope=polytope)]
     return sorted(known, key=size, reverse=True)
 
 
 def _second_search(
-    infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None, progress: Progress, polytope: bool
+    infeasible: Infeasible,
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    clock: Clock,
+    *,
+    polytope: bool,
 ) -> Certificate:
     """Returns a verified certificate that is found in other ways where the search for an ellipsoid found none.
 
@@ -545,7 +610,7 @@ def _second_search(
     if polytope and _LOST in infeasible.details:
         progress("no ellipsoid holds in exact arithmetic: seeking a polytope")
         try:
-            return _around_resting_point(plant, contract, progress, (), search_gain=False)
+            return _around_resting_point(plant, contract, progress, (), clock, search_gain=False)
         except Infeasible:
             raise infeasible from None
     was_sought = "share_of_radii" in infeasible.details
@@ -556,7 +621,7 @@ def _second_search(
     if certificate is not None:
         return certificate
     if was_sought or infeasible.binding in ("B", "E1"):
-        raise _with_hints(infeasible, plant, contract, progress, polytope) from infeasible
+        raise _with_hints(infeasible, plant, contract, progress, clock, polytope=polytope) from infeasible
     raise infeasible
 
 
@@ -693,19 +758,48 @@ def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> I
 
 
 def _with_hints(
-    infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None, progress: Progress, polytope: bool
+    infeasible: Infeasible,
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    clock: Clock,
+    *,
+    polytope: bool,
 ) -> Infeasible:
-    """Returns the exception with the bounds that would be feasible.
+    """Returns the exception with the changes that would help, where no ellipsoid was found.
 
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
+    if polytope and infeasible.binding != "E1":
+        sought = infeasibility(design_problem(plant, contract)[0], polytope=True)
+        polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
+        infeasible = sought if polytope and infeasible.binding != "B" else infeasible
+    return _with_changes(infeasible, plant, contract, progress, clock, polytope=polytope)
+
+
+def _with_changes(
+    infeasible: Infeasible,
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    clock: Clock,
+    *,
+    polytope: bool,
+) -> Infeasible:
+    """Returns the exception with single changes that have a certificate.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
+    """
+
+    def certifies(changed: LinearPlant, promised: ChannelContract | None, within: Clock) -> bool:
+        return nearby_certificate(changed, promised, polytope=polytope, progress=within.check) is not None
+
     try:
-        if polytope and infeasible.binding != "E1":
-            sought = infeasibility(design_problem(plant, contract)[0], polytope=True)
-            polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
-            infeasible = sought if polytope and infeasible.binding != "B" else infeasible
-        return with_feasible_bounds(infeasible, plant, contract, progress, polytope=polytope)
+        return with_feasible_bounds(
+            infeasible, plant, contract, progress, polytope=polytope, certifies=certifies, clock=clock
+        )
     except KeyboardInterrupt as interrupt:
         raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt
 

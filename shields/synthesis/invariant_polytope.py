@@ -120,12 +120,12 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
         Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
     step = _ClosedLoop(feedback, plant)
-    faces = invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress)
+    faces = _faces_that_cut(step.first_faces(), step.predecessor, len(plant.box), progress)
     extents = _extents(faces) if step.has_free_states else np.ones(plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
         step.widths = step.widths * extents
-        faces = invariant_faces(step.first_faces(), step.predecessor, len(plant.box), progress)
-    return _rounded(step, faces)
+        faces = _faces_that_cut(step.first_faces(), step.predecessor, len(plant.box), progress)
+    return _rounded(step, _faces_that_count(faces, len(plant.box), progress))
 
 
 def invariant_faces(
@@ -145,6 +145,13 @@ def invariant_faces(
     Raises:
         Infeasible: If there are none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds, or `predecessor` raises it.
     """
+    return _faces_that_count(_faces_that_cut(faces, predecessor, kept, progress), kept, progress)
+
+
+def _faces_that_cut(
+    faces: Faces, predecessor: Callable[[Faces], Faces], kept: int, progress: Callable[[str], object]
+) -> Faces:
+    """Returns the faces of `invariant_faces` with some that later ones imply."""
     if kept > MOST_ROWS:
         raise _none(
             f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
@@ -171,8 +178,13 @@ def invariant_faces(
                 row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1])
             )
         following += 1
+    return faces
+
+
+def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object]) -> Faces:
+    """Returns faces without those that others imply."""
     progress(f"polytope: which of {len(faces.rows)} rows count")
-    faces = _without_implied(faces, kept)[0]
+    faces = _bounding_every_state(_without_implied(faces, kept)[0], kept)
     if len(faces.rows) > MOST_ROWS:
         raise _too_many()
     return faces
@@ -431,6 +443,32 @@ def _without_implied(faces: Faces, kept: int, count: int = 0) -> tuple[Faces, in
             ends[int(low)][i] = _OPEN[int(low)][0]
             faces = Faces(faces.rows, *ends)
     return faces, count
+
+
+def _bounding_every_state(faces: Faces, kept: int) -> Faces:
+    """Returns faces of which those with two ends bound every state, as proofs ask for, if the polytope is bounded.
+
+    An open end is closed where the others imply it already; the `kept` first rows stay as they are, and are followed by
+    a closed copy. What keeps the others keeps such an end, too.
+    """
+    rows, low, high = (part.copy() for part in faces)
+    closed = np.isfinite(low) & np.isfinite(high)
+    for i in np.flatnonzero(~closed).tolist():
+        rank = np.linalg.matrix_rank(rows[closed]) if closed.any() else 0
+        if rank == rows.shape[1]:
+            break
+        least, largest = (bound.value for bound in _extremes(faces, rows[i]))
+        is_bounded = math.isfinite(least) and math.isfinite(largest)
+        if not is_bounded or np.linalg.matrix_rank(np.vstack([rows[closed], rows[i]])) == rank:
+            continue
+        ends = max(float(low[i]), least), min(float(high[i]), largest)
+        if i < kept:
+            rows, low, high = np.vstack([rows, rows[i]]), np.append(low, ends[0]), np.append(high, ends[1])
+            closed = np.append(closed, True)
+        else:
+            low[i], high[i] = ends
+            closed[i] = True
+    return Faces(rows, low, high)
 
 
 def _rounded(step: _ClosedLoop, faces: Faces) -> Polytope:

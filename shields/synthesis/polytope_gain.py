@@ -27,6 +27,10 @@ _POINTS_LOG2 = 13
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
 # over no more steps than the second number.
 _LEFT_OVER, _MOST_STEPS = 1e-7, 4000
+# They are summed over so many steps at once, a power of two.
+_BLOCK = 64
+# What a gain needs is found over more steps: it is asked once for each.
+_MOST_STEPS_OF_NEEDS = 40_000
 # No limit counts as less needed than this, in units of half its range.
 _SMALLEST_NEED = 1e-3
 # Digits of a tolerated factor: a search takes the same steps on every processor.
@@ -169,15 +173,18 @@ def needs_of(feedback: Feedback, plant: LinearPlant) -> np.ndarray | None:
     closed_loop = plant.A + plant.B @ K
     radius = float(np.abs(np.linalg.eigvals(closed_loop)).max()) if np.isfinite(closed_loop).all() else np.inf
     steps = np.inf if radius >= 1.0 else np.log(_LEFT_OVER) / np.log(max(radius, 1e-3))
-    if steps > _MOST_STEPS:
+    if steps > _MOST_STEPS_OF_NEEDS:
         return None
     pushed = plant.mixed_rows[:, plant.n :] @ K
     inputs = K / plant.input_half[:, None]
     moved = np.concatenate([plant.box, inputs, plant.mixed_rows[:, : plant.n] + pushed])
-    needs = np.zeros(len(moved))
-    for _ in range(int(steps) + plant.n):
-        needs += _reach(moved @ (plant.B @ K), errors) + _reach(moved, D[None])
-        moved = moved @ closed_loop
+    needs, powers = np.zeros(len(moved)), np.eye(plant.n)[None]
+    while len(powers) < _BLOCK:
+        powers = np.concatenate([powers, powers @ (powers[-1] @ closed_loop)])
+    for _ in range(0, int(steps) + plant.n, _BLOCK):
+        later = moved @ powers  # (steps, rows, n)
+        needs += (_reach(later @ (plant.B @ K), errors) + _reach(later, D[None])).sum(axis=0)
+        moved = later[-1] @ closed_loop
     needs[len(plant.box) :] += _reach(np.concatenate([inputs, pushed]), errors)
     return np.maximum(needs, _SMALLEST_NEED)
 

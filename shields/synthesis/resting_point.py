@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import null_space
@@ -25,6 +26,8 @@ _MOST_TURNS = 6
 # How far a state without a limit is taken to go while a gain is sought, next to where a regulator lets it go.
 _GENEROUS = 2.0
 _STEPS_OF_REACH = 400
+# A limit binds if more of what all nearest ones leave is due to it.
+_LEAST_PRICE = 1e-3
 
 
 def at_operating_point(plant: LinearPlant) -> Rest:
@@ -47,12 +50,40 @@ def _limit_rows(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return np.concatenate([box, inputs, plant.mixed_rows]), *np.concatenate(ends, axis=1)
 
 
+def needs_resting_point(plant: LinearPlant) -> bool:
+    """Returns whether limits are not symmetric about the operating point, or leave a state free."""
+    return not plant.is_symmetric or bool(np.linalg.matrix_rank(plant.box) < plant.n)
+
+
+class Farthest(NamedTuple):
+    """An equilibrium that is farthest from the limits.
+
+    Attributes:
+        rest: The equilibrium.
+        distance: Of the nearest limit, in units of what is needed.
+        binding: The rows that nearest limits belong to, as those of `distances`.
+    """
+
+    rest: Rest
+    distance: float
+    binding: np.ndarray
+
+
 def farthest_from_limits(plant: LinearPlant, needs: np.ndarray | None = None) -> Rest:
-    """Returns the equilibrium whose nearest limit is farthest away, by a linear program.
+    """Returns the equilibrium whose nearest limit is farthest away.
 
     Args:
         plant: The plant.
         needs: What distances from the limits are in units of, shape (k + m + q,), > 0; half the range by default.
+
+    Raises:
+        Infeasible: If no equilibrium is strictly within the limits.
+    """
+    return farthest_equilibrium(plant, needs).rest
+
+
+def farthest_equilibrium(plant: LinearPlant, needs: np.ndarray | None = None) -> Farthest:
+    """Returns what `farthest_from_limits` does with the limits that are nearest, by a linear program.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
@@ -66,7 +97,10 @@ def farthest_from_limits(plant: LinearPlant, needs: np.ndarray | None = None) ->
     found = linprog(-np.eye(size + 1)[-1], A_ub=faces, b_ub=ends, bounds=[(None, None)] * (size + 1))
     if found.status != 0 or not found.x[-1] > 0.0:
         raise Infeasible("no equilibrium lies strictly within the limits of states and inputs", "S", 1.0)
-    return rest_at(plant, directions @ found.x[:-1])
+    numbers = np.concatenate([np.flatnonzero(above), np.flatnonzero(below)])
+    prices = -found.ineqlin.marginals * needed[numbers, 0]  # they add up to 1
+    binding = np.unique(numbers[prices > _LEAST_PRICE])
+    return Farthest(rest_at(plant, directions @ found.x[:-1]), float(found.x[-1]), binding)
 
 
 def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:

@@ -366,3 +366,9 @@ def test_limits_count_beside_times_between_samples():
         assert info["shield_guaranteed"]
         assert info["cost"] == 0.0
         assert len(info["worst_constraint_values"]) == len(plant.box) + 1
+
+
+@pytest.mark.parametrize("name", ["rates", "rates of a late input"])
+def test_plant_of_past_inputs_says_why_it_has_no_other_step(name):
+    with pytest.raises(ValueError, match=r"states are past inputs, of input_delay or limits of rates.*dt=0.05"):
+        PLANTS[name].resampled(0.05)

@@ -134,6 +134,20 @@ def test_plant_in_deviations_from_another_point_has_the_same_polytope():
     assert 0.3 < np.mean(inside[0]) < 1.0
 
 
+def test_limit_with_one_end_alone_is_kept():
+    """The other end of the only state's range follows from the input's."""
+    room = LinearPlant(
+        A=[[0.98]], B=[[0.05]], dt=60.0, operating_state=22.0, operating_input=8.0,
+        state_limits=(20.0, np.inf), input_limits=(0.0, 12.0), disturbance_bound=0.1, **QUIET,
+    )  # fmt: skip
+    found = certificate_of(room, CONTRACT, "polytope")
+    assert verify(found, room).valid
+    assert verify_again(found, room).valid
+    assert found.polytope.high[0] == np.inf
+    reached = found.polytope.rows[1:] @ np.array([1e6])
+    assert ((reached > found.polytope.high[1:]) | (reached < found.polytope.low[1:])).any()
+
+
 @pytest.mark.parametrize("name", PLANTS)
 def test_share_of_the_box_is_that_of_random_points(name):
     plant, found = PLANTS[name], certificate(name)

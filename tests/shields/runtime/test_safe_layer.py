@@ -92,3 +92,10 @@ def test_what_has_no_numbers_to_decide_about_is_named(setting):
         torch.func.vmap(lambda u, x: layer(u[None], x[None])[0])(*given)
     with pytest.raises(ValueError, match=r"what torch.func and torch.export transform, and the meta device"):
         layer(*(each.to("meta") for each in given))
+
+
+@pytest.mark.filterwarnings("ignore")  # torch's about traces
+def test_trace_that_would_keep_one_decision_is_refused(setting):
+    plant, certificate, estimates, _, actions = setting
+    with pytest.raises(ValueError, match=r"torch\.jit\.trace cannot hold a SafeLayer"):
+        torch.jit.trace(SafeLayer(certificate, plant), (torch.tensor(actions[:3]), torch.tensor(estimates[:3])))

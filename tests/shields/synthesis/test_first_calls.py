@@ -1,0 +1,52 @@
+"""Plants of textbooks, toolboxes and standards, as their authors would write the first call (tests/data)."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from ncs_gym import ChannelContract, LinearPlant
+from shields import Infeasible, synthesize
+from shields.synthesis.certification import LONGEST_REFUSAL
+from tests.second_verifier.verify import verify_again
+from tests.verdicts import verified
+
+# Each has its source, what is invented of it, its model, what `LinearPlant.from_statespace` is given, and the age that
+# its network promises.
+CALLS = json.loads((Path(__file__).parents[2] / "data" / "first_calls.json").read_text())
+# Which are refused, and why.
+REFUSED = {
+    "zone_22": r"those that bind: 20 <= air <= 24 .*times the given disturbance_bound or less; .* limit of heat or more"
+}
+QUICK = ("motor_speed_ctms", "cstr_mathworks", "buck_geyer", "pitch_nrel5")
+
+
+def plant_of_call(name: str) -> LinearPlant:
+    given = CALLS[name]
+    return LinearPlant.from_statespace(tuple(given["model"]), given["dt"], **given["arguments"])
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CALLS]
+)
+def test_first_call_is_accepted_or_refused_with_what_helps(name):
+    plant, contract, began = plant_of_call(name), ChannelContract(CALLS[name]["max_age"]), time.thread_time()
+    if name in REFUSED:
+        with pytest.raises(Infeasible, match=REFUSED[name]):
+            synthesize(plant, contract=contract)
+    else:
+        found = synthesize(plant, contract=contract)
+    assert time.thread_time() - began < LONGEST_REFUSAL
+    if name not in REFUSED:
+        assert verified(found, plant).valid
+        assert verify_again(found, plant).valid
+
+
+def test_operating_point_that_was_not_given_is_asked_for():
+    given = CALLS["zone_22"]
+    arguments = {name: value for name, value in given["arguments"].items() if not name.startswith("operating")}
+    with pytest.raises(ValueError, match="give operating_"):
+        LinearPlant.from_statespace(tuple(given["model"]), given["dt"], **arguments)
