@@ -21,6 +21,7 @@ from experiments.attack.worst_case import (
     HostileRequests,
     WorstCaseVectorEnv,
     starts_in_box,
+    starts_in_set,
 )
 from experiments.runs.provenance import versions
 from experiments.settings import AttackSettings, BackendSettings
@@ -186,7 +187,7 @@ def _begin(settings: AttackSettings, shield: VectorSafetyShield, seed: int, rng:
         assert isinstance(env, NCSVectorEnv)
         if polytope is None or env.single.downlink is not None:  # behind a downlink the first inputs are zero
             return shield.reset(seed=seed)[1]
-        return shield.reset(seed=seed, options={"state": (1.0 - 1e-9) * polytope.sample_boundary(rng, count)})[1]
+        return shield.reset(seed=seed, options={"state": starts_in_set(rng, certificate, count)})[1]
     _, info = shield.reset(seed=seed, options={"state": starts_in_box(rng, plant, certificate, count)})
     if not info["shield_guaranteed"].all():
         env = shield.env.unwrapped

@@ -91,16 +91,22 @@ class GaussianVectorEnv(_OnBoundary):
         super().__init__(num_envs, initial_set=start_set(certificate, settings.get("downlink")), **settings)
 
 
+def starts_in_set(rng: np.random.Generator, certificate: Certificate, count: int) -> np.ndarray:
+    """Returns starts on the boundary of the safe set, shape (count, n), pulled in by more than rounding."""
+    center = certificate.resting_state
+    return center + (1.0 - 1e-9) * (certificate.safe_set.sample_boundary(rng, count) - center)
+
+
 def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Certificate, count: int) -> np.ndarray:
     """Returns starts, shape (count, n): half on the boundary of the safe set, half drawn uniformly from the box.
 
     In directions that no row of the box limits, `half_widths` limit them.
     """
-    states = (1.0 - 1e-9) * certificate.safe_set.sample_boundary(rng, count)
+    states = starts_in_set(rng, certificate, count)
     chosen, missing = np.arange(count) % 2 == 1, np.arange(count) % 2 == 1
     while missing.any():
         states[missing] = rng.uniform(-1.0, 1.0, (int(missing.sum()), plant.n)) * plant.half_widths
-        missing = chosen & (np.abs(states @ plant.box_rows.T).max(axis=1) > 1.0)
+        missing = chosen & (plant.constraint_values(states.T).max(axis=0) > 0.0)
     return states
 
 
@@ -116,8 +122,9 @@ class HostileAgents:
 
     def __init__(self, num_envs: int, plant: LinearPlant, certificate: Certificate, rng: np.random.Generator) -> None:
         self._rng = rng
+        self._rest = certificate.resting_state
         self._outwards = (plant.B.T @ certificate.M @ plant.A).T
-        self._turned = -1e3 * (certificate.K / plant.u_max[:, None]).T
+        self._turned = -1e3 * (certificate.K / plant.input_half[:, None]).T
         ends = [num_envs * quarter // 4 for quarter in range(5)]
         self._random, self._out, self._back, self._bang = (slice(*pair) for pair in itertools.pairwise(ends))
         self._actions = np.zeros((num_envs, plant.m), np.float32)
@@ -125,7 +132,7 @@ class HostileAgents:
 
     def act(self, estimates: np.ndarray) -> np.ndarray:
         """Returns the actions, shape (N, m), for estimates (N, n); the array is used again."""
-        actions = self._actions
+        actions, estimates = self._actions, estimates - self._rest
         actions[self._random] = self._rng.uniform(-1.0, 1.0, actions[self._random].shape)
         actions[self._out] = np.sign(estimates[self._out] @ self._outwards)
         actions[self._back] = np.clip(estimates[self._back] @ self._turned, -1.0, 1.0)

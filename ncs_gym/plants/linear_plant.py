@@ -80,7 +80,7 @@ _KINDS = {
 }
 # Arguments of the constructor about limits, in this order: those that are fields, too, need not be given.
 _LIMITS = (
-    *("state_limits", "input_limits", "output_limits", "mixed_limits", "box", "u_max", "offset"),
+    *("state_limits", "input_limits", "output_limits", "mixed_limits", "du_max", "box", "u_max", "offset"),
     *("input_ends", "box_ends", "mixed_rows", "mixed_ends"),
 )
 # Columns of the description: where its texts begin, and where they end.
@@ -114,6 +114,9 @@ def with_limits_as_published(kind: Kind) -> Kind:
                 "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
                 "H=... for the output matrix of a state-space model"
             )
+        if (du_max := arguments.pop("du_max", None)) is not None:  # a plant of more states
+            limited = kind(**arguments).with_rate_limits(du_max)
+            arguments = {each.name: getattr(limited, each.name) for each in fields(limited)}
         construct(self, **limits.fields_of(arguments))
 
     of_fields = dict(inspect.signature(construct).parameters)
@@ -150,7 +153,9 @@ class LinearPlant(ReadOnlyArrays):
         output_limits: Further limits, a list of (row, low, high) with low <= row x <= high.
         mixed_limits: Limits of states and inputs together, of outputs with feedthrough and of coupled inputs, a list of
             (state row, input row, low, high) with low <= state row x + input row u <= high for the x at the beginning
-            of a step and the u that is held then. Limits of how fast an input changes: `with_rate_limits`.
+            of a step and the u that is held then.
+        du_max: Largest change of each input from one step to the next, a positive number or shape (m,): the plant gets
+            past inputs as further states (`with_rate_limits`).
         offset: c of a model in absolute coordinates, shape (n,).
 
     Attributes:
@@ -237,6 +242,7 @@ class LinearPlant(ReadOnlyArrays):
             input_limits: tuple[ArrayLike, ArrayLike] | None = None,
             output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
             mixed_limits: Sequence[tuple[ArrayLike, ArrayLike, float, float]] | None = None,
+            du_max: ArrayLike | None = None,
             box: ArrayLike | None = None,
             u_max: ArrayLike | None = None,
             offset: ArrayLike | None = None,

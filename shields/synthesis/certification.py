@@ -175,6 +175,12 @@ def synthesize(
         try:
             return _around_resting_point(plant, contract, report, candidates, clock, rest, search_gain=search_gain)
         except Infeasible as infeasible:
+            if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
+                raise Infeasible(
+                    f"{infeasible}; this is around the resting_state that was given, without one the synthesis chooses",
+                    infeasible.binding,
+                    infeasible.shortfall,
+                ) from infeasible
             raise _with_changes(infeasible, plant, contract, report, clock, polytope=True) from infeasible
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if safe_set == "ellipsoid":
@@ -241,7 +247,8 @@ def _around_resting_point(
             break
     if known:
         return max(known, key=_polytope_share)
-    raise infeasibility_around(plant, contract, reasons[0] if reasons else "no gain was found")
+    reason = reasons[0] if reasons else "no gain was found"
+    raise Infeasible(reason, "P", 0.0) if fixed else infeasibility_around(plant, contract, reason)
 
 
 def _rest_for(K: np.ndarray, plant: LinearPlant, errors: ErrorSet, rest: Rest) -> Farthest:

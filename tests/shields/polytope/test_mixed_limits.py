@@ -214,6 +214,15 @@ def test_stable_plant_with_limits_of_rates_needs_no_contract():
     np.testing.assert_array_less(np.sqrt(found.error_shapes[:, 2, 2]), 1e-4)  # the past input is known
 
 
+def test_limits_of_rates_may_be_given_to_the_constructor():
+    model = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "dt": 0.1, **ONE_INPUT, **QUIET}
+    plant, other = LinearPlant(**model, du_max=0.3), LinearPlant(**model).with_rate_limits(0.3)
+    assert plant.fingerprint == other.fingerprint
+    assert plant.state_names == other.state_names == ("x1", "x2", "u1 of 1 step ago")
+    with pytest.raises(ValueError, match="du_max must be a positive number"):
+        LinearPlant(**model, du_max=-1.0)
+
+
 def test_rates_may_be_given_per_second_and_for_a_plant_that_is_made():
     plant = LinearPlant.from_statespace(MODEL, 0.1, **ONE_INPUT, **QUIET)
     assert plant.with_rate_limits(0.3).fingerprint == PLANTS["rates"].fingerprint

@@ -26,6 +26,7 @@ from ncs_gym import (
 from shields import (
     Certificate,
     CertificateError,
+    Infeasible,
     SafeLoop,
     SafetyFilter,
     SafetyShield,
@@ -558,6 +559,9 @@ def test_resting_state_is_taken_where_it_is_one():
     ):
         with pytest.raises(ValueError, match=words):
             synthesize(plant, contract=CONTRACT, resting_state=wrong)
+    rough = replace(plant, disturbance_bound=0.3)
+    with pytest.raises(Infeasible, match="this is around the resting_state that was given"):
+        synthesize(rough, contract=CONTRACT, resting_state=state)
     with pytest.raises(ValueError, match="resting_state is given"):
         synthesize(plant.symmetric, contract=CONTRACT, resting_state=[0.05, 0.0], safe_set="ellipsoid")
 
