@@ -32,6 +32,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--attack", type=int, default=0, metavar="STEPS", help="attacked steps of each certificate")
     options = parser.parse_args(arguments)
     names, total, outside = options.names, 0, 0
+    if options.attack < 0:
+        parser.error(f"--attack must be a number of steps, got {options.attack}")
     if unknown := [name for name in names if name not in published()]:
         raise SystemExit(f"no published plant is called {unknown[0]}; there are {', '.join(published())}")
     print(_row(*_COLUMNS))
