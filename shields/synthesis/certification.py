@@ -37,6 +37,7 @@ from shields.synthesis.diagnosis import (
 )
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import (
+    LONGEST_SEARCH,
     Feedback,
     feedback_of,
     invariant_polytope,
@@ -92,8 +93,8 @@ _MORE_DIGITS = (
 )
 # Where no set is found, half-widths of the box that differ by more are named as the reason.
 _WIDEST_SPREAD = 1e6
-# A refusal should take so long at most [s], of its thread's own time: the search for changes that would help ends so
-# much earlier, since what is under way then takes some seconds. Searches before it have no such end.
+# A refusal should take so long at most [s], of its thread's own time: the search for a polytope, and then
+# the one for changes that would help, end so much earlier, since what is under way then takes some seconds.
 LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
 _NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
@@ -239,7 +240,8 @@ def _around_resting_point(
     reasons = []
     for each in tried:
         try:
-            found = _certified_polytope(plant, each.K, contract, progress, each.rest)
+            longest = min(LONGEST_SEARCH, clock.left)
+            found = _certified_polytope(plant, each.K, contract, progress, each.rest, longest)
             return max([found, *known], key=_polytope_share)
         except _NOT_CERTIFIED as failure:
             reasons.append(str(failure))
@@ -395,6 +397,7 @@ def certify_polytope(
     contract: ChannelContract | None = None,
     progress: Progress = lambda line: None,
     rest: Rest | None = None,
+    longest: float | None = None,
 ) -> Certificate | None:
     """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
 
@@ -406,12 +409,14 @@ def certify_polytope(
         contract: Channel contract; with one, the error sets depend on the age of the newest sample.
         progress: Called with a line of text now and then.
         rest: The point around which it is sought; the operating point by default.
+        longest: How long the polytope is sought at most [s], as in `invariant_polytope`.
 
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
     try:
-        return _certified_polytope(plant, K, contract, progress, at_operating_point(plant) if rest is None else rest)
+        rest = at_operating_point(plant) if rest is None else rest
+        return _certified_polytope(plant, K, contract, progress, rest, longest)
     except _NOT_CERTIFIED as failure:
         if isinstance(failure, Infeasible) and failure.binding != "P":
             raise
@@ -419,7 +424,12 @@ def certify_polytope(
 
 
 def _certified_polytope(
-    plant: LinearPlant, K: np.ndarray, contract: ChannelContract | None, progress: Progress, rest: Rest
+    plant: LinearPlant,
+    K: np.ndarray,
+    contract: ChannelContract | None,
+    progress: Progress,
+    rest: Rest,
+    longest: float | None,
 ) -> Certificate:
     """Returns what `certify_polytope` does.
 
@@ -429,7 +439,7 @@ def _certified_polytope(
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     K, proofs = exact.rounded(K, _DIGITS, axis=1), _proofs(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
-    polytope = invariant_polytope(feedback, plant, progress)
+    polytope = invariant_polytope(feedback, plant, progress, longest)
     faces = polytope.F
     L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
     L = _in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
@@ -624,7 +634,7 @@ def _second_search(
     certificate = _with_closer_limits(plant, contract) if was_sought else None
     if certificate is None and polytope and (was_sought or infeasible.binding == "B"):
         progress("no ellipsoid: seeking the gain whose polytope bears most")
-        certificate = _polytope_alone(plant, contract, progress)
+        certificate = _polytope_alone(plant, contract, progress, min(LONGEST_SEARCH, clock.left))
     if certificate is not None:
         return certificate
     if was_sought or infeasible.binding in ("B", "E1"):
@@ -645,7 +655,10 @@ def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) ->
 
 
 def _polytope_alone(
-    plant: LinearPlant, contract: ChannelContract | None, progress: Progress = lambda line: None
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress = lambda line: None,
+    longest: float | None = None,
 ) -> Certificate | None:
     """Returns a verified certificate of a polytope for the gain that bears the largest radii; None if none is found.
 
@@ -659,7 +672,7 @@ def _polytope_alone(
         if gain is None or gain.margin < SUFFICIENT_MARGIN:
             return None
         _, K = problem.to_physical(np.eye(plant.n), gain.K)
-        found = certify_polytope(plant, K, contract, progress)
+        found = certify_polytope(plant, K, contract, progress, longest=longest)
     except Infeasible:
         return None
     except KeyboardInterrupt as interrupt:

@@ -71,12 +71,16 @@ class Clock:
     @property
     def is_over(self) -> bool:
         """Whether the time is over."""
-        return time.thread_time() > self._end
+        return self.left == 0.0
+
+    @property
+    def left(self) -> float:
+        """How much time is left [s]; 0.0 where none is."""
+        return max(self._end - time.thread_time(), 0.0)
 
     def part(self, count: int) -> Clock:
         """Returns a clock with this part of the time that is left, or twice the part of many."""
-        now = time.thread_time()
-        return Clock(now + (self._end - now) * min(2.0 / count, 1.0))
+        return Clock(time.thread_time() + self.left * min(2.0 / count, 1.0))
 
     def check(self, line: str = "") -> None:
         """Raises `TimeoutError` if the time is over; may be called as `progress`, with a line of text."""

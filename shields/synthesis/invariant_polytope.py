@@ -27,10 +27,13 @@ from shields.verification import ACTION_ROUNDING
 
 # The search takes at most so long [s], of its thread's own time: what else a machine does decides no certificate.
 LONGEST_SEARCH = 60.0
-# What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers.
-_MARGIN = 1e-6
-# A row counts as implied by others up to this: a thousandth of the margin.
-_IMPLIED = 1e-9
+# What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
+# and for what others imply only up to some part of it. Where the first makes too many rows, a larger one makes fewer.
+_MARGINS = (1e-6, 2e-5)
+# A row counts as implied by others up to this; next to the larger margin, up to this part of it.
+_IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
+# The search with the first margin ends after this part of the time.
+_FIRST_PART = 0.5
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
 # The ends of one row that are open.
@@ -108,24 +111,46 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
     return Faces(rows / half[:, None], low / half, high / half)
 
 
-def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
+def invariant_polytope(
+    feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object], longest: float | None = None
+) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
+
+    Where it would have too many rows, it is one that is nearly as large and has fewer.
 
     Args:
         feedback: The fallback.
         plant: Its plant.
         progress: Called with a line of text now and then.
+        longest: How long the search takes at most [s of the thread's time]; `LONGEST_SEARCH` by default.
 
     Raises:
-        Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
+        Infeasible: If there is none within `MOST_ROWS` rows and that time; the message says why.
     """
-    step = _ClosedLoop(feedback, plant)
-    faces = _faces_that_cut(step.first_faces(), step.predecessor, len(plant.box), progress)
-    extents = _extents(faces) if step.has_free_states else np.ones(plant.n)
+    fine, coarse = _MARGINS
+    now, longest = time.thread_time(), LONGEST_SEARCH if longest is None else longest
+    try:
+        return _polytope_of(_ClosedLoop(feedback, plant, fine), progress, _IMPLIED, now + _FIRST_PART * longest)
+    except _TooLarge as too_large:
+        progress(f"polytope: {too_large}; seeking a coarser one")
+        step, implied = _ClosedLoop(feedback, plant, coarse), _NEARLY_IMPLIED * coarse
+        try:
+            return _polytope_of(step, progress, implied, now + longest)
+        except _TooLarge:
+            raise
+        except Infeasible:  # a smaller margin would do, but for its rows
+            raise too_large from None
+
+
+def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float, deadline: float) -> Polytope:
+    """Returns what `invariant_polytope` does, of rows that cut by more than `implied`."""
+    kept = len(step.plant.box)
+    faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied, deadline)
+    extents = _extents(faces) if step.has_free_states else np.ones(step.plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
         step.widths = step.widths * extents
-        faces = _faces_that_cut(step.first_faces(), step.predecessor, len(plant.box), progress)
-    return _rounded(step, _faces_that_count(faces, len(plant.box), progress))
+        faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied, deadline)
+    return _rounded(step, _faces_that_count(faces, kept, progress, implied))
 
 
 def invariant_faces(
@@ -145,34 +170,47 @@ def invariant_faces(
     Raises:
         Infeasible: If there are none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds, or `predecessor` raises it.
     """
-    return _faces_that_count(_faces_that_cut(faces, predecessor, kept, progress), kept, progress)
+    deadline = time.thread_time() + LONGEST_SEARCH
+    faces = _faces_that_cut(faces, predecessor, kept, progress, _IMPLIED, deadline)
+    return _faces_that_count(faces, kept, progress, _IMPLIED)
 
 
 def _faces_that_cut(
-    faces: Faces, predecessor: Callable[[Faces], Faces], kept: int, progress: Callable[[str], object]
+    faces: Faces,
+    predecessor: Callable[[Faces], Faces],
+    kept: int,
+    progress: Callable[[str], object],
+    implied: float,
+    deadline: float,
 ) -> Faces:
-    """Returns the faces of `invariant_faces` with some that later ones imply."""
+    """Returns the faces of `invariant_faces` with some that later ones imply.
+
+    A row is added if it cuts off more than `implied`; the deadline is one of the thread's time [s].
+
+    Raises:
+        _TooLarge: If there are too many rows, or the deadline comes first.
+    """
     if kept > MOST_ROWS:
         raise _none(
             f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
         )
-    faces, _ = _without_implied(faces, kept)
-    deadline, following = time.thread_time() + LONGEST_SEARCH, 0
+    faces, _ = _without_implied(faces, kept, implied)
+    following = 0
     while following < len(faces.rows):
         row = faces.some(slice(following, following + 1))
-        if following < kept and not _cuts(faces.some(np.arange(len(faces.rows)) != following), row).any():
+        if following < kept and not _cuts(faces.some(np.arange(len(faces.rows)) != following), row, implied).any():
             following += 1
             continue
         if len(faces.rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
-            faces, following = _without_implied(faces, kept, following)
+            faces, following = _without_implied(faces, kept, implied, following)
             if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
                 raise _too_many()
         if time.thread_time() > deadline:
-            raise _none(f"its search took longer than {LONGEST_SEARCH:g} s, less with fewer states or longer steps")
+            raise _TooLarge("its search took longer than it may, less with fewer states or longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(faces.rows)} rows")
         row = predecessor(row)
-        low, high = _cuts(faces, row)
+        low, high = _cuts(faces, row, implied)
         if low or high:
             faces = faces.followed_by(
                 row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1])
@@ -181,10 +219,10 @@ def _faces_that_cut(
     return faces
 
 
-def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object]) -> Faces:
+def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object], implied: float) -> Faces:
     """Returns faces without those that others imply."""
     progress(f"polytope: which of {len(faces.rows)} rows count")
-    faces = _bounding_every_state(_without_implied(faces, kept)[0], kept)
+    faces = _bounding_every_state(_without_implied(faces, kept, implied)[0], kept)
     if len(faces.rows) > MOST_ROWS:
         raise _too_many()
     return faces
@@ -224,7 +262,7 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
         plant: Its plant.
         points: Of the box, shape (count, n).
     """
-    step, total = _ClosedLoop(feedback, plant), len(points)
+    step, total = _ClosedLoop(feedback, plant, _MARGINS[0]), len(points)
     if np.abs(np.linalg.eigvals(step.next)).max() >= 1.0:
         return 0.0
     points = (points - feedback.rest.state) / step.widths
@@ -286,8 +324,8 @@ def limits_within_step(feedback: Feedback, plant: LinearPlant) -> LimitsInClosed
 class _ClosedLoop:
     """What one step makes of rows, in units of the safe box and from the resting point."""
 
-    def __init__(self, feedback: Feedback, plant: LinearPlant) -> None:
-        self._plant, self._feedback = plant, feedback
+    def __init__(self, feedback: Feedback, plant: LinearPlant, margin: float) -> None:
+        self.plant, self._feedback, self._margin = plant, feedback, margin
         self._K, self._errors, self._D, self.rest = feedback
         self.widths = units_of_states(plant, self.rest)
         self.has_free_states = self.widths is not plant.half_widths
@@ -299,15 +337,15 @@ class _ClosedLoop:
         Raises:
             Infeasible: If errors of the estimate alone take an input beyond its limit, or the rest is not inside.
         """
-        plant, (x_c, u_c) = self._plant, self.rest
+        plant, (x_c, u_c) = self.plant, self.rest
         reached = plant.box @ x_c
         box = in_half_ranges(plant.box, plant.box_low - reached, plant.box_high - reached)
-        taken = plant.input_half * (float(ACTION_ROUNDING) + _MARGIN) + self._reach(self._K)
+        taken = plant.input_half * (float(ACTION_ROUNDING) + self._margin) + self._reach(self._K)
         low, high = plant.input_low - u_c + taken, plant.input_high - u_c - taken
         if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
         inputs, within = in_half_ranges(self._K, low, high), limits_within_step(self._feedback, plant)
-        low, high = within.low + _MARGIN, within.high - _MARGIN
+        low, high = within.low + self._margin, within.high - self._margin
         left = (low >= 0.0) | (high <= 0.0)
         if left[: len(left) - len(plant.mixed_rows)].any():
             raise _none("errors and disturbances alone leave the box between two samples; smaller bounds leave room")
@@ -326,9 +364,9 @@ class _ClosedLoop:
             Infeasible: If errors and disturbances alone leave a row.
         """
         physical = faces.rows / self.widths
-        pushed = physical @ self._plant.B
-        taken = _MARGIN + self._reach(pushed @ self._K) + np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
-        taken = taken + float(ACTION_ROUNDING) * (np.abs(pushed) @ self._plant.input_half)
+        pushed = physical @ self.plant.B
+        taken = self._margin + self._reach(pushed @ self._K) + np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
+        taken = taken + float(ACTION_ROUNDING) * (np.abs(pushed) @ self.plant.input_half)
         return in_half_ranges((physical @ self.next) * self.widths, faces.low + taken, faces.high - taken)
 
     def _reach(self, rows: np.ndarray) -> np.ndarray:
@@ -341,7 +379,7 @@ class _ClosedLoop:
 
         The rows of the box are those of the plant to the last bit, and so are their ends.
         """
-        plant, count = self._plant, len(self._plant.box)
+        plant, count = self.plant, len(self.plant.box)
         rows = exact.rounded(faces.rows, _DIGITS, axis=1) / self.widths
         reached = rows @ self.rest.state
         low, high = (
@@ -356,11 +394,11 @@ class _ClosedLoop:
 
         The first bound them from above, the second from below.
         """
-        rows, limits = faces.rows, self._plant.input_half
-        gains = slice(len(rows), len(rows) + self._plant.m)
+        rows, limits = faces.rows, self.plant.input_half
+        gains = slice(len(rows), len(rows) + self.plant.m)
         reached = rows @ self.rest.state
         own = Faces(rows * self.widths, faces.low - reached, faces.high - reached)
-        within = limits_within_step(self._feedback, self._plant).images
+        within = limits_within_step(self._feedback, self.plant).images
         images = np.concatenate([rows @ self.next, self._K / limits[:, None], within]) * self.widths
         found = np.array([[bound.multipliers for bound in _extremes(own, image)] for image in images])
         found[np.abs(found) < 1e-13] = 0.0
@@ -373,8 +411,15 @@ def _none(reason: str) -> Infeasible:
     return Infeasible(reason, "P", 0.0)
 
 
-def _too_many() -> Infeasible:
-    return _none(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
+class _TooLarge(Infeasible):
+    """There may be a polytope, but not within the limits of rows and time."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason, "P", 0.0)
+
+
+def _too_many() -> _TooLarge:
+    return _TooLarge(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
 
 
 class _Bound(NamedTuple):
@@ -419,23 +464,23 @@ def _extents(faces: Faces) -> np.ndarray:
     return np.where(np.isfinite(extents), extents, 1.0)
 
 
-def _cuts(faces: Faces, row: Faces) -> np.ndarray:
-    """Returns whether the low and the high end of one row cut anything off a polytope, shape (2,)."""
+def _cuts(faces: Faces, row: Faces, implied: float) -> np.ndarray:
+    """Returns whether the low and the high end of one row cut more than that off a polytope, shape (2,)."""
     least, largest = _extremes(faces, row.rows[0])
     low, high = float(row.low[0]), float(row.high[0])
     # An open end cuts nothing, even off what is unbounded.
-    cuts_low, cuts_high = low > -math.inf and least.value < low - _IMPLIED, largest.value > high + _IMPLIED
+    cuts_low, cuts_high = low > -math.inf and least.value < low - implied, largest.value > high + implied
     return np.array([cuts_low, high < math.inf and cuts_high])
 
 
-def _without_implied(faces: Faces, kept: int, count: int = 0) -> tuple[Faces, int]:
+def _without_implied(faces: Faces, kept: int, implied: float, count: int = 0) -> tuple[Faces, int]:
     """Returns faces without those that the others imply, and how many of the first `count` rows stay.
 
     The `kept` first stay as they are. Of a row that only cuts with one end the other one is opened.
     """
     for i in range(len(faces.rows) - 1, kept - 1, -1):
         others, row = faces.some(np.arange(len(faces.rows)) != i), faces.some(slice(i, i + 1))
-        low, high = _cuts(others, row)
+        low, high = _cuts(others, row, implied)
         if not (low or high):
             faces, count = others, count - (i < count)
         elif not (low and high):

@@ -22,7 +22,7 @@ from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
 from shields.synthesis import certification
 from shields.synthesis import invariant_polytope as search
-from shields.synthesis.certification import with_largest_polytope, with_polytope
+from shields.synthesis.certification import certify_polytope, with_largest_polytope, with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -266,6 +266,30 @@ def test_chain_of_three_masses_with_two_forces_certifies_within_a_minute():
     assert (plant.n, plant.m) == (6, 2)
     assert wide.provenance["polytope_share_of_box"] > 0.12 > 2.5 * wide.provenance["share_of_box"]
     assert verified(wide, plant).valid
+
+
+def slow_plant():
+    """Time constants of 60, 2 and .05 s at steps of .1 s; the limits have two different ends."""
+    return LinearPlant(
+        A=[[0.9982, -0.0004, 0.0024], [0.0475, 0.9645, -0.2049], [0.2070, -0.1415, 0.1174]],
+        B=0.01 * np.ones((3, 1)),
+        state_limits=([-0.9, -0.8, -1.1], [1.1, 1.2, 0.9]),
+        u_max=1.0,
+        dt=0.1,
+        disturbance_bound=4.5e-4,
+        sensor_bound=1e-3,
+        initial_bound=1e-3,
+    )
+
+
+def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(monkeypatch):
+    plant, lines = slow_plant(), []
+    monkeypatch.setattr(search, "MOST_ROWS", 40)
+    found = certify_polytope(plant, np.zeros((1, 3)), progress=lines.append)
+    assert any("more than 40 rows" in line and line.endswith("seeking a coarser one") for line in lines)
+    assert len(found.polytope.rows) <= 40
+    assert verified(found, plant).valid
+    assert found.provenance["polytope_share_of_box"] == pytest.approx(0.959, abs=0.002)
 
 
 @pytest.mark.slow
