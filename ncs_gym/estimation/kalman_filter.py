@@ -20,6 +20,9 @@ from ncs_gym.uncertainty.shape_matrices import is_inside
 LARGEST_COVARIANCE = 1e12
 # Factors of covariances keep this many bits, so that covariances recur when an arrival history does.
 COVARIANCE_BITS = 6
+# Deviations are no smaller than this share of what the certified set allows: those of a state that nothing disturbs
+# would become smaller for ever, and would not recur.
+SMALLEST_DEVIATION = 2.0**-10
 
 
 def predicted_covariance(P: np.ndarray, A: np.ndarray, Q: np.ndarray) -> np.ndarray:
@@ -90,6 +93,7 @@ class ErrorRecursion:
         if first is None:
             first = ErrorStatistics(plant.kalman_covariances[2], plant.initial_error.shape_matrix, 0)
         self.first = first
+        self._smallest = SMALLEST_DEVIATION * np.sqrt(np.diag(error_set.shape_at(0)))
 
     def coarser(self) -> ErrorRecursion:
         """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
@@ -106,7 +110,7 @@ class ErrorRecursion:
         grown = predicted_covariance(covariance, self.plant.A, self.Q)
         if np.vdot(self.plant.weight, grown) < LARGEST_COVARIANCE:
             covariance = grown
-        return ErrorStatistics(_rounded(covariance, self._bits), self.sets.predicted(shape, age), age + 1)
+        return ErrorStatistics(_rounded(covariance, self._bits, self._smallest), self.sets.predicted(shape, age), age + 1)
 
     def updated(self, statistics: ErrorStatistics) -> tuple[np.ndarray, ErrorStatistics] | None:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
@@ -149,17 +153,26 @@ class ErrorRecursion:
             return None
         if not (isfinite(gain.sum()) and isfinite(covariance.sum())):
             return None
-        return gain, _rounded(covariance, self._bits)
+        return gain, _rounded(covariance, self._bits, self._smallest)
 
 
-def _rounded(covariance: np.ndarray, bits: int) -> np.ndarray:
-    """Returns a covariance whose Cholesky factor has some bits only, relative to powers of two near the deviations."""
+def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndarray:
+    """Returns a covariance whose Cholesky factor has some bits only, relative to powers of two near the deviations.
+
+    Deviations are at least the `smallest`, shape (n,), but of states that are known exactly: those stay known.
+    """
+    if not covariance.diagonal().all():
+        uncertain = np.flatnonzero(covariance.diagonal())
+        among, rounded = np.ix_(uncertain, uncertain), np.zeros_like(covariance)
+        rounded[among] = _rounded(covariance[among], bits, smallest[uncertain])
+        return rounded
     try:
         factor = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         return covariance
     steps = np.array([[2.0 ** (ceil(0.5 * log2(variance)) - bits)] for variance in covariance.diagonal().tolist()])
     factor = steps * np.rint(factor / steps)
+    np.fill_diagonal(factor, np.maximum(factor.diagonal(), smallest))
     return factor.dot(factor.T)
 
 
