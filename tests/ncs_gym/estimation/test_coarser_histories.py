@@ -67,6 +67,54 @@ def test_coarse_graph_stays_coarse_where_it_begins_anew_and_where_it_is_full_aga
     assert histories.recursion.coarser() is histories.recursion
 
 
+def spring(**changes):
+    """A mass on a spring, position and speed measured; both are disturbed."""
+    given = {"state_limits": ([-2.0, -2.0], [2.0, 2.0]), "input_limits": ([-1.0], [1.0]), "disturbance_bound": 0.01}
+    model = [[0.0, 1.0], [-1.0, -0.7]], [[0.0], [1.0]], np.eye(2), 0
+    return LinearPlant.from_statespace(model, 0.1, sensor_bound=0.01, initial_bound=0.01, **(given | changes))
+
+
+# What is known exactly: inputs under way, past inputs; what soon is known nearly so: the speed of who drives ahead.
+KNOWN = {
+    "input delay": (spring(input_delay=2), None, [2, 3]),
+    "rate limit": (spring().with_rate_limits(0.2), None, [2]),
+    "undisturbed state": (
+        LinearPlant(
+            A=[[1.0, -0.085], [0.0, 0.7165]],
+            B=[[0.1], [0.0]],
+            box=np.eye(2),
+            u_max=1.0,
+            dt=0.1,
+            disturbance_bound=[0.01, 0.0],
+            sensor_bound=0.01,
+            initial_bound=0.01,
+        ),
+        ChannelContract(8),
+        [],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", KNOWN)
+def test_histories_recur_where_states_are_known_exactly_or_become_so(case):
+    """They did not: each prediction gave such a plant a covariance of its own, and every step a new history."""
+    plant, contract, exactly = KNOWN[case]
+    histories = histories_of(plant, Channel(delay=1), certified_error_set(plant, contract))
+    estimator, rng, arrived = VectorEstimator(plant, histories, 64), np.random.default_rng(0), np.zeros(64, np.bool_)
+    counts = []
+    for _ in range(200):
+        samples, arrives = np.zeros((plant.p, 64)), rng.random(64) < 0.7
+        estimator.advance(np.zeros((plant.m, 64)), samples, [(1, arrived)])
+        arrived = arrives
+        counts.append(len(histories))
+    assert counts[-1] < 2_500
+    assert counts[-1] - counts[100] < 0.15 * counts[-1]
+    for number in np.unique(estimator.statistics):
+        covariance = histories.table.statistics(number).covariance
+        assert not covariance[exactly].any()
+        assert np.linalg.eigvalsh(np.delete(np.delete(covariance, exactly, 0), exactly, 1))[0] > 0.0
+
+
 @pytest.mark.parametrize("step", [SHAPE_STEP, 2.0**-9, COARSEST_STEP])
 def test_rounded_shape_holds_the_shape_and_is_not_much_larger(step):
     rng, sets = np.random.default_rng(1), SetMembership(PLANT, 0.0, SETS, shape_step=step)
