@@ -22,7 +22,7 @@ def largest_share(plant: LinearPlant) -> float | None:
     points = points_of_box(plant, _POINTS_LOG2)
     if points is None:
         return None
-    n, m = plant.n, plant.m
+    n = plant.n
     # Of u_0, ..., u_(N-1), x_1, ..., x_N: x_(k+1) - A x_k - B u_k is A x_0 in the first step and 0 in the others.
     pushed = sparse.kron(sparse.eye(_STEPS), -plant.B)
     moved = sparse.eye(n * _STEPS) - sparse.kron(sparse.eye(_STEPS, k=-1), plant.A)

@@ -20,9 +20,6 @@ from ncs_gym.uncertainty.shape_matrices import is_inside
 LARGEST_COVARIANCE = 1e12
 # Factors of covariances keep this many bits, so that covariances recur when an arrival history does.
 COVARIANCE_BITS = 6
-# Deviations are no smaller than this share of what the certified set allows: those of a state that nothing disturbs
-# would become smaller for ever, and would not recur.
-SMALLEST_DEVIATION = 2.0**-10
 
 
 def predicted_covariance(P: np.ndarray, A: np.ndarray, Q: np.ndarray) -> np.ndarray:
@@ -93,7 +90,8 @@ class ErrorRecursion:
         if first is None:
             first = ErrorStatistics(plant.kalman_covariances[2], plant.initial_error.shape_matrix, 0)
         self.first = first
-        self._smallest = SMALLEST_DEVIATION * np.sqrt(np.diag(error_set.shape_at(0)))
+        # Deviations of a state that nothing disturbs would become smaller for ever, and covariances would not recur.
+        self._smallest = 4.0**-covariance_bits * np.sqrt(np.diag(error_set.shape_at(0)))
 
     def coarser(self) -> ErrorRecursion:
         """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
@@ -110,7 +108,7 @@ class ErrorRecursion:
         grown = predicted_covariance(covariance, self.plant.A, self.Q)
         if np.vdot(self.plant.weight, grown) < LARGEST_COVARIANCE:
             covariance = grown
-        return ErrorStatistics(_rounded(covariance, self._bits, self._smallest), self.sets.predicted(shape, age), age + 1)
+        return ErrorStatistics(self._rounded(covariance), self.sets.predicted(shape, age), age + 1)
 
     def updated(self, statistics: ErrorStatistics) -> tuple[np.ndarray, ErrorStatistics] | None:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
@@ -153,7 +151,10 @@ class ErrorRecursion:
             return None
         if not (isfinite(gain.sum()) and isfinite(covariance.sum())):
             return None
-        return gain, _rounded(covariance, self._bits, self._smallest)
+        return gain, self._rounded(covariance)
+
+    def _rounded(self, covariance: np.ndarray) -> np.ndarray:
+        return _rounded(covariance, self._bits, self._smallest)
 
 
 def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndarray:
