@@ -91,7 +91,7 @@ class ErrorRecursion:
             first = ErrorStatistics(plant.kalman_covariances[2], plant.initial_error.shape_matrix, 0)
         self.first = first
         # Deviations of a state that nothing disturbs would become smaller for ever, and covariances would not recur.
-        self._smallest = 4.0**-covariance_bits * np.sqrt(np.diag(error_set.shape_at(0)))
+        self._smallest = 2.0 ** -(covariance_bits + 4) * np.sqrt(np.diag(error_set.shape_at(0)))
 
     def coarser(self) -> ErrorRecursion:
         """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
