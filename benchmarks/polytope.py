@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments.baselines import controller
 from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
-from shields.synthesis.certification import with_largest_polytope, with_polytope
+from shields.synthesis.polytope_certificates import with_largest_polytope, with_polytope
 
 T = TypeVar("T")
 IDS = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum")

@@ -6,7 +6,8 @@ enlarges the set, and the result is verified exactly. `certify` proves a given s
 which networks leave a plant certifiable. Importing this package imports the solver.
 """
 
-from shields.synthesis.certification import certify, synthesize
+from shields.synthesis.certification import synthesize
+from shields.synthesis.ellipsoid_certificates import certify
 from shields.synthesis.network_requirements import Network, Requirement, Requirements, requirements
 
 __all__ = [

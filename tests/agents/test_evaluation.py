@@ -7,7 +7,7 @@ from gymnasium.vector import VectorWrapper
 
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
-from shields.synthesis.certification import with_polytope
+from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")

@@ -23,7 +23,7 @@ from shields.json_documents import document_of
 from shields.paper import synthesize as paper_synthesis
 from shields.paper.algorithm import kappa_rho_grid, search_grid
 from shields.paper.bounds import covariance_bound, safety_margin, state_error_bound, uplink_error_bound
-from shields.synthesis.certification import certify
+from shields.synthesis.ellipsoid_certificates import certify
 from tests.certificates import certificate_of
 from tests.plants import named, servo, small
 

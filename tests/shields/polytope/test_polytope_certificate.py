@@ -20,9 +20,9 @@ from ncs_gym.registration import CART_POLE_CHANNEL
 from shields import Certificate, VectorSafetyShield, synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
-from shields.synthesis import certification
 from shields.synthesis import invariant_polytope as search
-from shields.synthesis.certification import certify_polytope, with_largest_polytope, with_polytope
+from shields.synthesis import polytope_certificates
+from shields.synthesis.polytope_certificates import certify_polytope, with_largest_polytope, with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -120,7 +120,7 @@ def test_search_for_a_gain_that_fails_keeps_the_polytope_of_the_first_gain(monke
     def failing(*_, **__):
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(certification, "certify_polytope", failing)
+    monkeypatch.setattr(polytope_certificates, "certify_polytope", failing)
     assert with_largest_polytope(certificate, plant) == wide
     with pytest.raises(ValueError, match="search_gain"):
         synthesize(plant, search_gain="no")

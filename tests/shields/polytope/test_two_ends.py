@@ -571,7 +571,7 @@ def test_candidate_of_another_plant_is_carried_over_and_never_returned_as_it_is(
     tighter = replace(ANGLE, disturbance_bound=Ellipsoid(1.5 * ANGLE.disturbance_bound.shape_matrix))
     candidate = certificate_of(tighter, CONTRACT, "polytope")
     assert verify(candidate, tighter).valid
-    with mock.patch("shields.synthesis.certification._gains_around", return_value=()):
+    with mock.patch("shields.synthesis.polytope_certificates.gains_around", return_value=()):
         found = synthesize(ANGLE, contract=CONTRACT, candidates=[candidate])
     assert found.fingerprint == ANGLE.fingerprint
     assert verify(found, ANGLE).valid

@@ -19,7 +19,7 @@ from ncs_gym.network import downlink_protocol
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
-from shields.synthesis.certification import with_polytope
+from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 
 KEEPING = ("project", "switch", "boundary", "lookahead")

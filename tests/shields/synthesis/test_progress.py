@@ -53,7 +53,7 @@ def test_synthesis_interrupted_before_it_has_a_set_has_no_certificate(loaded, mo
 
 
 def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
-    finished = "shields.synthesis.certification.with_best_gain"
+    finished = "shields.synthesis.ellipsoid_certificates.with_best_gain"
     monkeypatch.setattr(finished, lambda problem, design: replace(design, L=3.0 * design.L))
     with pytest.raises(SynthesisInterrupted, match="had no certificate yet") as caught:
         synthesize(loaded, progress=interrupting_at("alternation 1"))

@@ -1,0 +1,130 @@
+"""Certificates of sets and gains that are found, not yet verified: proofs, assumptions, and how they were made."""
+
+from __future__ import annotations
+
+import math
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import ErrorSet, LinearPlant, exact
+from ncs_gym.plants.linear_plant import inflated
+from shields.certificate import Certificate, Proof, Updates
+from shields.synthesis.design_problem import CandidateDesign, DesignProblem
+from shields.synthesis.multipliers import with_best_multipliers
+from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
+from shields.synthesis.share_of_box import share_of_box
+
+# Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
+# that are for people have fewer.
+DIGITS, _SHOWN_DIGITS = 12, 6
+
+
+def certificate_of(
+    plant: LinearPlant, problem: DesignProblem, design: CandidateDesign, errors: ErrorSet, slack: float
+) -> Certificate:
+    """Returns the certificate of a design, not yet verified."""
+    L, K = problem.to_physical(design.L, design.K)
+    L, K = shape_in_digits(L), exact.rounded(K, DIGITS, axis=1)
+    volume = float(np.exp(0.5 * design.log_det)) * _share_of_ellipsoid(plant, problem)
+    return Certificate(
+        L=L,
+        K=K,
+        proofs=proofs_of(errors, problem, design),
+        **fields_of_problem(plant, problem, errors),
+        provenance=provenance_of(plant, L, volume) | {"slack": slack},
+    )
+
+
+def proofs_of(
+    errors: ErrorSet, problem: DesignProblem | None = None, design: CandidateDesign | None = None
+) -> tuple[Proof, ...]:
+    """Returns a proof per error set, with the multipliers of an ellipsoid that suit it best if a design is given."""
+    if errors.ages is None:
+        sets, designs = [(errors.Sigma, errors.rate)], [design]
+    else:
+        sets = list(zip(errors.ages.shapes[:-1], errors.ages.rates.tolist(), strict=True))
+        designs = [None] * len(sets)
+        if problem is not None and design is not None:
+            designs = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
+    return tuple(
+        Proof(Sigma=Sigma, rate=rate)
+        if each is None
+        else Proof(Sigma=Sigma, rate=rate, shares=_rounded_down(each.multipliers), inputs=each.inputs)
+        for (Sigma, rate), each in zip(sets, designs, strict=True)
+    )
+
+
+def _updates(errors: ErrorSet) -> Updates | None:
+    """Returns what a channel contract adds to the proofs; None without one."""
+    sets = errors.ages
+    if sets is None:
+        return None
+    return Updates(
+        contract=sets.contract, last=sets.shapes[-1], gains=sets.gains, shares=sets.multipliers, noise=sets.noise
+    )
+
+
+def fields_of_problem(plant: LinearPlant, problem: DesignProblem, errors: ErrorSet) -> dict[str, Any]:
+    """Returns the fields of a certificate that set and gain have no part in."""
+    return {
+        "D": inflated(plant.disturbance.shape_matrix),
+        "rounding": problem.rounding,
+        "updates": _updates(errors),
+        "between_samples": plant.between_samples,
+        "fingerprint": plant.fingerprint,
+    }
+
+
+def provenance_of(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:
+    """Returns how a certificate was made, and `_description` of its ellipsoid."""
+    solver = f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}"
+    return {"source": "docs/shield_proof.md", "solver": solver} | _description(plant, L, volume)
+
+
+def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:
+    """Returns what a reader of the certificate wants to know about its set and its plant.
+
+    Args:
+        plant: The plant.
+        L: Shape of the set, (n, n).
+        volume: Volume of the set in units of the largest ellipsoid in the safe box.
+    """
+    sizes = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
+    sizes = {name: size for name, size in sizes.items() if not (isinstance(size, float) and math.isnan(size))}
+    description: dict[str, Any] = {
+        name: float(exact.rounded(size, _SHOWN_DIGITS)) if isinstance(size, float) else size
+        for name, size in sizes.items()
+    }
+    assumptions = getattr(plant, "assumptions", ())
+    if assumptions:
+        description["assumptions"] = [assumptions] if isinstance(assumptions, str) else list(assumptions)
+    return description
+
+
+def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
+    """Returns the volume of an ellipsoid in units of the largest one in the safe box; NaN where that is unbounded."""
+    if np.linalg.matrix_rank(plant.box) < plant.n:
+        return math.nan
+    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box), L)) ** 0.5)
+
+
+def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
+    """Returns the volume of the largest ellipsoid in the box that a set was sought in; that of the plant's box is 1."""
+    if plant.grid_rows is None:
+        return 1.0
+    own = np.linalg.cholesky(largest_box_ellipsoid(plant.box_rows))
+    return float(np.exp(np.log(np.diag(problem.transform)).sum() - np.log(np.diag(own)).sum()))
+
+
+def shape_in_digits(L: np.ndarray) -> np.ndarray:
+    """Returns a shape, (n, n), with entries of few digits."""
+    extents = np.array([float(exact.rounded(extent, 1)) for extent in np.sqrt(np.diag(L))])
+    units = np.outer(extents, extents)
+    return np.round(L / units, DIGITS) * units
+
+
+def _rounded_down(multipliers: tuple[float, float, float]) -> np.ndarray:
+    """Returns multipliers of few digits, so much smaller that rounding cannot lift lx + le + ld above 1."""
+    return np.array([float(exact.rounded((1.0 - 1e-11) * each, DIGITS)) for each in multipliers])

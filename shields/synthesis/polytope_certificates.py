@@ -1,0 +1,334 @@
+"""Certificates of polytopes: for a certificate's own gain, a given one, or around a resting point that is sought."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import ErrorSet, LinearPlant, exact
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.linear_plant import inflated
+from ncs_gym.uncertainty.shape_matrices import outer_sum
+from shields.certificate import Certificate
+from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
+from shields.synthesis.alternating_optimization import largest_set, with_best_gain
+from shields.synthesis.certificate_fields import (
+    DIGITS,
+    fields_of_problem,
+    proofs_of,
+    provenance_of,
+    shape_in_digits,
+    volume_of,
+)
+from shields.synthesis.design_problem import CandidateDesign, DesignProblem, Rest, design_problem
+from shields.synthesis.diagnosis import Clock, infeasibility_around
+from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, SLACKS, Progress, progress_text
+from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
+from shields.synthesis.invariant_polytope import (
+    LONGEST_SEARCH,
+    Feedback,
+    feedback_of,
+    invariant_polytope,
+    points_of_box,
+    share_in_polytope,
+    share_of_points,
+)
+from shields.synthesis.max_margin_gain import max_margin_gain
+from shields.synthesis.polytope_gain import gains_of_larger_polytopes, most_tolerant_gain, needs_of, regulators
+from shields.synthesis.resting_point import (
+    Farthest,
+    at_operating_point,
+    farthest_equilibrium,
+    farthest_from_limits,
+    improved,
+    limits_around,
+)
+from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
+from shields.verification import verify
+
+# The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by.
+_INSIDE = 1.0 - 1e-9
+# Points of the box by which resting points are compared.
+_POINTS_OF_REST_LOG2 = 12
+# What an equilibrium lacks is computed with an error of at most this, relative to its terms.
+_OF_REST = 1e-14
+# What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
+_NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
+# What a certificate records that does not depend on its gain.
+_OF_THE_PLANT = ("tolerated_scale",)
+
+
+def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
+    """Returns a verified certificate with the largest polytope that its gain keeps in the box.
+
+    One that keeps a polytope alone is returned as it is. Without a polytope if none is found; its provenance, and so
+    the printed certificate, says why.
+
+    Args:
+        certificate: A verified one.
+        plant: Its plant.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt with the certificate as it was.
+    """
+    if not certificate.keeps_ellipsoid:
+        return certificate
+    try:
+        polytope = invariant_polytope(feedback_of(certificate), plant, progress)
+        return _verified_polytope(replace(certificate, polytope=polytope), plant, progress)
+    except Infeasible as none:
+        reason = str(none)
+    except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
+        reason = f"its numbers are out of reach of float64 ({error}): {MORE_DIGITS}"
+    except KeyboardInterrupt as interrupt:
+        message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
+        raise SynthesisInterrupted(message, certificate) from interrupt
+    return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
+
+
+def with_largest_polytope(
+    certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None
+) -> Certificate:
+    """Returns what `with_polytope` does, with the gain whose polytope is the largest that a search finds.
+
+    Another gain than the certificate's keeps the polytope alone; what the certificate's own would have kept is in the
+    provenance.
+
+    Args:
+        certificate: A verified one.
+        plant: Its plant.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt with the certificate, and its own gain's polytope if that was found.
+    """
+    own = with_polytope(certificate, plant, progress)
+    try:
+        for K in gains_of_larger_polytopes(feedback_of(certificate), plant, progress):
+            found = certify_polytope(plant, K, certificate.contract, progress)
+            if found is not None and polytope_share(found) > polytope_share(own):
+                kept = {name: certificate.provenance[name] for name in _OF_THE_PLANT if name in certificate.provenance}
+                gained = {"share_with_gain_of_ellipsoid": polytope_share(own)} if own.keeps_ellipsoid else {}
+                return replace(found, provenance=found.provenance | kept | gained)
+    except KeyboardInterrupt as interrupt:
+        message = "interrupted while a gain with a larger polytope was sought; the certificate has the first gain's"
+        raise SynthesisInterrupted(message, own) from interrupt
+    except (ArithmeticError, ValueError, CertificateError):  # a gain whose numbers are out of reach of float64
+        pass
+    return own
+
+
+def certify_polytope(
+    plant: LinearPlant,
+    K: np.ndarray,
+    contract: ChannelContract | None = None,
+    progress: Progress = lambda line: None,
+    rest: Rest | None = None,
+    longest: float | None = None,
+) -> Certificate | None:
+    """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
+
+    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it.
+
+    Args:
+        plant: The plant with its bounds.
+        K: Gain, shape (m, n) [input per state].
+        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
+        progress: Called with a line of text now and then.
+        rest: The point around which it is sought; the operating point by default.
+        longest: How long the polytope is sought at most [s], as in `invariant_polytope`.
+
+    Raises:
+        Infeasible: If the plant has no error set or its safe box is unbounded.
+    """
+    try:
+        rest = at_operating_point(plant) if rest is None else rest
+        return _certified_polytope(plant, K, contract, progress, rest, longest)
+    except _NOT_CERTIFIED as failure:
+        if isinstance(failure, Infeasible) and failure.binding != "P":
+            raise
+        return None
+
+
+def _certified_polytope(
+    plant: LinearPlant,
+    K: np.ndarray,
+    contract: ChannelContract | None,
+    progress: Progress,
+    rest: Rest,
+    longest: float | None,
+) -> Certificate:
+    """Returns what `certify_polytope` does.
+
+    Raises:
+        Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
+    """
+    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    K, proofs = exact.rounded(K, DIGITS, axis=1), proofs_of(errors)
+    feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
+    polytope = invariant_polytope(feedback, plant, progress, longest)
+    faces = polytope.F
+    L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
+    L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
+    others: dict[str, Any] = fields_of_problem(plant, problem, errors) | {"D": feedback.D}
+    others |= {"resting_state": rest.state, "resting_input": rest.input}
+    provenance = provenance_of(plant, L, volume_of(plant, L))
+    certificate = Certificate(L=L, K=K, proofs=proofs, polytope=polytope, provenance=provenance, **others)
+    return _verified_polytope(certificate, plant, progress)
+
+
+def most_tolerant_polytope(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress = lambda line: None,
+    longest: float | None = None,
+) -> Certificate | None:
+    """Returns a verified certificate of a polytope for the gain that bears the largest radii; None if none is found.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt.
+    """
+    try:
+        problem, _ = design_problem(plant, contract)
+        start = max_margin_gain(problem, problem.covering_error_shape)
+        gain = start and most_tolerant_gain(problem, start)
+        if gain is None or gain.margin < SUFFICIENT_MARGIN:
+            return None
+        _, K = problem.to_physical(np.eye(plant.n), gain.K)
+        found = certify_polytope(plant, K, contract, progress, longest=longest)
+    except Infeasible:
+        return None
+    except KeyboardInterrupt as interrupt:
+        message = "interrupted while a polytope was sought, and had no certificate yet"
+        raise SynthesisInterrupted(message) from interrupt
+    record = {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
+    return found and replace(found, provenance=found.provenance | record)
+
+
+def around_resting_point(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    known: Sequence[Certificate],
+    clock: Clock,
+    fixed: Rest | None = None,
+    *,
+    search_gain: bool,
+) -> Certificate:
+    """Returns a verified certificate of a polytope for limits that are not symmetric about the operating point.
+
+    The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
+    fixed one; where the share of the box is known, a better resting point then, and with `search_gain` a better gain.
+    Once the clock has run out, no further gain is tried.
+
+    Raises:
+        Infeasible: If none is found.
+    """
+    progress("resting point")
+    if fixed is not None:
+        known = [each for each in known if np.array_equal(each.resting_state, fixed.state)]
+    rest = fixed or farthest_from_limits(plant)
+    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    shapes = np.array([proof.Sigma for proof in proofs_of(errors)])
+    points = points_of_box(plant, _POINTS_OF_REST_LOG2)
+
+    def feedback(K: np.ndarray, at: Rest) -> Feedback:
+        return Feedback(K, shapes, _disturbance_around(plant, at), at)
+
+    gains = gains_around(plant, problem, progress)
+    suited = [(K, Farthest(rest, 1.0, np.empty(0, int)) if fixed else rest_for(K, plant, errors, rest)) for K in gains]
+    tried = [feedback(K, at.rest) for K, at in sorted(suited, key=lambda pair: pair[1].distance < 1.0)]
+    if points is not None and tried:
+        shares = [share_of_points(each, plant, points) for each in tried]
+        tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
+        K, first = tried[0].K, tried[0].rest
+        progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
+        better = tried[0]
+        if not fixed:
+            better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
+        larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
+        tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
+    reasons = []
+    for each in tried:
+        try:
+            longest = min(LONGEST_SEARCH, clock.left)
+            found = _certified_polytope(plant, each.K, contract, progress, each.rest, longest)
+            return max([found, *known], key=polytope_share)
+        except _NOT_CERTIFIED as failure:
+            reasons.append(str(failure))
+        if clock.is_over:
+            break
+    if known:
+        return max(known, key=polytope_share)
+    reason = reasons[0] if reasons else "no gain was found"
+    raise Infeasible(reason, "P", 0.0) if fixed else infeasibility_around(plant, contract, reason)
+
+
+def gains_around(
+    plant: LinearPlant, problem: DesignProblem, progress: Progress, *, quick: bool = False
+) -> Iterator[np.ndarray]:
+    """Yields gains, shape (m, n), for symmetric limits around a point.
+
+    Those of the largest ellipsoid, which takes longest and is left out if `quick`, of the largest tolerated radii, and
+    of regulators.
+    """
+
+    def report(stage: str, design: CandidateDesign | None) -> None:
+        progress(progress_text(stage, design))
+
+    found = None if quick else largest_set(problem, SLACKS[0], report)
+    if found is not None:
+        yield problem.to_physical(found.L, with_best_gain(problem, found).K)[1]
+    progress("gain that tolerates most")
+    start = max_margin_gain(problem, problem.covering_error_shape)
+    if start is not None:
+        yield problem.to_physical(start.L, start.K)[1]
+        yield problem.to_physical(start.L, most_tolerant_gain(problem, start).K)[1]
+    yield from regulators(plant)
+
+
+def rest_for(K: np.ndarray, plant: LinearPlant, errors: ErrorSet, rest: Rest) -> Farthest:
+    """Returns the resting point that suits a gain, shape (m, n): where the limits leave most of what it needs.
+
+    What the gain needs is there if the nearest limit is 1 away; where that is not known, it is said to be.
+    """
+    shapes = np.array([proof.Sigma for proof in proofs_of(errors)])
+    needs = needs_of(Feedback(K, shapes, _disturbance_around(plant, rest), rest), plant)
+    return Farthest(rest, 1.0, np.empty(0, int)) if needs is None else farthest_equilibrium(plant, needs)
+
+
+def _disturbance_around(plant: LinearPlant, rest: Rest) -> np.ndarray:
+    """Returns D with what a resting point lacks of an equilibrium, shape (n, n)."""
+    missing = plant.A @ rest.state + plant.B @ rest.input - rest.state
+    D = plant.disturbance.shape_matrix
+    if missing.any():
+        missing = np.abs(missing) + _OF_REST * (np.abs(plant.A) @ np.abs(rest.state) + np.abs(rest.state))
+        D = outer_sum(D, plant.n * np.diag(missing**2), plant.relative_weight)
+    return inflated(D)
+
+
+def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress) -> Certificate:
+    """Returns a certificate with a polytope, verified, with the polytope's size.
+
+    Raises:
+        Infeasible: If it does not verify.
+    """
+    assert certificate.polytope is not None
+    progress(f"exact verification: a polytope of {len(certificate.polytope.rows)} rows")
+    report = verify(certificate, plant)
+    if not report.valid:
+        failed = next(condition for condition in report.conditions if not condition.holds)
+        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {MORE_DIGITS}"
+        raise Infeasible(reason, "P", -failed.margin)
+    share = share_in_polytope(certificate.polytope, plant)
+    size = {} if share is None else {"polytope_share_of_box": float(exact.rounded(share, 3))}
+    return replace(certificate, provenance=certificate.provenance | size)
+
+
+def polytope_share(certificate: Certificate) -> float:
+    """Returns the share of the safe box that a certificate's polytope fills, as far as it is known; 0.0 otherwise."""
+    return certificate.provenance.get("polytope_share_of_box", 0.0)
