@@ -14,6 +14,8 @@ from ncs_gym.tasks.base_task import Task
 EFFORTS = tuple(10.0**power for power in (-4, -3, -2, -1, 0))
 # Weights of the safe box beside that of the task's own error.
 BOX_WEIGHTS = (1e-2, 1e-1, 1.0)
+# The target that a controller follows is the present one, or one of those that the task shows ahead.
+TARGETS_AHEAD = (0, 1, 2, 4, 8)
 PROPORTIONAL_GAINS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)
 
 
@@ -75,13 +77,16 @@ def setpoint(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _setpoint_regulators(plant: LinearPlant, task: SetpointTracking) -> list[LinearController]:
     state, held = setpoint(plant, task.output)
-    found = []
+    found, entries = [], len(task.observation_bound(plant, 1))
     for effort in EFFORTS:
         for weight in BOX_WEIGHTS:
             Q = np.outer(task.output, task.output) / task.width**2 + weight * plant.box_rows.T @ plant.box_rows
             gain = regulator(plant.A, plant.B, Q, effort * np.diag(1.0 / plant.u_max**2))
-            feed = (held - gain @ state)[:, None]
-            found.append(LinearController(f"LQR, effort {effort:g}, box {weight:g}", gain, feed))
+            for ahead in [each for each in TARGETS_AHEAD if each <= task.preview]:
+                feed = np.zeros((plant.m, entries))
+                feed[:, ahead] = held - gain @ state
+                name = f"LQR, effort {effort:g}, box {weight:g}, target {ahead} steps ahead"
+                found.append(LinearController(name, gain, feed))
     return found
 
 

@@ -32,6 +32,8 @@ LONGEST_SEARCH = 60.0
 _MARGINS = (1e-6, 2e-5)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
+# In the details of an `Infeasible`: it is the limits of rows and time that end the search.
+_TOO_LARGE = "too_large"
 # The search with the first margin ends after this part of the time.
 _FIRST_PART = 0.5
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
@@ -131,15 +133,17 @@ def invariant_polytope(
     now, longest = time.thread_time(), LONGEST_SEARCH if longest is None else longest
     try:
         return _polytope_of(_ClosedLoop(feedback, plant, fine), progress, _IMPLIED, now + _FIRST_PART * longest)
-    except _TooLarge as too_large:
+    except Infeasible as too_large:
+        if _TOO_LARGE not in too_large.details:
+            raise
         progress(f"polytope: {too_large}; seeking a coarser one")
         step, implied = _ClosedLoop(feedback, plant, coarse), _NEARLY_IMPLIED * coarse
         try:
             return _polytope_of(step, progress, implied, now + longest)
-        except _TooLarge:
-            raise
-        except Infeasible:  # a smaller margin would do, but for its rows
-            raise too_large from None
+        except Infeasible as infeasible:
+            if _TOO_LARGE in infeasible.details:
+                raise
+            raise too_large from None  # a smaller margin would do, but for its rows
 
 
 def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float, deadline: float) -> Polytope:
@@ -188,7 +192,7 @@ def _faces_that_cut(
     A row is added if it cuts off more than `implied`; the deadline is one of the thread's time [s].
 
     Raises:
-        _TooLarge: If there are too many rows, or the deadline comes first.
+        Infeasible: If there are too many rows, or the deadline comes first.
     """
     if kept > MOST_ROWS:
         raise _none(
@@ -206,7 +210,7 @@ def _faces_that_cut(
             if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
                 raise _too_many()
         if time.thread_time() > deadline:
-            raise _TooLarge("its search took longer than it may, less with fewer states or longer steps")
+            raise _too_large("its search took longer than it may, less with fewer states or longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(faces.rows)} rows")
         row = predecessor(row)
@@ -411,15 +415,13 @@ def _none(reason: str) -> Infeasible:
     return Infeasible(reason, "P", 0.0)
 
 
-class _TooLarge(Infeasible):
+def _too_large(reason: str) -> Infeasible:
     """There may be a polytope, but not within the limits of rows and time."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason, "P", 0.0)
+    return Infeasible(reason, "P", 0.0, {_TOO_LARGE: 1.0})
 
 
-def _too_many() -> _TooLarge:
-    return _TooLarge(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
+def _too_many() -> Infeasible:
+    return _too_large(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
 
 
 class _Bound(NamedTuple):
