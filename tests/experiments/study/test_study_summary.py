@@ -1,12 +1,10 @@
 import json
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
-from experiments.plots.figure_style import CaptionedFigure
 from experiments.study.channel_switches import SWITCHES
 from experiments.study.figures import return_figure, study_figures
 from experiments.study.study import quoted
@@ -194,14 +192,26 @@ def test_quoted_tables_replace_what_stands_between_the_marks():
     assert quoted(once, {"agents": "new"}) == once
 
 
-def test_small_margins_are_not_drawn_and_small_prices_are():
-    # Small numbers beside the points are margins; "penalized:10" has a price.
+def test_rows_of_the_figure_have_names_and_small_margins_are_left_out():
     summary = study(**{"trusting:10": (10.0, 0.0, 0.5), "penalized:10": (11.0, 0.0, 0.5)})[0]
-    with mock.patch.object(CaptionedFigure, "png", b""):
-        figure = return_figure(summary)
-    labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
-    assert "penalized:10" in labels
-    assert {text.get_text() for axis in figure.axes for text in axis.texts} == {"20"}
+    figure = return_figure(summary)
+    named = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert {"penalized:10", "trusting:20", "lqr+psf", "lqr+psf:20", "lookahead"} <= set(named)  # a price is no margin
+    assert not {"trusting:10", "lqr+psf:10"} & set(named)
+    assert len(set(named)) == len(named)
+    assert figure.legends == []
+    assert {line.get_marker() for axis in figure.axes for line in axis.lines} <= {"o", "None"}
+
+
+@pytest.mark.parametrize("environments", [1, 3])
+def test_names_of_the_rows_do_not_cover_one_another(made, environments):
+    summary = made[0] | {"environments": {f"Plant-v{i}": env_of(made) for i in range(environments)}}
+    figure = return_figure(summary)
+    figure.canvas.draw()
+    texts = [text for axis in figure.axes for text in (*axis.get_yticklabels(), axis.title, axis.xaxis.label)]
+    boxes = [text.get_window_extent() for text in texts if text.get_visible() and text.get_text()]
+    # Tick labels of shared panels are not drawn and lie where those of the first one would.
+    assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
 
 
 def test_figures_show_every_arm_and_every_run(made):
