@@ -44,11 +44,13 @@ if find_spec("mlflow"):
         """Logs the numbers of stable-baselines3's logger."""
 
         def write(self, key_values, key_excluded, step=0):
+            """Logs what is a number and not excluded from this output."""
             left_out = {name for name, outputs in key_excluded.items() if "mlflow" in (outputs or ())}
             numbers = {name: value for name, value in key_values.items() if isinstance(value, int | float)}
             mlflow.log_metrics({name: value for name, value in numbers.items() if name not in left_out}, step=step)
 
         def close(self):
+            """Ends the run."""
             mlflow.end_run()
 
     mlflow.set_tracking_uri(f"sqlite:///{logs}/mlflow.db")
