@@ -113,12 +113,13 @@ def progress_bar(total: int, description: str, unit: str) -> tqdm:
     from tqdm import tqdm
 
     is_terminal = sys.stderr.isatty()
+    count, rate = (" {n_fmt}/{total_fmt}", ", {rate_noinv_fmt}") if unit else ("", "")
     return tqdm(
         total=total,
         desc=description,
         unit=f" {unit}",
         unit_scale=True,
-        bar_format=None if unit else "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]",
+        bar_format=f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{remaining}}{rate}]",
         mininterval=_TERMINAL_PERIOD if is_terminal else _FILE_PERIOD,
         miniters=0,
         file=sys.stderr if is_terminal else _Lines(),
