@@ -15,7 +15,7 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-# The project's public address, written into pyproject.toml, CITATION.cff, README.md and the site by `make address`.
+# The project's public address, written into pyproject.toml, CITATION.cff, README.md, the notebook and the site by `make address`.
 ADDRESS ?=
 
 .DEFAULT_GOAL := help

@@ -93,12 +93,24 @@ def parse(arguments: list[str]) -> object:
 
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
     command, rest = "".join(arguments[:1]), arguments[1:]
-    if hasattr(kinds.get(command), "config"):
-        defaults, others = settings.config_defaults(rest, command, kinds[command])
-        if defaults is not None:
-            given = tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
-            return beside_those_of_file(given, defaults)
-    return tyro.extras.subcommand_cli_from_dict(kinds, prog="ncs", description=_DESCRIPTION, args=arguments)
+    if command not in kinds:
+        return tyro.extras.subcommand_cli_from_dict(kinds, prog="ncs", description=_DESCRIPTION, args=arguments)
+    kind, default = kinds[command], {}
+    if hasattr(kind, "config"):
+        found, rest = settings.config_defaults(rest, command, kind)
+        default = {} if found is None else {"default": found}
+    given = tyro.cli(kind, prog=f"ncs {command}", args=rest, description=_description(kind), **default)
+    return beside_those_of_file(given, found) if default else given
+
+
+def _description(settings: type) -> str:
+    """Returns what a command does, of the docstring of its settings, in lines of the terminal's width."""
+    from inspect import getdoc
+
+    from experiments.terminal import wrapped
+
+    text = (getdoc(settings) or "").partition("\n\nAttributes:")[0]
+    return "\n\n".join(wrapped(" ".join(paragraph.split())) for paragraph in text.split("\n\n"))
 
 
 def _run(settings: object) -> None:

@@ -1,4 +1,4 @@
-"""What commands show on a terminal: tables, prose, and warnings as sentences."""
+"""What commands show on a terminal: tables, prose, messages beside a progress bar, and warnings as sentences."""
 
 from __future__ import annotations
 
@@ -8,26 +8,49 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from textwrap import TextWrapper
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-# Lines of prose follow the terminal between these widths, and have the greatest where there is no terminal; columns of
-# a table that would be wider than the greatest stand closer together [characters].
-_LEAST_WIDTH, _GREATEST_WIDTH = 60, 80
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+# Lines of prose follow the terminal between these widths, and have the greatest where there is no terminal; no table is
+# wider than the greatest [characters].
+_LEAST_WIDTH, GREATEST_WIDTH = 60, 80
+# Period of the progress bar on a terminal and in a file [s].
+_TERMINAL_PERIOD, _FILE_PERIOD = 0.5, 20.0
 
 
-def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), left_columns: int = 1) -> str:
-    """Returns rows of cells as aligned text.
+def text_table(
+    rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), left_columns: int = 1, keys: int = 1
+) -> str:
+    """Returns rows of cells as aligned text of at most 80 columns.
+
+    Columns that would make it wider stand closer together; those that still find no room stand in a table of their
+    own below, behind the key columns. Only key columns and one other that are wider together make a line longer.
 
     Args:
         rows: Rows of equal length, the header first; a row of a single cell is a title, which may be wider than its
             column, of the rows below it.
         rules: Indices of the rows above which a horizontal rule is drawn.
         left_columns: Number of columns that are aligned to the left; the others are aligned to the right.
+        keys: Number of the first columns that say what a row is about.
     """
     widths = [max(map(len, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
-    gaps = len(widths) - 1
-    gap = 2 if sum(widths) + 2 * gaps <= _GREATEST_WIDTH else 1
-    rule = "-" * (sum(widths) + gap * gaps)
+    gap = 2 if _width(widths, 2) <= GREATEST_WIDTH else 1
+    parts = [list(range(keys))]
+    for column in range(keys, len(widths)):
+        has_room = _width([widths[each] for each in [*parts[-1], column]], gap) <= GREATEST_WIDTH
+        if has_room or len(parts[-1]) == keys:
+            parts[-1].append(column)
+        else:
+            parts.append([*range(keys), column])
+    return "\n\n".join(_table([_cells(row, part) for row in rows], rules, left_columns, gap) for part in parts)
+
+
+def _table(rows: Sequence[Sequence[str]], rules: Collection[int], left_columns: int, gap: int) -> str:
+    """Returns rows of cells as aligned text, however wide."""
+    widths = [max(map(len, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
+    rule = "-" * _width(widths, gap)
     lines = []
     for index, row in enumerate(rows):
         cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=len(row) > 1)]
@@ -36,14 +59,25 @@ def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), lef
     return "\n".join(lines)
 
 
+def _cells(row: Sequence[str], columns: Sequence[int]) -> Sequence[str]:
+    """Returns the cells of some columns; a title stays as it is."""
+    return row if len(row) == 1 else [row[column] for column in columns]
+
+
+def _width(widths: Sequence[int], gap: int) -> int:
+    return sum(widths) + gap * (len(widths) - 1)
+
+
 def terminal_width() -> int:
     """Returns how wide lines of prose may be [characters]."""
-    columns = shutil.get_terminal_size((_GREATEST_WIDTH, 24)).columns
-    return min(max(columns, _LEAST_WIDTH), _GREATEST_WIDTH)
+    columns = shutil.get_terminal_size((GREATEST_WIDTH, 24)).columns
+    return min(max(columns, _LEAST_WIDTH), GREATEST_WIDTH)
 
 
 def wrapped(text: str, width: int | None = None, *, label: str = "", indent: int = 2) -> str:
     """Returns a text in lines of at most some width; only a longer word makes a line longer.
+
+    A number and its percent sign stay on one line.
 
     Args:
         text: The text, on one line.
@@ -58,7 +92,49 @@ def wrapped(text: str, width: int | None = None, *, label: str = "", indent: int
         break_on_hyphens=False,
         break_long_words=False,
     )
-    return wrapper.fill(text)
+    return wrapper.fill(text.replace(" %", "\0%")).replace("\0", " ")
+
+
+def say(line: str, indent: int = 2) -> None:
+    """Prints a message on stderr, above a progress bar if there is one; on a terminal in lines of its width."""
+    from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
+
+    tqdm.write(wrapped(line, indent=indent) if sys.stderr.isatty() else line, file=sys.stderr)
+
+
+def progress_bar(total: int, description: str, unit: str) -> tqdm:
+    """Returns a progress bar on stderr: a line that changes on a terminal, in a file a line of its own now and then.
+
+    Args:
+        total: Count at the end.
+        description: What goes on.
+        unit: What is counted; an empty string if the count says nothing to people, who then see the share alone.
+    """
+    from tqdm import tqdm
+
+    is_terminal = sys.stderr.isatty()
+    count, rate = (" {n_fmt}/{total_fmt}", ", {rate_noinv_fmt}") if unit else ("", "")
+    return tqdm(
+        total=total,
+        desc=description,
+        unit=f" {unit}",
+        unit_scale=True,
+        bar_format=f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{remaining}}{rate}]",
+        mininterval=_TERMINAL_PERIOD if is_terminal else _FILE_PERIOD,
+        miniters=0,
+        file=sys.stderr if is_terminal else _Lines(),
+    )
+
+
+class _Lines:
+    """Writes to stderr what a progress bar would write over itself, in lines."""
+
+    def write(self, text: str) -> None:
+        if line := text.strip("\r\n "):
+            sys.stderr.write(f"{line}\n")
+
+    def flush(self) -> None:
+        sys.stderr.flush()
 
 
 @contextmanager
@@ -70,10 +146,7 @@ def warnings_as_sentences() -> Iterator[None]:
         text = " ".join(str(message).split())
         if text not in shown:
             shown.add(text)
-            from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
-
-            line = f"ncs: warning: {text}"
-            tqdm.write(wrapped(line, indent=5) if sys.stderr.isatty() else line, file=sys.stderr)
+            say(f"ncs: warning: {text}", indent=5)
 
     with _shown_by(show):
         yield

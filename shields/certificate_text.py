@@ -36,12 +36,13 @@ def size_of(recorded: dict[str, Any]) -> str:
 
 def table(title: str, rows: list[tuple[str, str]]) -> str:
     """Returns a title and named texts below it, without those that are empty."""
-    lines, indent = [title], " " * _INDENT
-    for name, text in rows:
-        if text:
-            first = f"  {name}".ljust(_INDENT)
-            lines.append(textwrap.fill(printable(text), _WIDTH, initial_indent=first, subsequent_indent=indent))
-    return "\n".join(lines)
+    return "\n".join([title, *(labeled(f"  {name}".ljust(_INDENT), printable(text)) for name, text in rows if text)])
+
+
+def labeled(label: str, text: str) -> str:
+    """Returns a text behind a label, in lines that all begin where the first does."""
+    indent = " " * len(label)
+    return textwrap.fill(text, _WIDTH, initial_indent=label, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def contract_text(contract: ChannelContract | None, input_delay: int = 0) -> str:

@@ -26,6 +26,10 @@ RUNS = {
         ],
     ),
     "change_the_channel.py": ([], [rf"{re.escape('30 % lost, 2 steps late')} +root mean square error {NUMBER}"]),
+    "loggers.py": (
+        ["--steps", "1024"],
+        [r"TensorBoard: safety/violation_rate 0\.000 safety/intervention_rate 0\.[1-9]"],
+    ),
     "lost_hour.py": (
         [],
         [
@@ -106,6 +110,7 @@ RUNS = {
     "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
 }
 TRAINING = {
+    "loggers.py",
     "own_plant.py",
     "random_networks.py",
     "recurrent_ppo.py",
@@ -170,6 +175,24 @@ def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, 
     run = run_example(name, *RUNS[name][0], cwd=tmp_path, MINARI_DATASETS_PATH=str(tmp_path))
     assert run.returncode == 0, run.stderr
     assert_expected(name, run.stdout)
+
+
+LOGGERS = {
+    "mlflow": ("3.17.2", r"MLflow: safety/violation_rate 0\.000 safety/intervention_rate 0\.[1-9]"),
+    "wandb": ("0.31.0", r"wandb: +safety/violation_rate 0\n[\s\S]*W&B: logs/wandb/offline-run-"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", LOGGERS)
+def test_loggers_that_are_installed_get_what_tensorboard_gets(package, tmp_path):
+    version, pattern = LOGGERS[package]
+    assert version in (ROOT / "docs" / "integrations.md").read_text()
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} not installed: a virtual environment of its own (docs/integrations.md)")
+    run = run_example("loggers.py", *RUNS["loggers.py"][0], cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert re.search(pattern, run.stderr + run.stdout)
 
 
 def assert_expected(name, printed):

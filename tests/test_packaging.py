@@ -3,6 +3,7 @@
 import ast
 import importlib
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -245,20 +246,25 @@ def test_make_alone_says_what_there_is():
 
 def test_address_is_written_everywhere_and_taken_out_again(tmp_path):
     shutil.copytree(ROOT / ".ci", tmp_path / ".ci")
-    names = ("pyproject.toml", "CITATION.cff", "README.md", "mkdocs.yml")
-    for name in names:
+    times = {"pyproject.toml": 1, "CITATION.cff": 1, "README.md": 2, "mkdocs.yml": 1, "examples/tour.ipynb": 1}
+    (tmp_path / "examples").mkdir()
+    for name in times:
         shutil.copy(ROOT / name, tmp_path / name)
     for address in ("https://example.org/old", "https://example.org/ncs/gym"):
         subprocess.run([sys.executable, tmp_path / ".ci" / "address.py", address], check=True, capture_output=True)
-    for name in names:
-        assert (tmp_path / name).read_text().count("https://example.org") == 1, name
+    for name, count in times.items():
+        assert (tmp_path / name).read_text().count("https://example.org") == count, name
+    install = 'pip install "ncs-gym[train] @ git+https://example.org/ncs/gym"\n'
+    assert f"\n{install}" in (tmp_path / "README.md").read_text()
+    cells = json.loads((tmp_path / "examples" / "tour.ipynb").read_text())["cells"]
+    assert '%pip install -q "ncs-gym[train] @ git+https://example.org/ncs/gym"' in "".join(cells[1]["source"])
     project = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]
     assert project["urls"]["Source"] == "https://example.org/ncs/gym"
     cited = yaml.safe_load((tmp_path / "CITATION.cff").read_text())
     assert cited["repository-code"] == "https://example.org/ncs/gym"
     assert yaml.safe_load((tmp_path / "mkdocs.yml").read_text())["repo_url"] == "https://example.org/ncs/gym"
     subprocess.run([sys.executable, tmp_path / ".ci" / "address.py", ""], check=True, capture_output=True)
-    assert not any("https://example.org" in (tmp_path / name).read_text() for name in names)
+    assert all((tmp_path / name).read_text() == (ROOT / name).read_text() for name in times)
 
 
 def test_virtual_environment_is_ignored_as_a_folder_and_as_a_link(tmp_path):

@@ -75,6 +75,7 @@ class MonteCarloBatch:
     certificate: Certificate
 
     parts = ("attack",)
+    unit = "step"
     result_type = SafetyCounts
     leaves = ()
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from experiments.analysis.statistics import clopper_pearson, rounded_up
 from experiments.errors import SafetyBroken
-from experiments.terminal import text_table
+from experiments.terminal import text_table, wrapped
 
 # Episodes start on the boundary of S; the largest level is taken from this step on.
 SETTLING_STEPS = 20
@@ -98,44 +98,54 @@ _Column = tuple[str, str, str, Callable[[SafetyCounts], str]]
 _COLUMNS: tuple[_Column, ...] = (
     ("", "episodes", "set box", lambda counts: f"{counts.episodes:,}"),
     ("began", "outside", "box", lambda counts: f"{counts.outside_starts:,}"),
-    ("outside", "S", "set", lambda counts: f"{counts.exits:,}"),
-    ("outside", "S", "box", lambda counts: f"{counts.exits / counts.steps:.1%}"),
-    ("outside", "box", "set box", lambda counts: f"{counts.violations:,}"),
+    ("out of", "S", "set", lambda counts: f"{counts.exits:,}"),
+    ("out of", "S", "box", lambda counts: f"{counts.exits / counts.steps:.1%}"),
+    ("out of", "box", "set box", lambda counts: f"{counts.violations:,}"),
     ("", "failed", "set box", lambda counts: f"{counts.broken_episodes:,}"),
     ("", "p <", "set box", lambda counts: f"{counts.bound:.1e}"),
     ("", "margin", "set box", lambda counts: f"{counts.margin:.1e}" if counts.level > 0.0 else "-"),
     ("", "planned", "box", lambda counts: f"{counts.planned / counts.steps:.1%}"),
     ("over-", "ridden", "set box", lambda counts: f"{counts.interventions / counts.steps:.1%}"),
     ("no", "claim", "lapsed", lambda counts: f"{counts.lapsed / counts.steps:.1%}"),
-    ("outside", "then", "lapsed", lambda counts: f"{counts.lapsed_violations:,}"),
-    ("packets", "per step", "requests", lambda counts: f"{counts.packets / counts.steps:.2f}"),
+    ("out of", "box then", "lapsed", lambda counts: f"{counts.lapsed_violations:,}"),
+    ("sent", "a step", "requests", lambda counts: f"{counts.packets / counts.steps:.2f}"),
     ("", "forced", "requests", lambda counts: f"{counts.forced / counts.steps:.1%}" if counts.forced else "-"),
-    ("age", "> h", "requests", lambda counts: f"{counts.overdue:,}"),
 )
+_OVERRIDDEN = "overridden: steps that the shield changed"
+_PROBABILITY = "p <: upper end of the exact 95 % interval of their probability"
 _LEGENDS = {
-    "set": f"""\
-outside: steps with a true state outside S or the box; failed: episodes that left S or the box;
-p <: upper end of the exact 95 % interval of their probability;
-margin: smallest 1 - level from step {SETTLING_STEPS} on (episodes start on the boundary); the level in S is
-max |g x| over the rows g of a polytope, sqrt(x'Mx) in an ellipsoid;
-overridden: steps that the shield changed or, unshielded, would have changed""",
-    "box": f"""\
-began outside: episodes that began outside S with a certified plan;
-outside S: steps there, which lookahead allows; outside box: steps there;
-failed: episodes that left the box; p <: upper end of the exact 95 % interval of their probability;
-margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on;
-planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed""",
-    "lapsed": """
-no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
-outside then: such steps outside the box""",
-    "requests": """
-forced: steps in which the contract forced a request that nobody made;
-age > h: steps with a sample older than the contract allows, of channels that keep it""",
+    "set": (
+        "out of S, out of box: steps with a true state there",
+        "failed: episodes that left S or the box",
+        _PROBABILITY,
+        f"margin: smallest 1 - level from step {SETTLING_STEPS} on (episodes start on the boundary); the level in S is "
+        "max |g x| over the rows g of a polytope, sqrt(x'Mx) in an ellipsoid",
+        f"{_OVERRIDDEN} or, unshielded, would have changed",
+    ),
+    "box": (
+        "began outside: episodes that began outside S with a certified plan",
+        "out of S: steps there, which lookahead allows; out of box: steps there",
+        "failed: episodes that left the box",
+        _PROBABILITY,
+        f"margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on",
+        "planned: steps with inputs of a certified plan in store",
+        _OVERRIDDEN,
+    ),
+    "lapsed": (
+        "no claim: steps from a broken contract on, until the proof holds again, which no failure counts",
+        "out of box then: such steps outside the box",
+    ),
+    "requests": (
+        "sent a step: samples",
+        "forced: steps in which the contract forced a request that nobody made",
+    ),
 }
-
-GAUSSIAN_LEGEND = """failed: episodes that left S or the box; interval: the exact 95 % interval of their probability;
-bound: the union bound on it over all draws of noise, for the shielded loop;
-a bound of 1 says nothing (--delta makes it small)"""
+_GAUSSIAN_LEGEND = (
+    "failed: episodes that left S or the box",
+    "interval: the exact 95 % interval of their probability",
+    "bound: the union bound on it over all draws of noise, for the shielded loop; a bound of 1 says nothing (--delta "
+    "makes it small)",
+)
 
 # What the channels of `attack_cases` do.
 _CHANNELS = {
@@ -165,15 +175,16 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
     for plant in dict.fromkeys(plants.values()):
         rows.append([plant])
         rows += [
-            _row("  " + name.rpartition(", ")[2], counts[name], columns) for name in counts if plants[name] == plant
+            _row(" " + name.rpartition(", ")[2], counts[name], columns) for name in counts if plants[name] == plant
         ]
     rows.append(_row("all", total, columns))
     steps = f"{total.steps:,} steps, {total.steps // total.episodes} in each episode"
     seen = dict.fromkeys(name.rpartition(", ")[2] for name in counts)
-    channels = "\n".join(f"{kind}: {_CHANNELS[kind]};" for kind in seen if kind in _CHANNELS)
-    table = text_table(rows, rules=(2, len(rows) - 1))
-    legend = "".join(text for name, text in _LEGENDS.items() if is_shown[name])
-    return "\n".join(filter(None, (f"{steps}\n", table, channels, legend)))
+    legend = [f"{kind}: {_CHANNELS[kind]}" for kind in seen if kind in _CHANNELS]
+    legend += [text for name, texts in _LEGENDS.items() if is_shown[name] for text in texts]
+    if total.forced:
+        legend.append(f"{total.overdue:,} steps had a sample older than the contract allows of a channel that keeps it")
+    return "\n".join([f"{steps}\n", text_table(rows, rules=(2, len(rows) - 1)), *map(wrapped, legend)])
 
 
 def _row(name: str, counts: SafetyCounts, columns: Sequence[_Column]) -> list[str]:
@@ -181,13 +192,16 @@ def _row(name: str, counts: SafetyCounts, columns: Sequence[_Column]) -> list[st
 
 
 def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> str:
-    """Returns the observed exits of each case, their exact interval and the bound on their probability, as text."""
+    """Returns the observed exits of each case, their exact interval and the bound on their probability, as text.
+
+    A legend stands below.
+    """
     rows = [["case", "episodes", "failed", "interval", "bound"]]
     for name, case in counts.items():
         low, high = case.interval
         numbers = f"{case.episodes:,}", f"{case.broken_episodes:,}"
         rows.append([name, *numbers, f"[{low:.1e}, {high:.1e}]", rounded_up(limits[name])])
-    return text_table(rows, rules=(1,))
+    return "\n".join([text_table(rows), *map(wrapped, _GAUSSIAN_LEGEND)])
 
 
 def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> None:

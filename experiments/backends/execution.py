@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,9 +22,8 @@ from experiments.backends.worker import Outcome, signals_blocked, work
 from experiments.errors import RunError, RunStopped
 from experiments.runs.run_store import Run, RunStore
 from experiments.settings import BackendSettings
+from experiments.terminal import progress_bar, say
 
-# Period of the progress bar on a terminal and in a file [s].
-_TERMINAL_PERIOD, _FILE_PERIOD = 0.5, 20.0
 # How often the reports of runs are read [s].
 _READING_PERIOD = 0.5
 # Largest number of runs that are submitted and not finished: more than a cluster executes at once, so that no core
@@ -64,13 +62,13 @@ def results_of(runs: Sequence[Run], folder: Path, settings: BackendSettings) -> 
     results = {run.name: _without_files(result) for run in runs if (result := store.load(run)) is not None}
     missing = [run for run in runs if run.name not in results]
     if results:
-        print(f"{len(results)} of {len(runs)} runs were finished before", file=sys.stderr)
+        say(f"{len(results)} of {len(runs)} runs were finished before")
 
     def keep(run: Run, result: Any) -> None:
         store.save(run, result)
         results[run.name] = _without_files(result)
         if result.outcome:
-            tqdm.write(f"{run.name}: {result.outcome}", file=sys.stderr)
+            say(f"{run.name}: {result.outcome}")
 
     if missing:
         execute(missing, executor_of(settings, len(missing), folder / "tensorboard"), keep)
@@ -118,15 +116,8 @@ def execute(
 
 
 def _progress_bar(runs: Sequence[Run]) -> tqdm:
-    return tqdm(
-        total=sum(run.total_steps for run in runs),
-        desc=" and ".join(sorted({part for run in runs for part in run.parts}, reverse=True)),
-        unit="step",
-        unit_scale=True,
-        mininterval=_TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD,
-        miniters=0,
-        file=sys.stderr,
-    )
+    parts = " and ".join(sorted({part for run in runs for part in run.parts}, reverse=True))
+    return progress_bar(sum(run.total_steps for run in runs), parts, " and ".join({run.unit for run in runs}))
 
 
 def _taken(queue: Queue[Future[Any]], timeout: float) -> list[Future[Any]]:
@@ -154,7 +145,7 @@ def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[Loca
         yield pool
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
-            print("stopping what runs; Ctrl-C again ends it at once", file=sys.stderr, flush=True)
+            say("stopping what runs; Ctrl-C again ends it at once")
         pool.stop()
         raise
     finally:

@@ -6,7 +6,6 @@ import logging
 import os
 import pickle
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import chdir, contextmanager, suppress
@@ -23,6 +22,7 @@ from experiments.runs.provenance import versions
 from experiments.runs.run_store import Run
 from experiments.settings import BackendSettings
 from experiments.settings.learning import OWN_CLUSTER
+from experiments.terminal import say
 
 # How often Ray repeats a run whose worker died.
 RETRIES = 3
@@ -130,7 +130,7 @@ def _require_large_node(settings: BackendSettings) -> None:
     if any(all(node.get(name, 0.0) >= amount for name, amount in wanted.items()) for node in nodes):
         return
     if settings.ray_wait:
-        print(f"no node is large enough yet; waiting up to {settings.ray_wait:g} s for one", file=sys.stderr)
+        say(f"no node is large enough yet; waiting up to {settings.ray_wait:g} s for one")
         request = _remote(lambda: None, settings).remote()  # a cluster grows by unmet demand
         if ray.wait([request], timeout=settings.ray_wait)[0]:
             return

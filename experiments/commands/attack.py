@@ -11,7 +11,6 @@ from tqdm import tqdm
 from experiments.attack.attack_cases import AttackCase
 from experiments.attack.monte_carlo_batch import MonteCarloBatch, cases_of, kinds_of_batches
 from experiments.attack.safety_counts import (
-    GAUSSIAN_LEGEND,
     SafetyCounts,
     counts_table,
     gaussian_table,
@@ -73,7 +72,7 @@ def attack(settings: AttackSettings) -> None:
             {name: cases[name].bound_violation_probability() for name in counts} if settings.noise == "gaussian" else {}
         )
         if limits:
-            print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
+            print("", gaussian_table(counts, limits), sep="\n")
         document = {"settings": lasting_settings(settings), "versions": versions(), "total": total.document()}
         document["cases"] = {case: each.document() for case, each in counts.items()}
         if limits:

@@ -18,6 +18,7 @@ from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
 from experiments.settings import EvaluateSettings
 from experiments.settings.arguments import id_alone, require_horizon
+from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
 
@@ -55,7 +56,9 @@ def evaluate(settings: EvaluateSettings) -> None:
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
     arms = {f"shield: {shield_name}": arm_summary(episodes_table([result]), mode, fixed_policy=True)}
     statistics = "" if settings.vec_normalize is None else f" with --vec-normalize {settings.vec_normalize}"
-    print(f"{agent.algorithm} of {folder}{statistics} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
+    print(
+        wrapped(f"{agent.algorithm} of {folder}{statistics} in {agent.env}, {settings.episodes:,} episodes"), end="\n\n"
+    )
     print(summary_text(arms, {}))
     if settings.out is not None:
         content = {

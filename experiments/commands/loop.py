@@ -43,6 +43,8 @@ from shields.verification import require_valid
 _SMOKE = {"steps": 100}
 # What keys of the summary begin with that say how many datagrams were refused, by reason.
 _BY_REASON = "refused, "
+# What keys begin with that say how many steps were not proved, by reason.
+_NOT_PROVED = "not proved, "
 # Seconds that a process may take to end, and between two lines of the view.
 _PATIENCE, _PERIOD = 1.0, 1.0
 
@@ -83,12 +85,21 @@ def loop(settings: LoopSettings) -> None:
             process.kill()
     summary = summary_of(settings.out)
     write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
-    width = max(map(len, summary))
-    print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
+    print(_text(summary))
     if refused := {
         reason: summary[_BY_REASON + words] for reason, words in REFUSED.items() if _BY_REASON + words in summary
     }:
         print(wrapped(f"Of the datagrams refused: {suspects_text(refused, settings)}."))
+
+
+def _text(summary: dict[str, Any]) -> str:
+    """Returns a summary as a table, and below it a sentence for each reason why steps were not proved."""
+    reasons = {name: count for name, count in summary.items() if name.startswith(_NOT_PROVED)}
+    numbers = {name: value for name, value in summary.items() if name not in reasons}
+    width = max(map(len, numbers))
+    lines = [f"{name:>{width}}  {value}" for name, value in numbers.items()]
+    lines += [wrapped(f"Not proved ({count}): {name.removeprefix(_NOT_PROVED)}.") for name, count in reasons.items()]
+    return "\n".join(lines)
 
 
 def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop) -> None:
@@ -160,6 +171,8 @@ class _view:
     def __exit__(self, *error: object) -> None:
         if self._live is not None:
             self._live.stop()
+            if not self._live.console.is_terminal:  # where the table is left without an end of line
+                print()
 
     def _show(self, row: dict[str, Any]) -> None:
         self._seen["overridden"] += row["intervened"]
@@ -168,11 +181,11 @@ class _view:
             return
         self._next = now + (_PERIOD if self._live is None else _PERIOD / 8)
         proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason']}"
-        margin = f"margin {row['margin']:.2f}, newest sample {row['age']} steps old"
         counts = f"overridden {self._seen['overridden']}, missing {row['missing']}, late {row['skipped']}"
-        line = f"step {row['step']}: {proved}; {margin}; {counts}, refused {row['refused']}"
+        known = f"margin {row['margin']:.2f}, age {row['age']}; {counts}, refused {row['refused']}"
+        line = f"step {row['step']}: {proved}; {known}"
         if self._live is None:
-            print(line, flush=True)
+            print(wrapped(line), flush=True)
             return
         from rich.table import Table
 
@@ -245,4 +258,4 @@ def summary_of(folder: Path) -> dict[str, Any]:
         summary["outside although proved"] = counts["outside, proved"]
         summary["proved, a miss not yet heard"] = counts["proved, missed"]
     reasons = {name.removeprefix("reason: "): count for name, count in counts.items() if name.startswith("reason: ")}
-    return summary | {f"not proved, {name}": count for name, count in reasons.items() if count}
+    return summary | {_NOT_PROVED + name: count for name, count in reasons.items() if count}

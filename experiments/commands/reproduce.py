@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from tqdm import tqdm
-
 from experiments.paper.reproduction import designs, reproduction_figures, simulate
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.settings import ReproduceSettings
-from experiments.terminal import text_table
+from experiments.terminal import progress_bar, text_table
 
 
 def reproduce(settings: ReproduceSettings) -> None:
     """Runs `ncs reproduce`."""
     with claim_folder("reproduce", settings):
-        with tqdm(total=3 * settings.starts, unit="start", mininterval=1.0) as bar:
+        with progress_bar(3 * settings.starts, "simulation", "start") as bar:
             simulations = [simulate(design, settings, bar) for design in designs()]
         outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
         write_results(settings.out, outcomes, figures=reproduction_figures(simulations))

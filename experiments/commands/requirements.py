@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 import shields
 from experiments.backends.execution import execute, executor_of
@@ -22,7 +20,7 @@ from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
-from experiments.terminal import text_table, wrapped
+from experiments.terminal import say, text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.network.requests import spare_samples
 from ncs_gym.reading import json_values, read_file
@@ -195,17 +193,17 @@ def _answers(searches: Sequence[Search], settings: RequirementsSettings, store: 
     answers = {search.name: known for search in searches if (known := store.load(search)) is not None}
     missing = {search.name: search for search in searches if search.name not in answers}
     if answers:
-        print(f"{len(answers)} of {len(searches)} searches were finished before", file=sys.stderr)
+        say(f"{len(answers)} of {len(searches)} searches were finished before")
 
     def keep(run: _SearchRun, result: dict[float, Answer]) -> None:
         store.save(run.search, result)
         answers[run.name] = result
         largest = max((age for age, answer in result.items() if answer.certificate is not None), default=None)
         outcome = "no certificate found" if largest is None else f"certified up to {largest:g}"
-        tqdm.write(f"{run.search.title}: {outcome}", file=sys.stderr)
+        say(f"{run.search.title}: {outcome}")
 
     for search in missing.values():
-        tqdm.write(f"seeking certificates: {search.title}", file=sys.stderr)
+        say(f"seeking certificates: {search.title}")
     if missing:
         executor = executor_of(settings, len(missing), store.folder / "tensorboard")
         execute([_SearchRun(search) for search in missing.values()], executor, keep)
@@ -218,6 +216,7 @@ class _SearchRun:
 
     search: Search
     parts: tuple[str, ...] = ("search",)
+    unit: str = ""
     result_type: type = dict
     leaves: tuple[str, ...] = ()
 

@@ -6,7 +6,6 @@ import asyncio
 import gc
 import hmac
 import signal
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from experiments.network_loop.log import StepLog
 from experiments.runs.loops import changed_channel, registered_env
 from experiments.runs.policies import policy_by_name
 from experiments.settings import LoopSettings
+from experiments.terminal import say
 from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import DownlinkProtocol, downlink_protocol
 from ncs_gym.network.contract import ChannelContract, contract_of
@@ -303,7 +303,7 @@ async def _controller(
         nonlocal is_told
         if node.episode == 0 and not is_told and time.monotonic() - began > SILENCE:
             is_told = True
-            print(waiting_text(node.refused, settings), file=sys.stderr, flush=True)
+            say(waiting_text(node.refused, settings))
         return is_over() or steps >= settings.steps
 
     def asks(safe: SafeLoop) -> bool:

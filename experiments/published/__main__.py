@@ -13,6 +13,7 @@ import numpy as np
 from experiments.published.attack import attack
 from experiments.published.largest_share import largest_share
 from experiments.published.plants import contract_of_plant, plant_of, published
+from experiments.terminal import wrapped
 from ncs_gym import LinearPlant
 from shields import Certificate, Infeasible, synthesize, verify
 
@@ -58,11 +59,9 @@ def main(arguments: list[str]) -> None:
         if options.attack:
             counts = attack(plant, certificate, options.attack)
             total, outside = total + counts.steps, outside + counts.exits + counts.violations
-            print(
-                f"  attacked for {counts.steps:,} steps: {counts.exits} outside the set, {counts.violations} outside "
-                f"the limits, {counts.unproved} unproved",
-                flush=True,
-            )
+            outcome = f"{counts.exits} outside the set, {counts.violations} outside the limits"
+            text = f"attacked for {counts.steps:,} steps: {outcome}, {counts.unproved} unproved"
+            print(wrapped(text, label="  "), flush=True)
     if options.attack:
         print(f"{outside} of {total:,} attacked steps left a set or broke a limit")
     print(f"{found} of {len(names or published())} have a certificate")

@@ -1,4 +1,4 @@
-"""The tables of results on a terminal, at most 80 columns wide for the usual names."""
+"""The tables of results on a terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from math import floor, log10
 from typing import Any
 
-from experiments.terminal import text_table
+from experiments.terminal import text_table, wrapped
 
 _MOST_DECIMALS = 4
 # Two lines of the header of what a point of a sweep fixes, by its key.
@@ -21,7 +21,7 @@ _SIDES = {
 _OUTCOMES = (
     ("", "arm"),
     ("violating", "episodes"),
-    ("violating", "training steps"),
+    ("violating", "training"),
     ("over-", "ridden"),
     ("", "return"),
 )
@@ -113,13 +113,15 @@ def sweep_table(cells: list[dict[str, Any]]) -> str:
     """Returns a row per point of the grid and arm, below a line that says what all points have in common."""
     swept = [side for side in _SIDES if len({cell[side] for cell in cells}) > 1]
     fixed = [side for side in _SIDES if side not in swept and (side != "downlink_loss" or cells[0][side] is not None)]
-    common = ", ".join(f"{_name(side)} {_side_text(side, cells[0][side])}" for side in fixed)
+    common = [f"{_name(side)} {_side_text(side, cells[0][side])}" for side in fixed]
+    if steps := max(arm["train_steps"] for cell in cells for arm in cell["arms"].values()):
+        common.append(f"{steps:,} training steps per arm")
     rows = [list(line) for line in zip(*(_SIDES[side] for side in swept), *_OUTCOMES, strict=True)]
     for cell in cells:
         point = [_side_text(side, cell[side]) for side in swept]
         rows += [[*point, name, *_outcome(arm)] for name, arm in cell["arms"].items()]
-    table = text_table(rows, rules=(2,), left_columns=0)
-    return f"in all rows: {common}\n\n{table}" if common else table
+    table = text_table(rows, rules=(2,), left_columns=0, keys=len(swept) + 1)
+    return "\n\n".join([*([wrapped(f"in all rows: {', '.join(common)}")] if common else []), table])
 
 
 def _name(side: str) -> str:
@@ -137,7 +139,7 @@ def _side_text(side: str, value: float | None) -> str:
 def _outcome(arm: dict[str, Any]) -> list[str]:
     return [
         f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
-        f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
+        f"{arm['train_violation_steps']:,}" if arm["train_steps"] else "-",
         "-" if arm["mode"] is None else f"{100 * arm['intervention_rate']:.1f} %",
         f"{arm['eval_return_mean']:z.1f}",
     ]

@@ -44,6 +44,11 @@ class Run(Protocol):
         ...
 
     @property
+    def unit(self) -> str:
+        """What is counted as its steps, for the progress bar; empty if their number says nothing to people."""
+        ...
+
+    @property
     def result_type(self) -> type:
         """Dataclass of its result."""
         ...

@@ -138,6 +138,7 @@ class TrainingRun:
     start: Start | None = None
 
     result_type = RunResult
+    unit = "step"
 
     @property
     def parts(self) -> tuple[str, ...]:

@@ -7,21 +7,28 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from experiments.plots.figure_style import (
     STYLE,
     ArmStyle,
     CaptionedFigure,
-    draw_estimate,
     label,
-    legend_below,
     thousands,
 )
 from experiments.runs.loops import AS_TRAINED
 from experiments.study.summary import ATTACKED
 
-# Smaller margins are not drawn: with them arms do nearly what they do with none, and their points lie on one another.
+# Smaller margins are not drawn: with them arms do nearly what they do with none.
 _LEAST_MARGIN = 20
+# Width of the panels of an environment, height of a row, what names and axes take, and the least height of all rows
+# [inches].
+_PANELS, _ROW, _MARGINS = 3.6, 0.2, (1.7, 0.9)
+_LEAST_HEIGHT = 1.8
+# Runs lie so far below their mean [rows].
+_LANE = 0.3
+# Size of the mean of an arm [points]; rows have names, so that markers need not tell arms apart.
+_MEAN_SIZE = 7.0
 
 
 def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
@@ -33,43 +40,48 @@ def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
 
 
 def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
-    """Returns the mean return as trained against violating episodes under attack, a panel per environment."""
+    """Returns violating episodes under attack and the mean return as trained, two panels per environment."""
+    caption = (
+        "Violating episodes under attack, and mean return as trained. Bars are 95 % intervals over runs and episodes. "
+        "Arms above the line were trained. The number behind a filter or governor is its margin in percent; those "
+        f"below {_LEAST_MARGIN} are left out."
+    )
     environments = summary["environments"]
+    names = list(dict.fromkeys(name for env in environments.values() for name in env["arms"] if _is_drawn(name)))
+    figure, axes = _figure(len(environments), len(names), caption, panels=2)
     with matplotlib.rc_context(STYLE):
-        caption = (
-            "Violating episodes under attack and return as trained, better to the upper left. Bars are 95 % intervals "
-            f"over runs and episodes. Small numbers are margins in percent; those below {_LEAST_MARGIN} are left out."
-        )
-        figure = CaptionedFigure((4.1 * len(environments), 5.0), caption)
-        handles = {}
-        axes = figure.subplots(1, len(environments), squeeze=False)[0]
-        for axis, (name, env) in zip(axes, environments.items(), strict=True):
-            for arm_name, arm in env["arms"].items():
-                base, _, margin = arm_name.rpartition(":")
-                has_margin = margin.isdigit() and not base.startswith("penalized")  # whose number is a price
-                if has_margin and int(margin) < _LEAST_MARGIN:
-                    continue
-                known, style = base if has_margin else arm_name, ArmStyle.of(arm_name)
-                _draw_point(axis, style, arm["scenarios"], margin if has_margin else "")
-                handles.setdefault(known, style.handle(line=False, points=True))
-            label(axis, "violating under attack [%]", "mean return as trained" if axis is axes[0] else "", name)
-            axis.set_xlim(-5.0, 105.0)
-            axis.yaxis.set_major_formatter(thousands)
-        legend_below(figure, handles)
-        return figure
+        for (left, right), (title, env) in zip(axes, environments.items(), strict=True):
+            for name in env["arms"].keys() & names:
+                scenarios, height = env["arms"][name]["scenarios"], len(names) - names.index(name)
+                style, own = ArmStyle.of(name), scenarios[AS_TRAINED]
+                attacked = scenarios.get(ATTACKED, own)
+                _draw_interval(left, style, attacked["rate_ci95"], height, 100.0)
+                _draw_mean(left, style, 100.0 * attacked["rate"], height)
+                _draw_interval(right, style, own["return_ci95"], height)
+                _draw_mean(right, style, own["return"], height)
+            last_trained = max((names.index(name) for name in _trained(env)), default=-1)
+            for axis in (left, right):
+                axis.axhline(len(names) - last_trained - 0.5, color="#555555", lw=0.8)
+            label(left, "violating [%]", "")
+            left.set_title(title, loc="left")
+            label(right, "return as trained", "")
+            left.set_xlim(-8.0, 108.0)
+            right.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+            right.xaxis.set_major_formatter(thousands)
+        _name_rows(axes[0][0], names)
+    return figure
 
 
 def runs_figure(summary: dict[str, Any]) -> CaptionedFigure:
     """Returns the violating episodes of every trained run under attack, a panel per environment."""
     caption = (
-        "Violating episodes under attack, by training run. Small dots are runs, markers their mean, bars 95 % "
-        "intervals over runs and episodes."
+        "Violating episodes under attack, by training run. Large dots are means, bars 95 % intervals over runs and "
+        "episodes, small dots below them the runs."
     )
 
     def draw(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
         attacked = arm["scenarios"].get(ATTACKED, arm["scenarios"][AS_TRAINED])
-        if attacked["rate_ci95"] is not None:
-            axis.plot([100.0 * end for end in attacked["rate_ci95"]], [height] * 2, "-", color=style.color, lw=1.0)
+        _draw_interval(axis, style, attacked["rate_ci95"], height, 100.0)
         _draw_runs(axis, style, [100.0 * rate for rate in attacked["rate_by_run"]], height)
         axis.set_xlim(-5.0, 105.0)
 
@@ -79,8 +91,8 @@ def runs_figure(summary: dict[str, Any]) -> CaptionedFigure:
 def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
     """Returns the violating steps of every training run, a panel per environment."""
     caption = (
-        "Violating steps while the agents learned, on a scale that is linear up to 1 and logarithmic beyond. Small "
-        "dots are runs, markers their mean. These violations do not appear in the evaluation."
+        "Violating steps while the agents learned, on a scale that is linear up to 1 and logarithmic beyond. Large "
+        "dots are means, small dots below them the runs. These violations do not appear in the evaluation."
     )
 
     def draw(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
@@ -93,16 +105,35 @@ def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
 
 def _by_run_figure(summary: dict[str, Any], caption: str, quantity: str, draw: Any) -> CaptionedFigure:
     environments = summary["environments"]
+    names = list(dict.fromkeys(name for env in environments.values() for name in _trained(env)))
+    figure, axes = _figure(len(environments), len(names), caption)
     with matplotlib.rc_context(STYLE):
-        figure = CaptionedFigure((4.1 * len(environments), 3.6), caption)
-        axes = figure.subplots(1, len(environments), squeeze=False, sharey=True)[0]
-        names = list(dict.fromkeys(name for env in environments.values() for name in _trained(env)))
-        for axis, (title, env) in zip(axes, environments.items(), strict=True):
+        for (axis,), (title, env) in zip(axes, environments.items(), strict=True):
             for name in _trained(env):
                 draw(axis, ArmStyle.of(name), env["arms"][name], len(names) - names.index(name))
-            axis.set_yticks(range(len(names), 0, -1), names)
             label(axis, quantity, "", title)
-        return figure
+        _name_rows(axes[0][0], names)
+    return figure
+
+
+def _figure(environments: int, rows: int, caption: str, panels: int = 1) -> tuple[CaptionedFigure, list[list[Axes]]]:
+    """Returns a figure, and the panels of each environment, which share named rows."""
+    with matplotlib.rc_context(STYLE):
+        size = _MARGINS[0] + _PANELS * environments, _MARGINS[1] + max(_ROW * rows, _LEAST_HEIGHT)
+        figure = CaptionedFigure(size, caption)
+        axes = figure.subplots(1, panels * environments, squeeze=False, sharey=True)[0]
+    return figure, [list(axes[i : i + panels]) for i in range(0, len(axes), panels)]
+
+
+def _name_rows(axis: Axes, names: list[str]) -> None:
+    axis.set_yticks(range(len(names), 0, -1), names)
+    axis.set_ylim(0.4, len(names) + 0.6)
+
+
+def _is_drawn(name: str) -> bool:
+    """Returns whether an arm has no margin, or one that is large enough."""
+    base, _, margin = name.rpartition(":")
+    return not margin.isdigit() or base.startswith("penalized") or int(margin) >= _LEAST_MARGIN  # that is a price
 
 
 def _trained(env: dict[str, Any]) -> list[str]:
@@ -110,13 +141,15 @@ def _trained(env: dict[str, Any]) -> list[str]:
 
 
 def _draw_runs(axis: Axes, style: ArmStyle, values: list[float], height: int) -> None:
-    axis.plot(values, [height] * len(values), "o", ms=4.0, mfc=style.color, mec="white", mew=0.5)
-    axis.plot(np.mean(values), height, ls="none", **style.points)
+    axis.plot(values, [height - _LANE] * len(values), "o", ms=4.0, mfc=style.color, mec="white", mew=0.7, zorder=4)
+    _draw_mean(axis, style, float(np.mean(values)), height)
 
 
-def _draw_point(axis: Axes, style: ArmStyle, scenarios: dict[str, Any], margin: str) -> None:
-    own, attacked = scenarios[AS_TRAINED], scenarios.get(ATTACKED, scenarios[AS_TRAINED])
-    draw_estimate(axis, style, attacked["rate"], attacked["rate_ci95"], own["return"], own["return_ci95"])
-    if margin:
-        point = (100.0 * attacked["rate"], own["return"])
-        axis.annotate(margin, point, (4.0, 4.0), textcoords="offset points", size=6.5)
+def _draw_mean(axis: Axes, style: ArmStyle, value: float, height: int) -> None:
+    points = style.points | {"marker": "o", "ms": _MEAN_SIZE, "mfc": "white" if style.hollow else style.color}
+    axis.plot(value, height, ls="none", zorder=3, **points)
+
+
+def _draw_interval(axis: Axes, style: ArmStyle, ends: list[float] | None, height: int, scale: float = 1.0) -> None:
+    if ends is not None:
+        axis.plot([scale * end for end in ends], [height] * 2, "-", color=style.color, lw=1.3)

@@ -36,6 +36,7 @@ from experiments.study.tables import (
     tables_by_name,
     training_table,
 )
+from experiments.terminal import GREATEST_WIDTH, wrapped
 from ncs_gym.reading import json_values, read_file, read_text
 from shields.atomic_write import write_atomically
 
@@ -112,7 +113,8 @@ def results_page(
 def results_tables(summary: dict[str, Any]) -> str:
     """Returns all tables as plain text: every arm and every combination of impairments."""
     known = _context(summary)
-    parts = [known["budget"], known["comparisons"], known["prices"], known["margins"]]
+    budget = "\n".join(wrapped(line, GREATEST_WIDTH) for line in known["budget"].splitlines())
+    parts = [budget, known["comparisons"], known["prices"], known["margins"]]
     for name in summary["environments"]:
         parts.append(f"{name}\n{known['evaluation'][name]}")
         if name in known["channels"]:

@@ -1,4 +1,4 @@
-"""The tables of a study as text, at most 100 columns wide: each is a pure function of the numbers that pages show."""
+"""The tables of a study as text: each is a pure function of the numbers that pages show."""
 
 from __future__ import annotations
 
@@ -29,28 +29,34 @@ _SCENARIOS = {
     "worst-case disturbance": ("worst", "dist."),
     "gaussian": ("Gauss", "noise"),
 }
+# Longest name of an arm whose row has room for all columns [characters].
+_LONGEST_NAME = 14
 
 
 def evaluation_table(env: dict[str, Any]) -> str:
-    """Returns violating episodes [%] in every scenario, the interval under attack, overridden steps and returns."""
+    """Returns violating episodes [%] in every scenario, the interval under attack, overridden steps and returns.
+
+    Behind long names the last two stand in a table of their own.
+    """
     known = next(iter(env["arms"].values()))["scenarios"]
     scenarios = [name for name in _SCENARIOS if name in known]
     interval_of = ATTACKED if ATTACKED in known else AS_TRAINED
-    head = [
-        ["violating [%]", *(_SCENARIOS[name][0] for name in scenarios), _SCENARIOS[interval_of][0], "over-", "return"],
-        ["", *(_SCENARIOS[name][1] for name in scenarios), "[95 % CI]", "ridden", "as trained"],
+    violating = [
+        ["violating [%]", *(_SCENARIOS[name][0] for name in scenarios), _SCENARIOS[interval_of][0]],
+        ["", *(_SCENARIOS[name][1] for name in scenarios), "[95 % CI]"],
     ]
-    rows = [
-        [
-            name,
-            *(f"{100 * arm['scenarios'][each]['rate']:.1f}" for each in scenarios),
-            _interval(arm["scenarios"][interval_of]["rate_ci95"], 100.0),
-            "-" if arm["mode"] is None else f"{100 * arm['scenarios'][AS_TRAINED]['overridden']:.1f} %",
-            _return(arm["scenarios"][AS_TRAINED]),
-        ]
-        for name, arm in env["arms"].items()
-    ]
-    return text_table([*head, *rows], rules=(len(head), len(head) + len(env["trained"])))
+    trained = [["over-", "return"], ["ridden", "as trained"]]
+    for name, arm in env["arms"].items():
+        rates = [f"{100 * arm['scenarios'][each]['rate']:.1f}" for each in scenarios]
+        violating.append([name, *rates, _interval(arm["scenarios"][interval_of]["rate_ci95"], 100.0)])
+        own = arm["scenarios"][AS_TRAINED]
+        trained.append(["-" if arm["mode"] is None else f"{100 * own['overridden']:.1f} %", _return(own)])
+    rules = (2, 2 + len(env["trained"]))
+    if max(map(len, env["arms"])) <= _LONGEST_NAME:
+        return text_table([[*row, *more] for row, more in zip(violating, trained, strict=True)], rules)
+    names = ["", "", *env["arms"]]
+    others = [[name, *row] for name, row in zip(names, trained, strict=True)]
+    return f"{text_table(violating, rules)}\n\n{text_table(others, rules)}"
 
 
 def comparisons_table(summary: dict[str, Any]) -> str:
@@ -58,7 +64,7 @@ def comparisons_table(summary: dict[str, Any]) -> str:
 
     Beside them is what the first arm violates under the same attack on an ideal channel.
     """
-    rows = [["violating episodes [points]", "difference", "interval", "scenario", "ideal [%]"]]
+    rows = [["violating episodes", "differ-", "", "", "ideal"], ["[points]", "ence", "interval", "scenario", "[%]"]]
     for name, env in summary["environments"].items():
         rows += [[name]] if env["comparisons"] else []
         for index, each in enumerate(env["comparisons"]):
@@ -67,7 +73,7 @@ def comparisons_table(summary: dict[str, Any]) -> str:
             ideal = env["arms"][each["first"]]["scenarios"].get(ATTACKED_IDEAL)
             without_network = "-" if ideal is None else f"{100 * ideal['rate']:.1f}"
             rows.append([title, f"{100 * each['mean']:+z.1f}", level, each["scenario"], without_network])
-    return text_table(rows)
+    return text_table(rows, rules=(2,))
 
 
 def prices_table(summary: dict[str, Any]) -> str:
@@ -103,17 +109,20 @@ def margins_table(summary: dict[str, Any]) -> str:
 def network_table(summary: dict[str, Any]) -> str:
     """Returns what the network does to a filter that trusts its estimate, beside the arm with a proof.
 
-    These are violating episodes under attack, on an ideal channel and over the environment's own network.
+    These are violating episodes as trained, and under attack: on an ideal channel, and over the environment's own
+    network.
     """
-    rows = [["attacked, violating [%]", "ideal", "network", "95 % interval"]]
+    rows = [
+        ["violating", "as", "attacked,", "attacked,", ""],
+        ["[%]", "trained", "ideal", "network", "95 % interval"],
+    ]
     for title, env in summary["environments"].items():
         for name in (SECONDARY[0].first, SECONDARY[0].second):
             scenarios = env["arms"].get(name, {"scenarios": {}})["scenarios"]
             if {ATTACKED, ATTACKED_IDEAL} <= set(scenarios):
-                ideal, own = scenarios[ATTACKED_IDEAL], scenarios[ATTACKED]
-                rates = [f"{100 * each['rate']:.1f}" for each in (ideal, own)]
-                rows.append([f"{title} {name}", *rates, _interval(own["rate_ci95"], 100.0)])
-    return text_table(rows)
+                rates = [f"{100 * scenarios[each]['rate']:.1f}" for each in (AS_TRAINED, ATTACKED_IDEAL, ATTACKED)]
+                rows.append([f"{title} {name}", *rates, _interval(scenarios[ATTACKED]["rate_ci95"], 100.0)])
+    return text_table(rows, rules=(2,))
 
 
 def regulators_table(summary: dict[str, Any]) -> str:
@@ -167,10 +176,14 @@ def switches_table(rows: Sequence[dict[str, Any]]) -> str:
     """
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     points = list(dict.fromkeys(tuple(row["on"]) for row in rows))
-    table = [["attacked, violating [%]", *arms]]
+    heads = [arm.rpartition("+") for arm in arms]
+    table = [
+        ["attacked,", *(first + plus for first, plus, _ in heads)],
+        ["violating [%]", *(last for *_, last in heads)],
+    ]
     for point in points:
         table.append([_impaired(point), *(_violating(rows, arm, point) for arm in arms)])
-    return text_table(table)
+    return text_table(table, rules=(2,))
 
 
 def impairments_table(channels: Mapping[str, Sequence[dict[str, Any]]]) -> str:
@@ -249,7 +262,7 @@ def _return(evaluated: dict[str, Any]) -> str:
 
 def _impaired(point: Sequence[str]) -> str:
     """Returns the name of a combination of impairments."""
-    return "ideal" if not point else "all four" if len(point) == len(SWITCHES) else " + ".join(point)
+    return "ideal" if not point else "all four" if len(point) == len(SWITCHES) else "+".join(point)
 
 
 def _violating(rows: Sequence[dict[str, Any]], arm: str, point: Sequence[str]) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from ncs_gym import LinearPlant
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
+from shields.certificate_text import labeled
 from shields.errors import CertificateError
 from shields.verification.certified_conditions import certified_conditions
 from shields.verification.conditions import Condition, flag
@@ -48,7 +49,7 @@ class Report:
 def _line(alike: list[Condition]) -> str:
     least = min(alike, key=lambda condition: condition.margin)
     count = "" if len(alike) == 1 else f" (the least of {len(alike)})"
-    return f"{'holds ' if least.holds else 'BROKEN'}  {least.margin:+.3e}  {least.name}{count}"
+    return labeled(f"{'holds ' if least.holds else 'BROKEN'}  {least.margin:+.3e}  ", f"{least.name}{count}")
 
 
 @own_error_state

@@ -19,6 +19,7 @@ class Endless:
 
     total_steps = 10**9
     parts = ("waiting",)
+    unit = "step"
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> Any:
         """Never returns."""

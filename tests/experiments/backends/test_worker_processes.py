@@ -49,10 +49,10 @@ def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
 
 def test_progress_bar_names_what_its_steps_are(endless, tmp_path, capsys, without_workers):
     results_of([replace(endless, episodes=1)], tmp_path / "fixed", BackendSettings(jobs=1))
-    assert "\revaluation: 100%" in capsys.readouterr().err
+    assert "\nevaluation: 100%" in capsys.readouterr().err
     small = dict(n_envs=1, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
     run = replace(endless, policy_kind="trained", episodes=1, steps=8, settings=small)
     results_of([run], tmp_path / "trained", BackendSettings(jobs=1))
     shown = capsys.readouterr().err
-    assert "\rtraining and evaluation: 100%" in shown
+    assert "\ntraining and evaluation: 100%" in shown
     assert f"/{run.total_steps} [" in shown

@@ -422,7 +422,7 @@ def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, counted
     head, *lines = capsys.readouterr().out.splitlines()
     assert head == "3,200 steps, 200 in each episode"
     cells = ["16", "3", "0.1%", "0", "0", "2.1e-01", "2.5e-01", "50.0%", "0.0%"]
-    assert next(line for line in lines if line.startswith("  overtaking")).split() == ["overtaking", *cells]
+    assert next(line for line in lines if line.startswith(" overtaking")).split() == ["overtaking", *cells]
     assert document(tmp_path / "kept")["settings"]["horizon"] == 6
     assert document(tmp_path / "kept")["total"]["planned"] == 1600
     for more, words in (

@@ -1,5 +1,6 @@
 """What verification reports: the verdict, and margins that agree with floating point."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -60,13 +61,19 @@ def test_margins_of_several_inputs_agree_with_floating_point():
         assert margins[f"(U) input {i + 1}"] == pytest.approx(limit - used, rel=1e-12)
 
 
+def unfolded(report):
+    """The lines of a report, each condition on one; all are at most 80 columns wide."""
+    assert max(map(len, str(report).splitlines())) <= 80
+    return re.sub(r"\n {10,}", " ", str(report)).splitlines()
+
+
 def test_report_prints_the_verdict_and_one_line_per_condition(certificate, loaded):
     report = verified(certificate, loaded)
-    verdict, *lines = str(report).splitlines()
+    verdict, *lines = unfolded(report)
     assert verdict == f"valid: {len(lines)} of {len(lines)} conditions hold in exact arithmetic"
     assert [line.split("  ")[-1] for line in lines] == [condition.name for condition in report.conditions]
     report = verified(replace(certificate, K=certificate.K + 4.0), loaded)
-    verdict, *lines = str(report).splitlines()
+    verdict, *lines = unfolded(report)
     names = [condition.name for condition in report.conditions if not condition.holds]
     assert verdict == f"not valid: {len(names)} of {len(lines)} conditions broken"
     assert [line.split("  ")[-1] for line in lines if line.startswith("BROKEN")] == names

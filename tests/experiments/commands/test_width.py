@@ -1,0 +1,220 @@
+"""Whatever a command shows fits into a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.__main__ import COMMANDS
+from experiments.attack.attack_cases import attack_cases
+from experiments.attack.safety_counts import SafetyCounts, counts_table, gaussian_table
+from experiments.commands import loop, reproduce
+from experiments.report.text_tables import sweep_table
+from experiments.runs.loops import registered_env
+from experiments.settings import LoopSettings
+from experiments.study.study import results_tables
+from experiments.study.tables import QUOTABLE
+from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
+from ncs_gym import LinearPlant
+from tests.command import ROOT, ncs
+from tests.experiments.results import run, summary_of
+
+WIDTH = 80
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+LONG_CAMPAIGN = SafetyCounts(
+    steps=40_000_000,
+    episodes=2_000_000,
+    exits=2_500_000,
+    violations=1_200_000,
+    broken_episodes=400_000,
+    interventions=40_000_000,
+    level=1.25,
+    planned=40_000_000,
+    outside_starts=1_000_000,
+    lapsed=40_000_000,
+    lapsed_violations=1_234_567,
+    packets=40_000_000,
+    forced=40_000_000,
+    overdue=1_000_000,
+)
+
+
+def printed(*arguments):
+    """What a command prints, without the lines that name its files."""
+    done = ncs(*arguments, COLUMNS=str(WIDTH))
+    assert done.returncode == 0, done.stderr
+    return "\n".join(
+        line for line in done.stdout.splitlines() if not line.startswith(("files: ", "agent: ", "saved to "))
+    )
+
+
+class Shown:
+    """What each command shows, by its name: of short runs, or of the largest numbers and the longest names."""
+
+    def __init__(self, folder, request):
+        self.folder, self.request = folder, request
+
+    @property
+    def plant(self):
+        """The file of an unstable plant of one state, of which searches take no time."""
+        bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.01}
+        LinearPlant(A=[[1.2]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds).save(self.folder / "plant.json")
+        return self.folder / "plant.json"
+
+    def compare(self):
+        return self.request.getfixturevalue("smoke")[1].stdout.partition("files: ")[0]
+
+    def study(self):
+        summary = json.loads((ROOT / "docs" / "results.json").read_text())
+        tables = [table(summary) for name, table in QUOTABLE.items() if name != "budget"]
+        return "\n".join([results_tables(summary), *tables])
+
+    def train(self):
+        small = ("n_envs=2", "n_steps=64", "batch_size=64", "policy_kwargs=dict(net_arch=[8, 8])")
+        return printed("train", "--steps", 128, "--episodes", 1, "--hyperparams", *small, "--out", self.folder / "r")
+
+    def evaluate(self):
+        return printed("evaluate", "pretrained", "--env", CRUISE, "--shield", "lookahead", "--episodes", 1)
+
+    def sweep(self):
+        arms = summary_of({"shielded:project+penalty": [run("shielded:project+penalty")]})["arms"]
+        for arm in arms.values():
+            arm |= {"train_steps": 9_000_000, "train_violation_steps": 8_000_000, "eval_episodes": 5_000}
+        sides = {"loss": 0.05, "downlink_loss": 0.05, "delay": 12, "quantization_step": 0.05, "burst_length": 25.0}
+        here, there = sides | {"mass_factor": 1.05, "arms": arms}, dict.fromkeys(sides, 0) | {"mass_factor": 1.0}
+        return sweep_table([here, there | {"arms": arms}])
+
+    def render(self):
+        return printed("render", "--smoke", "--side-by-side", "--out", self.folder / "a.png")
+
+    def loop(self):
+        env = registered_env(CRUISE)
+        row = {"step": 12_345, "margin": 0.123, "age": 12, "missing": 12_345, "skipped": 12_345, "refused": 12_345}
+        row |= {f"x_hat_{name}": -123.4 for name in env.plant.state_names}
+        row |= {"intervened": 12_345, "guaranteed": False, "reason": "the state is not known to have stayed " * 3}
+        with pytest.MonkeyPatch.context() as patch:
+            stream = io.StringIO()
+            patch.setattr("sys.stdout", stream)
+            patch.setenv("COLUMNS", str(WIDTH))
+            with loop._view(LoopSettings(env=CRUISE, live="yes"), env) as show:
+                show(row)
+        summary = {
+            "ms into the step, 50/99.9/100 %": "123.45 / 123.45 / 123.45",
+            f"not proved, {row['reason']}": 12_345,
+        }
+        return f"{stream.getvalue()}\n{loop._text(summary)}"
+
+    def synthesize(self):
+        return printed("synthesize", "--plant", self.plant, "--max-age", 2, "--out", self.folder / "c.json")
+
+    def verify(self):
+        shown = [printed("verify", file) for file in sorted((ROOT / "shields" / "certificates").glob("C*.json"))]
+        return "\n".join(line for text in shown for line in text.splitlines() if " verifies" not in line)
+
+    def channel(self):
+        rng = np.random.default_rng(0)
+        lines = [f"{0.02 * i},{'' if rng.random() < 0.2 else 0.02 * i + 0.01}" for i in range(500)]
+        (self.folder / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
+        return printed("channel", self.folder / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+
+    def requirements(self):
+        asked = ("--send-periods", 1, 2, "--losses", *range(20), "--input-delays", 0, 1, "--jobs", 1)
+        return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r")
+
+    def attack(self):
+        cases = dict.fromkeys(attack_cases(0, 4), LONG_CAMPAIGN)
+        every = [counts_table(cases, looks_ahead=looks_ahead) for looks_ahead in (False, True)]
+        shown = self.request.getfixturevalue("attacked")[1].stdout
+        return "\n".join([*every, gaussian_table(cases, dict.fromkeys(cases, 0.5)), shown])
+
+    def audit(self):
+        """`tests/experiments/commands/test_audit.py` has every claim, which takes longer."""
+        from experiments.commands.audit import _text
+        from experiments.paper.audit import audited_claims
+        from experiments.paper.paper_example import PaperExample
+
+        claims = audited_claims(PaperExample())
+        return _text([next(claims) for _ in range(3)], WIDTH)
+
+    def reproduce(self):
+        names = ("outside_set", "outside_box", "input_asked_beyond", "steps", "largest_level", "largest_input")
+        names += ("largest_error", "epsilon", "largest_estimation_error")
+        return reproduce._table(dict.fromkeys(("printed", "charitable", "certified"), dict.fromkeys(names, 9_999_999)))
+
+
+@pytest.fixture
+def shown(tmp_path, request, without_workers):
+    return Shown(tmp_path, request)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_everything_that_a_command_prints_fits_into_80_columns(command, shown):
+    lines = getattr(shown, command)().splitlines()
+    assert len(lines) > 1
+    assert [line for line in lines if len(line) > WIDTH] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_into_80_columns(command):
+    usage, *lines = printed(command, "--help").splitlines()
+    assert usage.startswith("usage: ")  # tyro's own, which may be longer
+    assert [line for line in lines if len(line) > WIDTH] == []
+
+
+def test_rows_of_a_campaign_that_breaks_nothing_are_whole():
+    none = {"exits": 0, "violations": 0, "broken_episodes": 0, "level": 0.9, "lapsed": 0, "lapsed_violations": 0}
+    cases = attack_cases(0, 4)
+    counts = dict.fromkeys(cases, replace(LONG_CAMPAIGN, episodes=5_000_000 // len(cases), **none))
+    text = counts_table(counts, looks_ahead=False)
+    assert sum(line.startswith("case ") for line in text.splitlines()) == 1
+
+
+def test_columns_that_find_no_room_stand_below_behind_their_keys():
+    rows = [["name", *(f"column {i}" for i in range(12))], ["title"], ["a", *map(str, range(12))]]
+    first, second = text_table(rows).split("\n\n")
+    assert max(map(len, first.splitlines())) <= WIDTH
+    assert first.splitlines()[0].split() + second.splitlines()[0].split()[1:] == " ".join(rows[0]).split()
+    assert [part.splitlines()[2:][0] for part in (first, second)] == ["title"] * 2
+    cells = [part.splitlines()[-1].split() for part in (first, second)]
+    assert cells[0] + cells[1][1:] == rows[2]
+    assert cells[1][0] == "a"
+
+
+def test_only_a_key_and_a_cell_that_are_wider_together_make_a_row_longer():
+    assert max(map(len, text_table([["k" * 70, "v" * 20, "w"], ["", "", ""]]).splitlines())) == 91
+
+
+class Terminal(io.StringIO):
+    """A terminal that takes what is written to it."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_messages_share_no_line_with_a_progress_bar(stream, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(WIDTH))
+    monkeypatch.setattr("sys.stderr", errors := stream())
+    with warnings_as_sentences(), progress_bar(1000, "training and evaluation", "step") as bar:
+        bar.update(500)
+        say(f"shielded-0: {'many words of an outcome ' * 8}")
+        bar.update(500)
+    seen = [line.rpartition("\r")[2].rstrip() for line in errors.getvalue().splitlines()]
+    message = [line for line in seen if "words" in line]
+    assert not any("%" in line for line in message)
+    assert message[0].startswith("shielded-0: many")
+    assert len(message) == (3 if stream is Terminal else 1)  # in a file a message is a line
+    assert "100%" in seen[-1]
+    assert "\r" not in errors.getvalue() or stream is Terminal
+
+
+def test_a_bar_without_a_unit_shows_the_share_alone(monkeypatch):
+    monkeypatch.setattr("sys.stderr", errors := Terminal())
+    with progress_bar(2000, "search", "") as bar:
+        bar.update(2000)
+    assert "search: 100%" in errors.getvalue()
+    assert "2.00k" not in errors.getvalue()
