@@ -106,17 +106,17 @@ def main() -> None:
     parser.add_argument("--env", nargs="+", help="ids; all registered ones by default")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    print(f"{'id':34}{'what varies':28}may vary by")
+    print(f"{'id':36}{'what varies':28}may vary by")
     for env_id in options.env or registered_ids():
         env = ncs_env(gym.make(env_id))
         if env.plant.remainder is not None:
-            print(f"{env_id:34}{'':28}not at all: a remainder of its own", flush=True)
+            print(f"{env_id:36}{'':28}not at all: a remainder of its own", flush=True)
             continue
         for varied in [*VARIED.get(env_id.removeprefix("ncs_gym/").removesuffix("-v0"), []), Gain()]:
             share = largest_share(partial(has_certificate, varied, env_id))
             names = ", ".join(varied.values)
             found = f"{100 * share:.1f} %" if share < LARGEST else f"{100 * share:.0f} % or more"
-            print(f"{env_id:34}{names:28}{found}", flush=True)
+            print(f"{env_id:36}{names:28}{found}", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from experiments.attack.attack_cases import plant_cases
 from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
-from ncs_gym import ChannelContract, Ellipsoid, FunctionProcess, Remainder
+from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSVectorEnv, Remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from shields import VectorSafetyShield, verify
 from tests.certificates import certificate_of
@@ -122,3 +123,65 @@ def test_members_may_change_from_step_to_step(count, steps):
     counts = attacked("truck", plant, certified("truck"), count, steps // 2, process=process)
     assert counts["outside"] == counts["alarms"] == counts["left"] == 0
     assert counts["held"] == count * (steps // 2)
+
+
+def gains(**settings):
+    """The hull of three plants: two gains, and other poles with one of them."""
+    given = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.01, "sensor_bound": 0.002, "initial_bound": 0.005}
+    given |= settings
+    if "state_limits" in given:
+        del given["box"], given["u_max"]
+    moving = [([[0.9, 0.1], [0.0, 0.8]], 0.28), ([[0.9, 0.1], [0.0, 0.8]], 0.3), ([[0.89, 0.1], [0.01, 0.8]], 0.3)]
+    return LinearPlant.family(
+        [
+            LinearPlant.from_statespace((A, [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1), **given)
+            for A, gain in moving
+        ]
+    )
+
+
+LIMITS = {
+    "input delay": {"input_delay": 1},
+    "limits of rates": {"du_max": 0.4},
+    "two ends": {"state_limits": ([-0.6, -1.0], [1.0, 0.7]), "input_limits": (-0.5, 1.0)},
+    "both together": {"mixed_limits": [([0.0, 1.0], [0.5], -1.1, 1.1)]},
+    "a downlink": {},
+}
+
+
+@pytest.mark.parametrize(("count", "steps"), [(30, 60), pytest.param(200, 300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", LIMITS)
+def test_members_keep_limits_of_every_kind(kind, count, steps):
+    plant = gains(**LIMITS[kind])
+    downlink = Channel(delay=1, loss=0.4, max_consecutive_losses=1) if kind == "a downlink" else None
+    many = NCSVectorEnv(
+        count,
+        plant=plant,
+        channel=Channel(loss=0.4, delay=1),
+        downlink=downlink,
+        disturbance="adversarial",
+        noise="extreme",
+    )
+    certificate = certificate_of(plant, many.certificate_contract, "polytope")
+    shield = VectorSafetyShield(many, certificate, on_unproved="ignore")
+    rng = np.random.default_rng(0)
+    _, info = shield.reset(seed=0, options={"parameters": {"member": np.arange(count) % 3}})
+    agents, held, near, overridden = HostileAgents(count, plant, certificate, rng), 0, -1.0, 0
+    for _ in range(steps):
+        *_, info = shield.step(agents.act(info["estimate"]))
+        proved, worst = info["shield_guaranteed"], info["worst_constraint_values"].max(axis=1)
+        assert not (proved & ((info["cost"] > 0.0) | info["assumption_violated"])).any()
+        low, high = plant.input_ends
+        assert ((low <= info["input"]) & (info["input"] <= high)).all()
+        held, near = held + np.count_nonzero(proved), max(near, worst.max())
+        overridden += np.count_nonzero(info["shield_intervened"])
+    assert held == count * steps
+    assert near > -0.5  # the shield is what keeps them away
+    assert overridden > 0.1 * held
+
+
+def test_the_cases_of_a_file_move_the_members_that_it_holds(tmp_path):
+    varying_truck().save(tmp_path / "truck.json")
+    (attack_case, *_) = plant_cases(tmp_path / "truck.json", None).values()
+    env = NCSVectorEnv(8, plant=attack_case.plant, channel=attack_case.channel, process=attack_case.process)
+    assert {*env.reset(seed=0)[1]["parameters"][:, 0]} == {3800.0, 4200.0}
