@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 P = TypeVar("P", bound="LinearPlant")
 
 # Growth of the bound for the rounding of sums, and room for that of a function's entries, in units of the largest one
-# of their row.
+# of their row where that varies.
 ROUNDING, ROOM = 1e-9, 1e-12
 # Plants of a function at about so many points of the ranges check that its entries are monotone.
 GRID = 256
@@ -49,9 +49,10 @@ def plant_of_middle(
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
     first = plants[0]
-    low, high = (family.members.min(axis=0), family.members.max(axis=0)) if family.interval is None else family.interval
-    middle = 0.5 * (low + high)
-    off = np.abs(family.members - middle) if family.interval is None else np.maximum(high - middle, middle - low)[None]
+    middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
+    off = np.abs(family.members - middle)
+    if family.interval is not None:
+        off = np.abs(family.interval - middle).max(axis=0, keepdims=True)
     bound = _around(first, _largest(first, off))
     return replace(
         first,
@@ -93,7 +94,8 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
     _require_alike(kind, plants)
     matrices = np.array([np.concatenate([each.A, each.B], axis=1) for each in plants])
-    room = ROOM * np.abs(matrices).max(axis=(0, 2))[:, None] * np.isfinite(plants[0].reach)
+    varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
+    room = ROOM * (varies * np.abs(matrices).max(axis=(0, 2)))[:, None] * np.isfinite(plants[0].reach)
     interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
     parameters = np.array(corners)
     family = Family(names=names, parameters=parameters, members=matrices, function=function, interval=interval)

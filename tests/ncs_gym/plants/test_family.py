@@ -12,6 +12,7 @@ import pytest
 from scipy.linalg import expm
 
 from ncs_gym import Ellipsoid, LinearPlant, NCSEnv, Remainder, cart_pole, truck_trailer
+from ncs_gym.plants.linear_plant import inputs_under_way
 from ncs_gym.uncertainty.family import Family
 
 MASSES = {"mass": (3800.0, 4200.0)}
@@ -101,6 +102,13 @@ def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
     np.testing.assert_allclose(delayed.reach, [1.0, 2.0, 3.0, 3.0, 3.0])
     limited = LinearPlant.family([of(0.3, du_max=0.5), of(0.5, du_max=0.5)])
     np.testing.assert_allclose(np.sqrt(np.diag(limited.remainder.bound.shape_matrix)), [0, 0.3, 0], rtol=1e-8)
+    for more in ({"input_delay": 2}, {"du_max": 0.5}):
+        given = LinearPlant.family(partial(of, **more), {"gain": (0.3, 0.5)}, monotone=True)
+        wanted = delayed if "input_delay" in more else limited
+        assert inputs_under_way(given) == len(given.A) - 2
+        np.testing.assert_allclose(given.A, wanted.A, rtol=0, atol=1e-15)
+        found, right = (np.sqrt(np.diag(each.remainder.bound.shape_matrix)) for each in (given, wanted))
+        np.testing.assert_allclose(found, right, atol=1e-7)
 
 
 def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_members():
