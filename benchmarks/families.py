@@ -7,7 +7,7 @@ the functions that make the plants (`LinearPlant.family`, which checks on a grid
 
     python benchmarks/families.py [--env ncs_gym/CartPole-v0]
 
-Takes about ten minutes on one core.
+Takes about twenty minutes on one core.
 """
 
 from __future__ import annotations
