@@ -86,6 +86,7 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environme
 	$(BIN)/python benchmarks/kalman_gain.py
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/contracts.py
+	$(BIN)/python benchmarks/families.py
 	$(BIN)/python benchmarks/numerical_trust.py
 	$(BIN)/python benchmarks/environment_speed.py
 	$(BIN)/python benchmarks/rendering.py

@@ -23,7 +23,7 @@ from ncs_gym.plants.limits import MovedOperatingPointWarning
 from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
-from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
+from ncs_gym.processes import FamilyProcess, FunctionProcess, GymProcess, LinearProcess, Process, linear_model
 from ncs_gym.processes.linearization import NoEquilibriumWarning
 from ncs_gym.registration import register_all, register_plant
 from ncs_gym.rendering import Annotation
@@ -40,6 +40,7 @@ from ncs_gym.uncertainty.disturbances import (
     SphereDisturbance,
 )
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.family import Family
 from ncs_gym.uncertainty.remainder import Remainder
 
 __version__ = "0.1.0"
@@ -64,6 +65,8 @@ __all__ = [
     "ErrorSet",
     "ErrorSetError",
     "Estimator",
+    "Family",
+    "FamilyProcess",
     "FunctionProcess",
     "GilbertElliott",
     "GymProcess",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from ncs_gym import (
     ChannelContract,
     GilbertElliott,
     LinearPlant,
-    LinearProcess,
     NCSEnv,
     Process,
     bound_violation_probability,
@@ -50,7 +49,7 @@ class AttackCase:
         plant: The plant.
         channel: The channel between sensor and estimator.
         contract: Channel contract that the estimator assumes; None for a stable plant.
-        process: What really moves.
+        process: What really moves; None for the plant's own equations, or those of its family's members.
         downlink: The channel between controller and actuator; None for an ideal one.
         downlink_contract: What is assumed of the downlink; None for nothing.
     """
@@ -58,7 +57,7 @@ class AttackCase:
     plant: LinearPlant
     channel: Channel
     contract: ChannelContract | None = None
-    process: Process = field(default_factory=LinearProcess)
+    process: Process | None = None
     downlink: Channel | None = None
     downlink_contract: ChannelContract | None = None
 

@@ -33,7 +33,7 @@ from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.plant_step import PlantSimulation
-from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.processes.process import LinearProcess, Process, own_process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
@@ -81,7 +81,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     ## Starting state
     Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
     (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`. Other options of
-    `reset` give the episode another channel.
+    `reset` give the episode another channel, or another member of the plant's family.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the
@@ -115,6 +115,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `channel_delay` | int | steps | longest delay of this episode's channel |
     | `downlink_loss` | float | - | likewise of its downlink; zero for an ideal one |
     | `downlink_delay` | int | steps | likewise |
+    | `parameters` | `(f,)` | of the parameters | those of the member that moves; of the plant of a family alone |
 
     Args:
         plant: The plant with its bounds.
@@ -133,7 +134,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         noise: "truncated"; "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds but for a probability that `bound_violation_probability` bounds (docs/shield.md); or
             "extreme" for sensor noise and first errors as large as assumed, in random directions.
-        process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
+        process: What really moves (docs/beyond_linear.md); by default the plant's own equations, or those of a member
+            of its family (`LinearPlant.family`), another one in every episode.
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's
             settings guarantee.
@@ -205,7 +207,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
         self._initial_set = starting_set(initial_set, plant)
         require_suitable(self._task, plant)
-        self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
+        self._process_given = own_process(plant) if process is None else expect(process, Process, "process")
         if plant.between_samples is not None and not isinstance(self._process_given, LinearProcess):
             raise ValueError(
                 "between_samples is about the plant's own equations: beside another process= give a plant with "
@@ -261,20 +263,22 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
                 channel, a `Channel` or a function (rng) -> Channel that draws one. Contract, error set and spaces stay
                 those that the environment was made with: a channel that cannot keep the contract may break it, as ever,
                 one that rounds more coarsely than the environment's own, or delays commands by more than its
-                downlink commits ahead, is refused.
+                downlink commits ahead, is refused. {"parameters": {name: value}} fixes parameters of the member of a
+                family that moves in this episode; others are drawn.
 
         Raises:
             ValueError: If an option is unknown or wrong, or the environment cannot have the channel.
         """
         start = start_option(options, self._plant.n)
         read = [links.read((options or {}).get(name), name) for name, links in self._links()]
+        fixed = self._process.read_parameters((options or {}).get("parameters"))
         super().reset(seed=seed)
         self._consistent = False
         if seed is not None:
             self._process.forget()
         rng = self.np_random
         initial, first = (None, start) if start is not None else (self._initial_set, self._drawn_start(rng))
-        self._state, self.start = self._process.start(rng, first, initial)
+        self._state, self.start = self._process.start(rng, first, initial, fixed)
         self._task_state = self._task.begin(rng, self._plant)
         self._disturbance_memory = self._process.begin(rng)
         for (_, links), sources in zip(self._links(), read, strict=True):
@@ -459,7 +463,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
         happened = estimator.mean, self._state, inputs.missing, arrived
-        told = constraints, sampled, self._network, actions_of(inputs, self._plant, read)
+        told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant, read)
         return loop_info(self._known, *happened, self._contract, *told)
 
 

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from ncs_gym.network.channel import Channel, GilbertElliott, TraceChannel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, LinearProcess, PendulumProcess
+from ncs_gym.processes import CartPoleProcess, FamilyProcess, InvertedPendulumProcess, LinearProcess, PendulumProcess
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
@@ -44,7 +44,14 @@ JSON_SETTINGS: dict[str, tuple[type, ...]] = {
 # Classes whose fields do not tell them apart: their dictionaries have the class's name as "type".
 _BY_TYPE: dict[str, type] = {
     each.__name__: each
-    for each in (TraceChannel, BallDisturbance, SphereDisturbance, AdversarialDisturbance, LinearProcess)
+    for each in (
+        TraceChannel,
+        BallDisturbance,
+        SphereDisturbance,
+        AdversarialDisturbance,
+        LinearProcess,
+        FamilyProcess,
+    )
 }
 _BY_FIELDS = {each for kinds in JSON_SETTINGS.values() for each in kinds} | {GilbertElliott}
 # Plants by their documents: environments of one plant share what was computed for it.
@@ -75,6 +82,8 @@ def to_json(value: Any) -> Any:
     What is of a class of others, or holds a function, is returned as it is.
     """
     if isinstance(value, LinearPlant):
+        if value.remainder is not None and value.remainder.family is not None and value.remainder.family.function:
+            return value
         document = value.document
         _plants[_key(document)] = value
         return document

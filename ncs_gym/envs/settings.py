@@ -103,7 +103,7 @@ def start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
-    options = _known_options(options, {"state", *CHANNELS})
+    options = _known_options(options, {"state", "parameters", *CHANNELS})
     if "state" not in options:
         return None
     return as_vector(options["state"], n, "options['state']")
@@ -115,7 +115,7 @@ def vector_reset_options(options: dict[str, Any] | None, count: int, n: int) -> 
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
-    options = _known_options(options, {"state", "reset_mask", *CHANNELS})
+    options = _known_options(options, {"state", "parameters", "reset_mask", *CHANNELS})
     given = options.get("reset_mask", np.ones(count, np.bool_))
     mask = np.zeros(0, np.bool_) if as_numbers(given) is None else np.array(given)
     if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():

@@ -183,6 +183,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
                 {"channel": c}, {"downlink": c} give these environments other channels, one for all or a list of N, in
                 which None stands for an environment's own; see `NCSEnv.reset`. They are for these episodes; those that
                 begin by themselves have the environments' own again (`VectorRandomChannel` draws for every episode).
+                {"parameters": {name: value}} fixes parameters of these episodes, each a number or shape (N,).
 
         Raises:
             ValueError: If an option is unknown or wrong, or the environments cannot have the channel.
@@ -190,6 +191,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         mask, starts = vector_reset_options(options, self.num_envs, self._plant.n)
         links = list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
         read = [each.read((options or {}).get(name), name) for name, each in links]
+        fixed = self._process.read_parameters((options or {}).get("parameters"))
         if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
             seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
@@ -201,7 +203,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._consistent, self._ended = False, None
         for (_, each), sources in zip(links, read, strict=True):
             each.give(sources, np.flatnonzero(mask).tolist())
-        self._begin(mask, starts)
+        self._begin(mask, starts, fixed)
         self._worst = np.where(mask, self._plant.values_at_start(self._state), self._worst)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
@@ -358,13 +360,16 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             terminated, truncated = terminated & ~restarted, truncated & ~restarted
         return terminated, truncated
 
-    def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
-        """Starts episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set."""
+    def _begin(self, mask: np.ndarray, starts: np.ndarray | None, fixed: np.ndarray | None = None) -> None:
+        """Starts episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set.
+
+        `fixed` is what the process read of the parameters of a family, (N, k).
+        """
         rng, rows = self.np_random, np.flatnonzero(mask)
         count = len(rows)
         first_states, first_errors = self._first(count)
         initial, states = (self._single.initial_set, first_states) if starts is None else (None, starts[mask].T)
-        states, known = self._process.start_many(rng, states, initial, mask)
+        states, known = self._process.start_many(rng, states, initial, mask, fixed)
         task_state, memory = self._task.begin_many(rng, self._plant, count), self._process.begin(rng, count)
         channels, downlinks = self._uplinks.begin(rng, rows), self._downlinks.begin(rng, rows)
         if count == self.num_envs or not (self._uplinks.is_plain and self._downlinks.is_plain):
@@ -446,7 +451,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             asked, forced = self._requests.requested, self._requests.forced
         happened = self._estimator.mean, self._state, inputs.missing, arrived
         sampled = Requested(asked, forced, self._packets)
-        told = constraints, sampled, self._network, actions_of(inputs, self._plant)
+        told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant)
         return loop_info(self._known, *happened, self._contract, *told)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:

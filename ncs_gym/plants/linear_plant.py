@@ -11,6 +11,7 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,9 +22,11 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.plants import between_samples, limits, statespace
+from ncs_gym.plants.family import plant_of_middle
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.family import Family
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import (
@@ -72,6 +75,8 @@ LONGEST_INPUT_DELAY = 100
 # Disturbances of a step of a model whose response to a constant is worse conditioned are not traced back to its cause.
 LARGEST_CONDITION = 1e9
 _FORMAT = "ncs-gym plant 1"
+# What of a remainder, and of the family that it is about, stands in a file.
+_OF_REMAINDER, _OF_FAMILY = ("bound", "proved", "basis"), ("names", "parameters", "members")
 # The kinds of uncertainty: what a plant without it assumes, and the arguments that declare it.
 _KINDS = {
     "disturbances": ("no disturbance acts on the plant", "disturbance_bound, gamma or process_noise_cov"),
@@ -180,8 +185,8 @@ class LinearPlant(ReadOnlyArrays):
             low <= w <= high moves the operating point to where the middle of w rests: deviations are counted from it.
         sensor_bound: Of further sensor noise v; kept as an `Ellipsoid`.
         initial_bound: Of a further error of the first estimate; kept as an `Ellipsoid`.
-        remainder: What the model leaves out of the process that really moves, part of d (`ncs_gym.linear_model`); None
-            if nothing.
+        remainder: What the model leaves out of the process that really moves, part of d (`ncs_gym.linear_model`,
+            `family`); None if nothing.
         continuous_model: [Ac, Bc] of the model x' = Ac x + Bc u in continuous time that A and B were sampled from,
             shape (n, n + m) [1/s]; None if it is unknown.
         between_samples: Number N of times per step, 2 to 64, at which the box counts; with a bound on what is between
@@ -380,6 +385,34 @@ class LinearPlant(ReadOnlyArrays):
             plant = plant._storing(delay, delay)
         return plant if du_max is None else plant.with_rate_limits(du_max)
 
+    @classmethod
+    @own_error_state
+    def family(
+        cls,
+        members: Sequence[Self] | Callable[..., Self],
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        *,
+        monotone: bool = False,
+    ) -> Self:
+        """Returns the plant of the middle of a family, with a proved bound on what it leaves out of any member.
+
+        A certificate for it covers every member, also one that moves from one to another (docs/shield_proof.md, "Plants
+        that vary"). An environment draws a member for every episode; what the bound allows is not drawn beside.
+
+        Args:
+            members: Two plants or more that differ in A and B alone, whose convex hull is covered: the vertices. Or a
+                function of parameters given by name that returns such plants.
+            ranges: Lowest and highest value of each parameter of the function, up to 6 of them.
+            monotone: Whether every entry of A and B is monotone in each parameter while the others stay, anywhere in
+                the ranges. That is yours to prove; it bounds the entries by those of the corners, and is checked on a
+                grid. Needed for a function.
+
+        Raises:
+            ValueError: If members differ in anything else, are proved between samples or have a remainder, a claim of
+                monotone entries is contradicted or missing, a state that matters has no limit, or an argument is wrong.
+        """
+        return plant_of_middle(cls, members, ranges, monotone=monotone)
+
     @own_error_state
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
@@ -494,6 +527,10 @@ class LinearPlant(ReadOnlyArrays):
         # The further states of a model move as they should: stored inputs keep their limits.
         remainder = self.remainder
         if remainder is not None:
+            if remainder.family is not None:
+                raise ValueError(
+                    "inputs become states of the plants of a family one by one: give du_max to its members"
+                )
             remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored))))
         return replace(
             self,
@@ -718,6 +755,24 @@ class LinearPlant(ReadOnlyArrays):
     def largest_input(self) -> np.ndarray:
         """The largest |u_i| within the limits, shape (m,)."""
         return read_only(np.maximum(-self.input_low, self.input_high))
+
+    @cached_property
+    def reach(self) -> np.ndarray:
+        """The largest |x_j| in the safe box and |u_i| within the limits, shape (n + m,); infinite for a free state.
+
+        Of states that are past inputs those are the inputs' limits, which they never leave.
+        """
+        two_ends = np.isfinite(self.box_ends).all(axis=0)
+        limited, reach = self.box[two_ends].any(axis=0), np.full(self.n, np.inf)
+        with suppress(ZeroDivisionError):  # rows that limit a sum alone
+            reach[limited] = between_samples.widest(self.box[:, limited], self.box_ends)
+        for row, ends in zip(self.box, self.box_ends.T, strict=True):
+            if np.count_nonzero(row) == 1:
+                j = int(np.flatnonzero(row)[0])
+                reach[j] = min(reach[j], np.abs(ends / row[j]).max())
+        past = inputs_under_way(self)
+        reach[self.n - past :] = np.tile(self.largest_input, past // self.m)
+        return read_only(np.concatenate([reach, self.largest_input]))
 
     @cached_property
     def grid_rows(self) -> between_samples.GridRows | None:
@@ -1121,7 +1176,10 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, Ellipsoid):
         return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
-        return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
+        given = {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
+        return given if value.family is not None else {name: given[name] for name in _OF_REMAINDER}
+    if isinstance(value, Family):
+        return {name: _as_json(getattr(value, name)) for name in _OF_FAMILY}
     if isinstance(value, tuple):
         return list(value)
     return value.tolist() if isinstance(value, np.ndarray) else value
@@ -1131,8 +1189,10 @@ def _from_json(value: Any) -> Any:
     """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape, or a remainder."""
     if not isinstance(value, dict):
         return value
-    if set(value) == {entry.name for entry in fields(Remainder)}:
-        return Remainder(_from_json(value["bound"]), value["proved"], value["basis"])
+    if set(value) == {*_OF_FAMILY}:
+        return Family(**value)
+    if set(value) - {"family"} == {*_OF_REMAINDER}:
+        return Remainder(**{name: _from_json(each) for name, each in value.items()})
     if set(value) != {"shape"}:
         raise ValueError(
             f'a bound in the file of a plant must be a number, a list or {{"shape": ...}}, got {shown(value)}'

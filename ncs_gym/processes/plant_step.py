@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.processes.process import LinearProcess, Process, own_process
 from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import read_only
@@ -55,7 +55,7 @@ class PlantSimulation:
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         size: Number of environments; None for one without that axis.
         noise: How process noise, sensor noise and first errors are drawn, one of `NOISES`.
-        process: What moves; the plant's own equations by default.
+        process: What moves; the plant's own equations, or those of its family's members, by default.
 
     Attributes:
         plant: The plant whose noise and disturbances are drawn: without the remainder beside another process.
@@ -76,7 +76,7 @@ class PlantSimulation:
         noise: str = "truncated",
         process: Process | None = None,
     ) -> None:
-        given = LinearProcess() if process is None else process
+        given = own_process(plant) if process is None else process
         self.process, self._is_linear = given.opened(plant, size), isinstance(given, LinearProcess)
         self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
         self.disturbance, self.size = disturbance, size
@@ -104,6 +104,16 @@ class PlantSimulation:
     def truncated(self) -> Any:
         """Whether the process cut the episode off, a bool or shape (N,)."""
         return self.process.truncated
+
+    @property
+    def infos(self) -> dict[str, np.ndarray]:
+        """What infos say of the process: parameters of the member of a family, a fresh array, (k,) or (N, k)."""
+        parameters = self.process.parameters
+        return {} if parameters is None else {"parameters": parameters}
+
+    def read_parameters(self, given: Any) -> np.ndarray | None:
+        """Returns what an option of `reset` fixes of the parameters of the member of a family."""
+        return self.process.read_parameters(given, anywhere=self._allow)
 
     def _draw_process_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns process noise, and the disturbance where it depends on nothing but chance, shape (n, count)."""
@@ -160,7 +170,7 @@ class PlantSimulation:
         self.process_noise.forget()
 
     def start(
-        self, rng: np.random.Generator, state: np.ndarray, initial: Ellipsoid | None
+        self, rng: np.random.Generator, state: np.ndarray, initial: Ellipsoid | None, fixed: np.ndarray | None = None
     ) -> tuple[np.ndarray, Ellipsoid | np.ndarray]:
         """Starts an episode; returns its first state, shape (n,), and what that is known to lie in.
 
@@ -169,11 +179,13 @@ class PlantSimulation:
             state: Where it is to start, shape (n,).
             initial: The set that this was drawn from; None for a given state. A start elsewhere, where the process
                 itself went, is known as the state itself.
+            fixed: What `read_parameters` returned; None to draw all parameters.
 
         Raises:
             ValueError: If the process cannot start at a given state.
         """
         self._require_written(initial)
+        self.process.choose(rng, None, fixed)
         started = self.process.start(rng, state, None)
         self.alarm = False
         if initial is not None and (started is state or initial.contains(started)):
@@ -181,7 +193,12 @@ class PlantSimulation:
         return started, read_only(started)
 
     def start_many(
-        self, rng: np.random.Generator, states: np.ndarray, initial: Ellipsoid | None, mask: np.ndarray
+        self,
+        rng: np.random.Generator,
+        states: np.ndarray,
+        initial: Ellipsoid | None,
+        mask: np.ndarray,
+        fixed: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Starts the k episodes that a mask, shape (size,), chooses.
 
@@ -193,6 +210,7 @@ class PlantSimulation:
             ValueError: If the process cannot start at given states.
         """
         self._require_written(initial)
+        self.process.choose(rng, np.flatnonzero(mask), fixed)
         started = self.process.start(rng, states, np.flatnonzero(mask))
         self.alarm = self.alarm & ~mask
         known = started.T.copy()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.family import Family
 from ncs_gym.validation import as_flag, as_setting, shown
 
 
@@ -37,6 +38,34 @@ class Process:
             ValueError: If the process does not fit the plant.
         """
         return self
+
+    @property
+    def parameters(self) -> np.ndarray | None:
+        """Those of the present episode, shape (k,), or of N, shape (N, k); None if no episode differs from others."""
+        return None
+
+    def read_parameters(self, given: Any, *, anywhere: bool = False) -> np.ndarray | None:
+        """Returns what an option of `reset` fixes of the parameters of episodes, NaN where it fixes nothing.
+
+        Args:
+            given: A dictionary; None for nothing.
+            anywhere: Whether parameters beyond the ranges of the proof are allowed.
+
+        Raises:
+            ValueError: If there are no such parameters.
+        """
+        if given is not None:
+            raise ValueError("options['parameters'] is for the plant of a family (LinearPlant.family)")
+        return None
+
+    def choose(self, rng: np.random.Generator, chosen: np.ndarray | None, fixed: np.ndarray | None) -> None:
+        """Draws the parameters of episodes that begin; before `start`.
+
+        Args:
+            rng: Source of randomness.
+            chosen: Numbers of their environments, shape (k,); None without that axis.
+            fixed: What `read_parameters` returned; None for nothing.
+        """
 
     def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
         """Starts episodes, and returns the states that they start in.
@@ -82,6 +111,63 @@ class LinearProcess(Process):
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x + B u."""
         return plant.A.dot(state) + plant.B.dot(u)
+
+
+@dataclass(frozen=True)
+class FamilyProcess(Process):
+    """The equations of another member of the plant's family in every episode (`LinearPlant.family`)."""
+
+    vectorized: ClassVar[bool] = True
+
+    def opened(self, plant: LinearPlant, size: int | None) -> Process:
+        """Returns what moves the members of the present episodes.
+
+        Raises:
+            ValueError: If the plant is that of no family.
+        """
+        if plant.remainder is None or plant.remainder.family is None:
+            raise ValueError("FamilyProcess is for the plant of a family: make it by LinearPlant.family")
+        return _Members(plant, plant.remainder.family, size)
+
+
+class _Members(Process):
+    """One member of a family, or one of each of `size` environments; the plant of the middle until they are chosen."""
+
+    def __init__(self, plant: LinearPlant, family: Family, size: int | None) -> None:
+        self._family, self._size = family, size
+        count = 1 if size is None else size
+        self._matrices = np.tile(np.concatenate([plant.A, plant.B], axis=1), (count, 1, 1))
+        self._parameters = np.full((count, len(family.names)), np.nan)
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """Those of the present episodes, in the order of the family's names."""
+        return self._parameters.copy() if self._size is not None else self._parameters[0].copy()
+
+    def read_parameters(self, given: Any, *, anywhere: bool = False) -> np.ndarray:
+        """Returns the parameters that an option fixes, shape (k,) or (N, k)."""
+        return self._family.read(given, self._size, anywhere=anywhere)
+
+    def choose(self, rng: np.random.Generator, chosen: np.ndarray | None, fixed: np.ndarray | None) -> None:
+        """Draws members."""
+        values = np.full_like(self._parameters, np.nan) if fixed is None else fixed.reshape(self._parameters.shape)
+        for e in range(len(values)) if chosen is None else chosen.tolist():
+            drawn = self._family.drawn(rng, values[e])
+            self._matrices[e] = self._family.member(drawn)
+            self._parameters[e] = drawn
+
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns A_i x + B_i u."""
+        joint = np.concatenate([state, u])
+        if self._size is None:
+            return self._matrices[0].dot(joint)
+        return np.einsum("eij,je->ie", self._matrices, joint)
+
+
+def own_process(plant: LinearPlant) -> Process:
+    """Returns what moves where no process is given: the plant's own equations, or those of its family's members."""
+    has_members = plant.remainder is not None and plant.remainder.family is not None
+    return FamilyProcess() if has_members else LinearProcess()
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.family import Family
 from ncs_gym.validation import as_flag, require_short_text, shown
 
 
@@ -25,14 +26,17 @@ class Remainder:
         proved: Whether the bound follows from the equations of the process; False if it was found by sampling, so that
             every certificate *assumes* it.
         basis: Where the bound comes from, in a phrase.
+        family: The plants that the process is one of, of which each episode has another (`LinearPlant.family`); None if
+            it is something else.
 
     Raises:
-        ValueError: If the bound is not an ellipsoid, `proved` no truth value, or `basis` no text.
+        ValueError: If the bound is not an ellipsoid, `proved` no truth value, `basis` no text, or `family` none.
     """
 
     bound: Ellipsoid
     proved: bool
     basis: str
+    family: Family | None = None
     _model: ClassVar[Mapping[str, np.ndarray] | None] = None
 
     def __post_init__(self) -> None:
@@ -42,6 +46,8 @@ class Remainder:
         if not isinstance(self.basis, str):
             raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
         require_short_text(self.basis, "the basis of a remainder")
+        if not isinstance(self.family, Family | None):
+            raise ValueError(f"the family of a remainder must be a Family, got {shown(self.family)}")
 
     def of_model(self, model: Mapping[str, np.ndarray]) -> Self:
         """Returns the same remainder, which from now on belongs to this model alone.
@@ -50,8 +56,13 @@ class Remainder:
             model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt.
 
         Raises:
-            ValueError: If it belongs to another model.
+            ValueError: If it belongs to another model, or the members of its family are of another size.
         """
+        size = len(model["A"]), len(model["A"]) + model["B"].shape[1]
+        if self.family is not None and self.family.members.shape[1:] != size:
+            raise ValueError(
+                f"the members of the family must be [A, B] of shape {size}, got {self.family.members.shape[1:]}"
+            )
         if self._model is not None:
             others = [name for name, value in model.items() if not np.array_equal(value, self._model[name])]
             if others:

@@ -20,9 +20,11 @@ from ncs_gym import (
     ChannelContract,
     Ellipsoid,
     Estimator,
+    FamilyProcess,
     FunctionProcess,
     GilbertElliott,
     GymProcess,
+    LinearPlant,
     LinearProcess,
     NCSEnv,
     PacketLog,
@@ -45,9 +47,12 @@ from ncs_gym.uncertainty.disturbances import as_disturbance
 ID = "ncs_gym/TruckTrailerCruise-v0"
 DOWNLINK = {"downlink": Channel(delay=1), "downlink_contract": ChannelContract(2)}
 PLANT, ERRORS = pendulum(), certified_error_set(batch_reactor(), ChannelContract(3))
+FAMILY = LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
 SETTINGS = [
     PLANT,
     PLANT.remainder,
+    FAMILY,
+    FAMILY.remainder.family,
     PLANT.disturbance,
     truck_trailer().process_noise,
     ERRORS,
@@ -69,6 +74,7 @@ SETTINGS = [
     AdversarialDisturbance(np.eye(2)),
     as_disturbance(np.add, truck_trailer(), False),
     LinearProcess(),
+    FamilyProcess(),
     FunctionProcess(np.add),
     GymProcess(gym.make, np.asarray),
     CartPoleProcess(),

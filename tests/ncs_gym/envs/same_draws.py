@@ -89,6 +89,8 @@ class ScriptedEnv(NCSEnv):
         if np.isnan(many.starts[index]).any():
             self.start = self.initial_set
         self._process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
+        if (parameters := many._process.process.parameters) is not None:
+            self._process.process.choose(np.random.default_rng(0), None, parameters[index])
         self.estimator.reset(many._estimator.mean[:, index])
         self._task_state = np.copy(many._task_state[..., index])[()]
         self._disturbance_memory = np.copy(many._disturbance_memory[..., index])[()]
@@ -126,7 +128,9 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     """Scalar environments that follow each environment of a vector, which is made to record."""
     single = many.single
     allowed = single.allow_assumption_violation
+    moving = many._process.process
     many._process = RecordedProcess(many.plant, single.disturbance, allowed, many.num_envs, noise=single.noise)
+    many._process.process = moving  # with the members of families that the reset has drawn
     many._process.noise_now = np.zeros((many.plant.p, many.num_envs))
     many.np_random = rng = RecordingGenerator(many.np_random)
     begin = many._begin

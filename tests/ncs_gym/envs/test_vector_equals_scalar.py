@@ -16,6 +16,7 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     GilbertElliott,
+    LinearPlant,
     NCSEnv,
     NCSVectorEnv,
     SetpointTracking,
@@ -50,6 +51,7 @@ def make(name, count, **settings):
 ASKED = Channel(loss=0.6, delay=1, jitter=1, max_consecutive_losses=2, on_request=True)
 ENDLESS = {"max_episode_steps": None, "terminate_on_violation": False}
 TRUCK, SPEED = truck_trailer(mass=4000.0), SpeedTracking(change_probability=0.2)
+FAMILY = LinearPlant.family([truck_trailer(mass=mass) for mass in (3000.0, 4000.0, 5000.0)])
 SETPOINT = SetpointTracking(output=(1.0, 0.5), reach=0.8, width=0.3, change_probability=0.3)
 
 
@@ -59,8 +61,9 @@ def custom(plant, channel, **settings):
 
 def ending(channel, mode, **settings):
     """Episodes that end at different times, so that some environments send while others do not."""
-    settings |= {"max_episode_steps": 13, "autoreset_mode": mode, "terminate_on_violation": True}
-    return lambda: NCSVectorEnv(3, plant=TRUCK, channel=channel, task=SpeedTracking(), **settings)
+    settings = {"plant": TRUCK, "max_episode_steps": 13} | settings
+    settings |= {"autoreset_mode": mode, "terminate_on_violation": True}
+    return lambda: NCSVectorEnv(3, channel=channel, task=SpeedTracking(), **settings)
 
 
 ENVIRONMENTS = (
@@ -73,6 +76,10 @@ ENVIRONMENTS = (
     | {
         kind: custom(truck_trailer(), CHANNELS["bursts"], task=SETPOINT, disturbance=kind)
         for kind in ("adversarial", "sinusoid", "sphere", "box")
+    }
+    | {
+        f"family, {mode}": ending(CHANNELS["overtaking"], mode, plant=FAMILY, disturbance="adversarial")
+        for mode in ("NextStep", "SameStep")
     }
     | {
         f"{name}, {mode}": ending(CHANNELS[name], mode)

@@ -14,6 +14,7 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     Ellipsoid,
+    FamilyProcess,
     GilbertElliott,
     LinearPlant,
     Process,
@@ -151,6 +152,18 @@ def servo(factor: float = 1.2, **changes: Any) -> LinearPlant:
     return with_radii(plant, disturbance=factor, noise=factor)
 
 
+@cache
+def varying_truck() -> LinearPlant:
+    """The loaded truck, 4000 kg +- 5 %."""
+    return LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
+
+
+@cache
+def varying_cart_pole() -> LinearPlant:
+    """The cart-pole, mass and length of the pole +- 2 %."""
+    return LinearPlant.family(cart_pole, {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}, monotone=True)
+
+
 CASES = {
     "truck": lambda: stable(TRUCKS["1000 kg"], horizon=3),
     "cruise": lambda: stable(TRUCKS["4000 kg"], horizon=3),
@@ -171,6 +184,10 @@ CASES = {
     "cruise, both ways and at all times": lambda: two_ways(replace(TRUCKS["4000 kg"], between_samples=8), horizon=3),
     "cart-pole with remainder": lambda: registered("CartPoleNonlinear", horizon=6),
     "pendulum with remainder": lambda: registered("Pendulum"),
+    "cruise of 5 %, with remainder": lambda: stable(varying_truck(), horizon=3, process=FamilyProcess()),
+    "cart-pole of 2 %, with remainder": lambda: unstable(
+        varying_cart_pole(), 3, safe_set="polytope", horizon=6, process=FamilyProcess()
+    ),
 }
 
 

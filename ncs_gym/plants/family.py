@@ -1,0 +1,191 @@
+"""The plant of the middle of a family of plants, with a proved bound on what it leaves out of each of them.
+
+For x in the safe box and u within the limits, what the middle (A, B) leaves out of a member, (A_i - A) x + (B_i - B) u,
+is at most sum_j |[A_i - A, B_i - B]|_j w_j, entry by entry, with w the largest |x_j| and |u_j|. It is linear in the
+member, so a bound for some members is one for their convex hull (docs/shield_proof.md, "Plants that vary").
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import reduce
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from ncs_gym import exact
+from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.family import Family, entry_name, matrices_of
+from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.validation import as_names, as_number, shown
+
+if TYPE_CHECKING:
+    from ncs_gym.plants.linear_plant import LinearPlant
+
+P = TypeVar("P", bound="LinearPlant")
+
+# Growth of the bound for the rounding of sums, and room for that of a function's entries, in units of the largest one
+# of their row where that varies.
+ROUNDING, ROOM = 1e-9, 1e-12
+# Plants of a function at about so many points of the ranges check that its entries are monotone.
+GRID = 256
+MOST_PARAMETERS = 6
+# In what members may differ; the plant of the middle has no model in continuous time.
+_OWN = ("A", "B", "continuous_model")
+
+
+def plant_of_middle(
+    kind: type[P], members: Sequence[P] | Callable[..., P], ranges: Mapping[str, Any] | None, *, monotone: bool
+) -> P:
+    """Returns what `LinearPlant.family` does, of plants of this class."""
+    if callable(members):
+        family, plants, basis = _of_function(kind, members, ranges, monotone)
+    elif ranges is None and not monotone:
+        family, plants, basis = _of_plants(kind, members)
+    else:
+        raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
+    first = plants[0]
+    middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
+    off = np.abs(family.members - middle)
+    if family.interval is not None:
+        off = np.abs(family.interval - middle).max(axis=0, keepdims=True)
+    bound = _around(first, _largest(first, off))
+    return replace(
+        first,
+        A=middle[:, : first.n],
+        B=middle[:, first.n :],
+        continuous_model=None,
+        remainder=Remainder(bound, True, basis, family),
+    )
+
+
+def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:
+    """Returns the family of plants, the plants, and whose bound it is."""
+    if not isinstance(members, (list, tuple)) or len(members) < 2:
+        raise ValueError(
+            f"a family must be a list of two plants or more, or a function of ranges, got {shown(members)}"
+        )
+    plants = list(members)
+    _require_alike(kind, plants)
+    matrices = np.array([np.concatenate([each.A, each.B], axis=1) for each in plants])
+    family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices)
+    return family, plants, f"for the convex hull of {len(plants)} plants"
+
+
+def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monotone: bool) -> tuple[Family, list[P], str]:
+    """Returns the family of a function, the plants of its corners, and whose bound it is."""
+    if not isinstance(ranges, Mapping) or not 1 <= len(ranges) <= MOST_PARAMETERS:
+        raise ValueError(
+            f"ranges must be a dictionary of 1 to {MOST_PARAMETERS} parameters with their (low, high), got "
+            f"{shown(ranges)}"
+        )
+    if not monotone:
+        raise ValueError(
+            "between the ends of the ranges the plants of a function may be anything: say monotone=True if every entry "
+            "of A and B is monotone in each parameter, or give the list of plants whose convex hull holds yours"
+        )
+    names = as_names(list(ranges), tuple(map(str, ranges)), "the names of parameters")
+    ends = [_ends(name, value) for name, value in ranges.items()]
+    corners = [np.array(corner) for corner in itertools.product(*ends)]
+    plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
+    _require_alike(kind, plants)
+    matrices = np.array([np.concatenate([each.A, each.B], axis=1) for each in plants])
+    varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
+    room = ROOM * (varies * np.abs(matrices).max(axis=(0, 2)))[:, None] * np.isfinite(plants[0].reach)
+    interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
+    parameters = np.array(corners)
+    family = Family(names=names, parameters=parameters, members=matrices, function=function, interval=interval)
+    checked = _check_monotone(family, room)
+    shown_ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(names, ends, strict=True))
+    basis = f"for {shown_ranges}, entries of A and B being monotone in each (given, and checked at {checked:,} points)"
+    return family, plants, basis
+
+
+def _ends(name: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise ValueError(f"the range of {name} must be a pair (low, high), got {shown(value)}")
+    low, high = (as_number(end, f"an end of the range of {name}") for end in value)
+    if not low < high:
+        raise ValueError(f"the range of {name} must be (low, high) with low < high, got {shown(value)}")
+    return low, high
+
+
+def _require_alike(kind: type[P], plants: list[P]) -> None:
+    """Raises ValueError unless all are plants that differ in A and B alone."""
+    for number, each in enumerate(plants):
+        if not isinstance(each, kind):
+            raise ValueError(f"the members of a family must be of type {kind.__name__}, got {shown(each)}")
+        if each.remainder is not None:
+            raise ValueError(
+                "a member of a family has a remainder of its own, for which no bound of the family is proved"
+            )
+        if each.between_samples is not None:
+            raise ValueError("between_samples is not proved for a family: give its members without it")
+        for entry in fields(each):
+            one, other = getattr(plants[0], entry.name), getattr(each, entry.name)
+            if entry.name not in _OWN and not _is_same(one, other):
+                raise ValueError(
+                    f"the members of a family may differ in A and B alone, and member {number} has another {entry.name}"
+                )
+        matrices_of(each, (plants[0].n, plants[0].n + plants[0].m))
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    one, other = (each.shape_matrix if isinstance(each, Ellipsoid) else each for each in (one, other))
+    return bool(np.array_equal(one, other))
+
+
+def _check_monotone(family: Family, room: np.ndarray) -> int:
+    """Checks on a grid that entries are monotone up to `room`, shape (n, n + m); returns its number of points.
+
+    Raises:
+        ValueError: If an entry is not, with its name and that of the parameter.
+    """
+    k, (low, high) = len(family.names), family.ranges
+    each = max(int(GRID ** (1.0 / k) + 1e-9), 3)
+    points = np.array([*itertools.product(*np.linspace(low, high, each).T)])
+    values = np.array([family.of_function(point) for point in points]).reshape(*[each] * k, *room.shape)
+    for axis, name in enumerate(family.names):
+        change = np.diff(values, axis=axis)
+        both = np.any(change > room, axis=axis) & np.any(change < -room, axis=axis)
+        wrong = np.array(both).reshape(-1, *room.shape).max(axis=0)
+        if wrong.any():
+            raise ValueError(
+                f"{entry_name(wrong)} is not monotone in {name} from {low[axis]:g} to {high[axis]:g}, as monotone=True "
+                "says: give a smaller range, or the list of plants whose convex hull holds yours"
+            )
+    return each**k
+
+
+def _largest(plant: LinearPlant, off: np.ndarray) -> np.ndarray:
+    """Returns the half-widths of what the middle leaves out, shape (n,).
+
+    Args:
+        plant: A member.
+        off: How far entries of [A, B] are from the middle, shape (N, n, n + m).
+
+    Raises:
+        ValueError: If members differ in what an unlimited state does.
+    """
+    reach, differs = plant.reach, off.any(axis=(0, 1))
+    if free := np.flatnonzero(differs & np.isinf(reach)).tolist():
+        raise ValueError(
+            f"the members differ in what {plant.state_names[free[0]]} does, which no row of the box with two ends "
+            "limits: give it limits, if generous ones"
+        )
+    reach = np.where(differs, reach, 0.0)
+    return (1.0 + ROUNDING) * np.max([exact.product(each, reach) for each in off], axis=0)
+
+
+def _around(plant: LinearPlant, sizes: np.ndarray) -> Ellipsoid:
+    """Returns the ellipsoid of the smallest tr(W P) around a box of half-widths, shape (n,)."""
+    n = plant.n
+    sides = [as_bound((np.eye(n)[:, [i]], [size]), n, "the remainder") for i, size in enumerate(sizes.tolist()) if size]
+    if not sides:
+        return Ellipsoid(np.zeros((n, n)))
+    shapes = (each.shape_matrix for each in sides)
+    return Ellipsoid(reduce(lambda one, other: outer_sum(one, other, plant.relative_weight), shapes))

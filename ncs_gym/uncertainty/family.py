@@ -1,0 +1,154 @@
+"""The members of a family of plants that differ in A and B, of which each episode has one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_numbers, read_only, shown
+
+if TYPE_CHECKING:
+    from ncs_gym.plants.linear_plant import LinearPlant
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Family(ReadOnlyArrays):
+    """Plants x+ = A_i x + B_i u + d, told apart by parameters (`LinearPlant.family`).
+
+    Attributes:
+        names: Names of the parameters; "member", which counts from 0, for plants without any.
+        parameters: Their values for the members that are listed, shape (N, k): plants, or the corners of a function.
+        members: [A_i, B_i] of these, shape (N, n, n + m).
+        function: Returns the plant of parameters between those listed; None if there are no others. No file holds it:
+            a family that was read from one is that of the members listed.
+        interval: The low and the high entries of [A, B] of all that the function returns, shape (2, n, n + m); None
+            without one.
+
+    Raises:
+        ValueError: If a shape is wrong.
+    """
+
+    names: Sequence[str]
+    parameters: np.ndarray
+    members: np.ndarray
+    function: Callable[..., LinearPlant] | None = None
+    interval: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        members = as_numbers(self.members)
+        if members is None or members.ndim != 3 or not len(members) or not np.isfinite(members).all():
+            raise ValueError(f"the members of a family must be finite with shape (N, n, n + m), got {shown(members)}")
+        parameters = as_matrix(self.parameters, (len(members), None), "the parameters of a family")
+        default = tuple(f"p{number + 1}" for number in range(parameters.shape[1]))
+        object.__setattr__(self, "names", as_names(self.names, default, "the names of parameters"))
+        object.__setattr__(self, "parameters", parameters)
+        object.__setattr__(self, "members", np.array(members))
+        self._make_arrays_read_only()
+
+    @cached_property
+    def ranges(self) -> np.ndarray:
+        """The low and the high ends of the parameters, shape (2, k)."""
+        return read_only(np.array([self.parameters.min(axis=0), self.parameters.max(axis=0)]))
+
+    def read(self, given: Any, size: int | None, *, anywhere: bool = False) -> np.ndarray:
+        """Returns the parameters that an option of `reset` fixes, shape (k,) or (size, k); NaN where it fixes none.
+
+        Args:
+            given: A dictionary of some parameters, each a number or, for many environments, shape (size,); None for
+                an empty one.
+            size: Number of environments; None without that axis.
+            anywhere: Whether parameters beyond their ranges are allowed.
+
+        Raises:
+            ValueError: If it is no such dictionary, or there is no such member.
+        """
+        values = np.full((1 if size is None else size, len(self.names)), np.nan)
+        if given is not None and not (isinstance(given, Mapping) and set(given) <= set(self.names)):
+            raise ValueError(f"options['parameters'] must be a dictionary of {list(self.names)}, got {shown(given)}")
+        for name, value in (given or {}).items():
+            numbers, column = as_numbers(value), self.names.index(name)
+            if numbers is None or numbers.shape not in ((), (size,)) or not np.isfinite(numbers).all():
+                several = "" if size is None else f" or finite with shape ({size},)"
+                raise ValueError(f"{name} of options['parameters'] must be a number{several}, got {shown(value)}")
+            low, high = self.ranges[:, column].tolist()
+            if self.function is not None and not anywhere and ((numbers < low) | (numbers > high)).any():
+                raise ValueError(
+                    f"{name} must be between {low:g} and {high:g}, for which the family's bound is proved, got "
+                    f"{shown(value)}: allow_assumption_violation=True lets others move"
+                )
+            values[:, column] = numbers
+        if self.function is None:
+            for row in values:
+                self._fitting(row)
+        return values[0] if size is None else values
+
+    def drawn(self, rng: np.random.Generator, fixed: np.ndarray) -> np.ndarray:
+        """Returns the parameters of a member, shape (k,): uniform in their ranges, or one of the members listed.
+
+        Args:
+            rng: Source of randomness.
+            fixed: Parameters, shape (k,); NaN for those that are drawn.
+        """
+        if self.function is None:
+            rows = self._fitting(fixed)
+            return self.parameters[rows[rng.integers(len(rows))]]
+        return np.where(np.isnan(fixed), rng.uniform(*self.ranges), fixed)
+
+    def member(self, parameters: np.ndarray) -> np.ndarray:
+        """Returns [A, B] of the member with these parameters, shape (n, n + m).
+
+        Raises:
+            ValueError: If the function returns something else, or within the ranges what contradicts the interval.
+        """
+        if self.function is None:
+            return self.members[self._fitting(parameters)[0]]
+        matrices, (low, high) = self.of_function(parameters), self.ranges
+        if self.interval is not None and ((low <= parameters) & (parameters <= high)).all():
+            outside = (matrices < self.interval[0]) | (matrices > self.interval[1])
+            if outside.any():
+                given = dict(zip(self.names, parameters.tolist(), strict=True))
+                raise ValueError(
+                    f"{entry_name(outside)} at {shown(given)} is not between those at the ends of the ranges: it is no "
+                    "monotone entry, as monotone=True says"
+                )
+        return matrices
+
+    def of_function(self, parameters: np.ndarray) -> np.ndarray:
+        """Returns [A, B] of the plant that the function returns, shape (n, n + m), whatever it is."""
+        assert self.function is not None
+        plant = self.function(**dict(zip(self.names, parameters.tolist(), strict=True)))
+        return matrices_of(plant, self.members.shape[1:])
+
+    def _fitting(self, fixed: np.ndarray) -> np.ndarray:
+        """Returns the indices of the members listed that have these parameters, NaN fitting all."""
+        rows = np.flatnonzero((np.isnan(fixed) | (self.parameters == fixed)).all(axis=1))
+        if not len(rows):
+            wanted = {name: each for name, each in zip(self.names, fixed.tolist(), strict=True) if each == each}
+            listed = [dict(zip(self.names, row, strict=True)) for row in self.parameters.tolist()]
+            raise ValueError(f"no member of the family has {shown(wanted)}; it has {shown(listed)}")
+        return rows
+
+
+def matrices_of(plant: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns [A, B] of a plant, of a given shape.
+
+    Raises:
+        ValueError: If it is no plant, or of another shape.
+    """
+    A, B = getattr(plant, "A", None), getattr(plant, "B", None)
+    if not isinstance(A, np.ndarray) or not isinstance(B, np.ndarray):
+        raise ValueError(f"the function of a family must return a LinearPlant, got {shown(plant)}")
+    matrices = np.concatenate([A, B], axis=1)
+    if matrices.shape != shape:
+        raise ValueError(f"the plants of a family must have [A, B] of the same shape {shape}, got {matrices.shape}")
+    return matrices
+
+
+def entry_name(chosen: np.ndarray) -> str:
+    """Returns what the first entry of [A, B] that is chosen, shape (n, n + m), is called: A[0, 1] or B[0, 0]."""
+    (row, column), n = np.argwhere(chosen)[0].tolist(), len(chosen)
+    return f"A[{row}, {column}]" if column < n else f"B[{row}, {column - n}]"

@@ -1,0 +1,251 @@
+"""A family of plants: the bound that its middle is given, which members there are, and what is refused."""
+
+import copy
+import itertools
+import pickle
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from ncs_gym import Ellipsoid, LinearPlant, NCSEnv, Remainder, cart_pole, truck_trailer
+from ncs_gym.plants.linear_plant import inputs_under_way
+from ncs_gym.uncertainty.family import Family
+
+MASSES = {"mass": (3800.0, 4200.0)}
+POLE = {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}
+TRUCK = LinearPlant.family(truck_trailer, MASSES, monotone=True)
+POLES = LinearPlant.family(cart_pole, POLE, monotone=True)
+TRUCKS = [truck_trailer(mass=mass) for mass in (3800.0, 4000.0, 4300.0)]
+HULL = LinearPlant.family(TRUCKS)
+QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+SMALL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 2.0], "u_max": 3.0, "dt": 0.1} | QUIET
+
+
+def exact(matrix):
+    return [[Fraction(entry) for entry in row] for row in np.atleast_2d(matrix).tolist()]
+
+
+def solved(matrix, vector):
+    """The exact solution of P z = r, by elimination."""
+    rows = [[*row, entry] for row, entry in zip(matrix, vector, strict=True)]
+    for k in range(len(rows)):
+        rows[k] = [entry / rows[k][k] for entry in rows[k]]
+        for i in range(len(rows)):
+            if i != k:
+                rows[i] = [a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)]
+    return [row[-1] for row in rows]
+
+
+def largest_gauge(plant, members, widths):
+    """The largest r' R^-1 r of r = ([A_i, B_i] - [A, B]) z over members and the corners z of box and limits: exact.
+
+    It is convex in z and in the member, so that no point of box x limits and of the members' hull has a larger one.
+    """
+    middle, P = exact(np.hstack([plant.A, plant.B])), exact(plant.remainder.bound.shape_matrix)
+    largest = Fraction(0)
+    for member in members:
+        off = [
+            [a - b for a, b in zip(row, other, strict=True)] for row, other in zip(exact(member), middle, strict=True)
+        ]
+        for signs in itertools.product((-1, 1), repeat=len(widths)):
+            z = [sign * Fraction(width) for sign, width in zip(signs, widths, strict=True)]
+            r = [sum(a * b for a, b in zip(row, z, strict=True)) for row in off]
+            largest = max(largest, sum(a * b for a, b in zip(r, solved(P, r), strict=True)))
+    return largest
+
+
+def between(function, ranges, count, seed=0):
+    """[A, B] of plants at random parameters and at the corners."""
+    rng, ends = np.random.default_rng(seed), list(ranges.values())
+    points = [*itertools.product(*ends), *([rng.uniform(*end) for end in ends] for _ in range(count))]
+    plants = [function(**dict(zip(ranges, map(float, point), strict=True))) for point in points]
+    return [np.hstack([each.A, each.B]) for each in plants]
+
+
+@pytest.mark.parametrize(
+    ("plant", "members", "widths"),
+    [
+        (TRUCK, between(truck_trailer, MASSES, 20), (2.0, 2.0, 4.0)),
+        (POLES, between(cart_pole, POLE, 8), (2.4, 3.0, 0.2, 2.0, 10.0)),
+        (HULL, [np.hstack([each.A, each.B]) for each in TRUCKS], (2.0, 2.0, 4.0)),
+    ],
+)
+def test_bound_holds_every_member_exactly_and_is_not_far_larger(plant, members, widths):
+    gauge = largest_gauge(plant, members, widths)
+    assert 0.4 < gauge <= 1
+    assert plant.remainder.proved
+
+
+def test_members_inside_the_hull_leave_out_less_than_its_vertices():
+    rng = np.random.default_rng(0)
+    inside = np.einsum("ei,ijk->ejk", rng.dirichlet(np.ones(3), 20), HULL.remainder.family.members)
+    assert largest_gauge(HULL, inside, (2.0, 2.0, 4.0)) < 1
+    beyond = between(truck_trailer, {"mass": (3500.0, 4700.0)}, 0)
+    assert largest_gauge(HULL, beyond, (2.0, 2.0, 4.0)) > 1
+
+
+def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
+    def of(gain, **more):
+        limits = {"state_limits": ([-1.0, -2.0], [0.5, 2.0]), "input_limits": (-1.0, 3.0)}
+        model = (SMALL["A"], [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1)
+        return LinearPlant.from_statespace(model, **limits, **QUIET, **more)
+
+    plant = LinearPlant.family([of(0.3), of(0.5)])
+    np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.0, 0.3], rtol=1e-8)
+    np.testing.assert_allclose(plant.reach, [1.0, 2.0, 3.0])
+    delayed = LinearPlant.family([of(0.3, input_delay=2), of(0.5, input_delay=2)])
+    np.testing.assert_allclose(np.sqrt(np.diag(delayed.remainder.bound.shape_matrix)), [0, 0.3, 0, 0], rtol=1e-8)
+    np.testing.assert_allclose(delayed.reach, [1.0, 2.0, 3.0, 3.0, 3.0])
+    limited = LinearPlant.family([of(0.3, du_max=0.5), of(0.5, du_max=0.5)])
+    np.testing.assert_allclose(np.sqrt(np.diag(limited.remainder.bound.shape_matrix)), [0, 0.3, 0], rtol=1e-8)
+    for more in ({"input_delay": 2}, {"du_max": 0.5}):
+        given = LinearPlant.family(partial(of, **more), {"gain": (0.3, 0.5)}, monotone=True)
+        wanted = delayed if "input_delay" in more else limited
+        assert inputs_under_way(given) == len(given.A) - 2
+        np.testing.assert_allclose(given.A, wanted.A, rtol=0, atol=1e-15)
+        found, right = (np.sqrt(np.diag(each.remainder.bound.shape_matrix)) for each in (given, wanted))
+        np.testing.assert_allclose(found, right, atol=1e-7)
+
+
+def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_members():
+    def of(entry, column=0, **more):
+        A = np.array(SMALL["A"])
+        A[0, column] = entry
+        return LinearPlant(**SMALL | {"A": A} | more)
+
+    sums = {"box": np.array([[1.0, 1.0], [1.0, -1.0]])}
+    plant = LinearPlant.family([of(0.8, **sums), of(0.9, **sums)])
+    np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.05, 0.0], rtol=1e-8)
+    free = {"box": [np.inf, 2.0]}
+    plant = LinearPlant.family([of(0.1, 1, **free), of(0.2, 1, **free)])
+    np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.1, 0.0], rtol=1e-8)
+    with pytest.raises(ValueError, match="differ in what x1 does"):
+        LinearPlant.family([of(0.8, **free), of(0.9, **free)])
+    alone = {"box": np.array([[1.0, 1.0]])}
+    with pytest.raises(ValueError, match="differ in what x1 does"):
+        LinearPlant.family([of(0.8, **alone), of(0.9, **alone)])
+
+
+def test_middle_is_the_middle_of_the_entries_and_all_else_that_of_the_members():
+    ends = [truck_trailer(mass=mass) for mass in MASSES["mass"]]
+    np.testing.assert_allclose(TRUCK.A, 0.5 * (ends[0].A + ends[1].A), rtol=1e-12)
+    np.testing.assert_allclose(TRUCK.B, 0.5 * (ends[0].B + ends[1].B), rtol=1e-12)
+    same = replace(TRUCK, A=ends[0].A, B=ends[0].B, remainder=None)
+    assert same.fingerprint == ends[0].fingerprint
+    assert TRUCK.fingerprint != replace(TRUCK, remainder=None).fingerprint
+
+
+def test_what_is_proved_stands_in_the_sentence_of_a_certificate():
+    assert "bounded by proof" in TRUCK.remainder.sentence
+    assert "mass from 3800 to 4200" in TRUCK.remainder.sentence
+    assert "monotone" in TRUCK.remainder.sentence
+    assert "the convex hull of 3 plants" in HULL.remainder.sentence
+
+
+def test_file_holds_the_members_listed_of_a_function_the_corners(tmp_path):
+    for plant, count in ((HULL, 3), (POLES, 4)):
+        plant.save(tmp_path / "plant.json")
+        read = LinearPlant.load(tmp_path / "plant.json")
+        assert read.fingerprint == plant.fingerprint
+        assert read.remainder.sentence == plant.remainder.sentence
+        family, own = read.remainder.family, plant.remainder.family
+        np.testing.assert_array_equal(family.members, own.members)
+        np.testing.assert_array_equal(family.parameters, own.parameters)
+        assert (family.names, family.function, len(family.members)) == (own.names, None, count)
+        drawn = {tuple(NCSEnv(read, **_contract(read)).reset(seed=seed)[1]["parameters"]) for seed in range(30)}
+        assert drawn == set(map(tuple, own.parameters.tolist()))
+
+
+def _contract(plant):
+    from ncs_gym import ChannelContract
+
+    return {} if plant.spectral_radius < 1.0 else {"contract": ChannelContract(3)}
+
+
+def test_copies_and_pickles_are_read_only_and_keep_the_function():
+    for twin in (copy.deepcopy(TRUCK), pickle.loads(pickle.dumps(TRUCK))):
+        family = twin.remainder.family
+        assert family.function is truck_trailer
+        with pytest.raises(ValueError, match="read-only"):
+            family.members[0, 0, 0] = 1.0
+
+
+def test_members_are_those_of_the_continuous_model():
+    for mass in (3800.0, 3931.7, 4200.0):
+        model = np.array([[0.0, 1.0, 0.0], [-4500.0 / mass, -4600.0 / mass, 1.0], [0.0, 0.0, 0.0]])
+        np.testing.assert_allclose(TRUCK.remainder.family.member(np.array([mass])), expm(0.5 * model)[:2], rtol=1e-12)
+
+
+def bent(mass):
+    """Its gain rises and falls again."""
+    return LinearPlant(**SMALL | {"B": [[0.0], [0.3 + 0.01 * mass * (1.0 - mass)]]})
+
+
+def spiked(mass):
+    """Monotone at every point of the grid, not between two of them."""
+    return LinearPlant(**SMALL | {"B": [[0.0], [0.3 + 0.1 * mass + (0.4 < 255 * mass % 1 < 0.6)]]})
+
+
+def test_entries_that_are_not_monotone_are_found_on_the_grid_or_when_they_are_drawn():
+    with pytest.raises(ValueError, match=r"B\[1, 0\] is not monotone in mass from 0 to 1"):
+        LinearPlant.family(bent, {"mass": (0.0, 1.0)}, monotone=True)
+    half = LinearPlant.family(bent, {"mass": (0.0, 0.5)}, monotone=True)
+    assert half.remainder.bound.shape_matrix[1, 1] > 0.0
+    env = NCSEnv(LinearPlant.family(spiked, {"mass": (0.0, 1.0)}, monotone=True))
+    env.reset(options={"parameters": {"mass": 1.0 / 255}})
+    with pytest.raises(ValueError, match=r"B\[1, 0\] at .* is not between those at the ends"):
+        env.reset(options={"parameters": {"mass": 0.5 / 255}})
+
+
+def two(**changes):
+    return [LinearPlant(**SMALL), LinearPlant(**SMALL | changes)]
+
+
+MODEL = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1)))
+SAMPLED = LinearPlant.from_statespace(MODEL, dt=0.1, box=[1.0, 2.0], u_max=1.0, between_samples=4, **QUIET)
+LEFT_OUT = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
+REFUSED = {
+    "nothing between the ends": (lambda: LinearPlant.family(truck_trailer, MASSES), "say monotone=True if"),
+    "no ranges": (lambda: LinearPlant.family(truck_trailer), "ranges must be a dictionary of 1 to 6"),
+    "no range": (lambda: LinearPlant.family(truck_trailer, {"mass": 4000.0}, monotone=True), "must be a pair"),
+    "ends": (lambda: LinearPlant.family(truck_trailer, {"mass": (4.0, 3.0)}, monotone=True), "low < high"),
+    "ranges of plants": (lambda: LinearPlant.family(TRUCKS, MASSES), "about a function"),
+    "one plant": (lambda: LinearPlant.family(TRUCKS[:1]), "two plants or more"),
+    "no plant": (lambda: LinearPlant.family([*TRUCKS, 3]), "must be of type LinearPlant"),
+    "another box": (lambda: LinearPlant.family(two(box=[1.0, 1.0])), "member 1 has another box"),
+    "another noise": (lambda: LinearPlant.family(two(disturbance_bound=0.1)), "another disturbance_bound"),
+    "a step": (lambda: LinearPlant.family(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "another dt"),
+    "a remainder": (lambda: LinearPlant.family(two(remainder=LEFT_OUT)), "a remainder of its own"),
+    "between samples": (lambda: LinearPlant.family([SAMPLED, SAMPLED]), "between_samples is not proved for a family"),
+    "between samples later": (lambda: replace(HULL, between_samples=4), "between_samples"),
+    "rates later": (
+        lambda: LinearPlant.family(two(B=[[0.0], [0.4]])).with_rate_limits(0.5),
+        "give du_max to its members",
+    ),
+    "another step later": (lambda: HULL.resampled(0.25), "without a remainder"),
+    "another box later": (lambda: replace(HULL, box=[1.0, 1.0]), "another box"),
+    "not a plant": (lambda: LinearPlant.family(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "type LinearPlant"),
+    "sizes": (
+        lambda: replace(
+            HULL,
+            remainder=Remainder(
+                HULL.remainder.bound,
+                True,
+                "an example",
+                Family(names=["a"], parameters=[[0.0]], members=np.zeros((1, 3, 4))),
+            ),
+        ),
+        r"of shape \(2, 3\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_not_covered_is_refused_with_a_sentence(name):
+    call, sentence = REFUSED[name]
+    with pytest.raises(ValueError, match=sentence):
+        call()
