@@ -17,7 +17,6 @@ from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.design_problem import Rest, design_problem
 from shields.synthesis.diagnosis import Clock, infeasibility, is_feasible, with_feasible_bounds
 from shields.synthesis.ellipsoid_certificates import LOST, Progress, certify, largest_ellipsoid, nearby_ellipsoid
-from shields.synthesis.invariant_polytope import LONGEST_SEARCH
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
@@ -31,8 +30,8 @@ from shields.synthesis.polytope_certificates import (
 from shields.synthesis.resting_point import farthest_from_limits, limits_around, needs_resting_point, resting_at
 from shields.verification import verify
 
-# A refusal should take so long at most [s], of its thread's own time: the search for a polytope, and then the one for
-# changes that would help, end so much earlier, since what is under way then takes some seconds.
+# A refusal should take so long at most [s], of its thread's own time: searches after the first for a polytope, and then
+# for changes that would help, end so much earlier, since what is under way then takes some seconds.
 LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # Alternations of a search that begins near the design of a similar problem.
 _FEW_ALTERNATIONS = 4
@@ -252,7 +251,7 @@ def _second_search(
     certificate = _with_closer_limits(plant, contract) if was_sought else None
     if certificate is None and polytope and (was_sought or infeasible.binding == "B"):
         progress("no ellipsoid: seeking the gain whose polytope bears most")
-        certificate = most_tolerant_polytope(plant, contract, progress, min(LONGEST_SEARCH, clock.left))
+        certificate = most_tolerant_polytope(plant, contract, progress)
     if certificate is not None:
         return certificate
     if was_sought or infeasible.binding in ("B", "E1"):

@@ -34,8 +34,6 @@ _MARGINS = (1e-6, 2e-5)
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 # In the details of an `Infeasible`: it is the limits of rows and time that end the search.
 _TOO_LARGE = "too_large"
-# The search with the first margin ends after this part of the time.
-_FIRST_PART = 0.5
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
 # The ends of one row that are open.
@@ -130,16 +128,16 @@ def invariant_polytope(
         Infeasible: If there is none within `MOST_ROWS` rows and that time; the message says why.
     """
     fine, coarse = _MARGINS
-    now, longest = time.thread_time(), LONGEST_SEARCH if longest is None else longest
+    deadline = time.thread_time() + (LONGEST_SEARCH if longest is None else longest)
     try:
-        return _polytope_of(_ClosedLoop(feedback, plant, fine), progress, _IMPLIED, now + _FIRST_PART * longest)
+        return _polytope_of(_ClosedLoop(feedback, plant, fine), progress, _IMPLIED, deadline)
     except Infeasible as too_large:
         if _TOO_LARGE not in too_large.details:
             raise
         progress(f"polytope: {too_large}; seeking a coarser one")
         step, implied = _ClosedLoop(feedback, plant, coarse), _NEARLY_IMPLIED * coarse
         try:
-            return _polytope_of(step, progress, implied, now + longest)
+            return _polytope_of(step, progress, implied, deadline)
         except Infeasible as infeasible:
             if _TOO_LARGE in infeasible.details:
                 raise

@@ -128,7 +128,6 @@ def certify_polytope(
     contract: ChannelContract | None = None,
     progress: Progress = lambda line: None,
     rest: Rest | None = None,
-    longest: float | None = None,
 ) -> Certificate | None:
     """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
 
@@ -140,14 +139,13 @@ def certify_polytope(
         contract: Channel contract; with one, the error sets depend on the age of the newest sample.
         progress: Called with a line of text now and then.
         rest: The point around which it is sought; the operating point by default.
-        longest: How long the polytope is sought at most [s], as in `invariant_polytope`.
 
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
     try:
         rest = at_operating_point(plant) if rest is None else rest
-        return _certified_polytope(plant, K, contract, progress, rest, longest)
+        return _certified_polytope(plant, K, contract, progress, rest)
     except _NOT_CERTIFIED as failure:
         if isinstance(failure, Infeasible) and failure.binding != "P":
             raise
@@ -160,7 +158,7 @@ def _certified_polytope(
     contract: ChannelContract | None,
     progress: Progress,
     rest: Rest,
-    longest: float | None,
+    longest: float | None = None,
 ) -> Certificate:
     """Returns what `certify_polytope` does.
 
@@ -185,7 +183,6 @@ def most_tolerant_polytope(
     plant: LinearPlant,
     contract: ChannelContract | None,
     progress: Progress = lambda line: None,
-    longest: float | None = None,
 ) -> Certificate | None:
     """Returns a verified certificate of a polytope for the gain that bears the largest radii; None if none is found.
 
@@ -199,7 +196,7 @@ def most_tolerant_polytope(
         if gain is None or gain.margin < SUFFICIENT_MARGIN:
             return None
         _, K = problem.to_physical(np.eye(plant.n), gain.K)
-        found = certify_polytope(plant, K, contract, progress, longest=longest)
+        found = certify_polytope(plant, K, contract, progress)
     except Infeasible:
         return None
     except KeyboardInterrupt as interrupt:
@@ -255,7 +252,7 @@ def around_resting_point(
     reasons = []
     for each in tried:
         try:
-            longest = min(LONGEST_SEARCH, clock.left)
+            longest = min(LONGEST_SEARCH, clock.left) if reasons else LONGEST_SEARCH  # of gains after the first
             found = _certified_polytope(plant, each.K, contract, progress, each.rest, longest)
             return max([found, *known], key=polytope_share)
         except _NOT_CERTIFIED as failure:
