@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from shields.verification import ACTION_ROUNDING
 LONGEST_SEARCH = 60.0
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
 # and for what others imply only up to some part of it. Where the first makes too many rows, a larger one makes fewer.
-_MARGINS = (1e-6, 2e-5)
+MARGINS = (1e-6, 2e-5)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 # In the details of an `Infeasible`: it is the limits of rows and time that end the search.
@@ -112,7 +112,11 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
 
 
 def invariant_polytope(
-    feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object], longest: float | None = None
+    feedback: Feedback,
+    plant: LinearPlant,
+    progress: Callable[[str], object],
+    longest: float | None = None,
+    margins: Sequence[float] = MARGINS,
 ) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
@@ -123,25 +127,29 @@ def invariant_polytope(
         plant: Its plant.
         progress: Called with a line of text now and then.
         longest: How long the search takes at most [s of the thread's time]; `LONGEST_SEARCH` by default.
+        margins: Those of `MARGINS` that are tried, each where the one before makes too many rows.
 
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows and that time; the message says why.
     """
-    fine, coarse = _MARGINS
     deadline = time.thread_time() + (LONGEST_SEARCH if longest is None else longest)
-    try:
-        return _polytope_of(_ClosedLoop(feedback, plant, fine), progress, _IMPLIED, deadline)
-    except Infeasible as too_large:
-        if _TOO_LARGE not in too_large.details:
-            raise
-        progress(f"polytope: {too_large}; seeking a coarser one")
-        step, implied = _ClosedLoop(feedback, plant, coarse), _NEARLY_IMPLIED * coarse
+    too_large: Infeasible | None = None
+    for margin in margins:
+        implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
         try:
-            return _polytope_of(step, progress, implied, deadline)
+            return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied, deadline)
         except Infeasible as infeasible:
-            if _TOO_LARGE in infeasible.details:
-                raise
-            raise too_large from None  # a smaller margin would do, but for its rows
+            if not is_too_large(infeasible):  # with a smaller margin it is a matter of rows
+                raise (too_large or infeasible) from None
+            too_large = infeasible
+            progress(f"polytope: {infeasible}")
+    assert too_large is not None
+    raise too_large
+
+
+def is_too_large(infeasible: Infeasible) -> bool:
+    """Returns whether there may be a polytope, but not within the limits of rows and time."""
+    return _TOO_LARGE in infeasible.details
 
 
 def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float, deadline: float) -> Polytope:
@@ -264,7 +272,7 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
         plant: Its plant.
         points: Of the box, shape (count, n).
     """
-    step, total = _ClosedLoop(feedback, plant, _MARGINS[0]), len(points)
+    step, total = _ClosedLoop(feedback, plant, MARGINS[0]), len(points)
     if np.abs(np.linalg.eigvals(step.next)).max() >= 1.0:
         return 0.0
     points = (points - feedback.rest.state) / step.widths

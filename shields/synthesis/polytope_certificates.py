@@ -29,9 +29,11 @@ from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, SLACKS, Progre
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import (
     LONGEST_SEARCH,
+    MARGINS,
     Feedback,
     feedback_of,
     invariant_polytope,
+    is_too_large,
     points_of_box,
     share_in_polytope,
     share_of_points,
@@ -159,6 +161,7 @@ def _certified_polytope(
     progress: Progress,
     rest: Rest,
     longest: float | None = None,
+    margins: Sequence[float] = MARGINS,
 ) -> Certificate:
     """Returns what `certify_polytope` does.
 
@@ -168,7 +171,7 @@ def _certified_polytope(
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     K, proofs = exact.rounded(K, DIGITS, axis=1), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
-    polytope = invariant_polytope(feedback, plant, progress, longest)
+    polytope = invariant_polytope(feedback, plant, progress, longest, margins)
     faces = polytope.F
     L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
     L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
@@ -249,16 +252,21 @@ def around_resting_point(
             better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
         larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
         tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
-    reasons = []
-    for each in tried:
-        try:
-            longest = min(LONGEST_SEARCH, clock.left) if reasons else LONGEST_SEARCH  # of gains after the first
-            found = _certified_polytope(plant, each.K, contract, progress, each.rest, longest)
-            return max([found, *known], key=polytope_share)
-        except _NOT_CERTIFIED as failure:
-            reasons.append(str(failure))
-        if clock.is_over:
-            break
+    reasons: list[str] = []
+    for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
+        larger, longest = [], LONGEST_SEARCH
+        for each in tried:
+            try:
+                found = _certified_polytope(plant, each.K, contract, progress, each.rest, longest, (margin,))
+                return max([found, *known], key=polytope_share)
+            except _NOT_CERTIFIED as failure:
+                reasons.append(str(failure))
+                if isinstance(failure, Infeasible) and is_too_large(failure):
+                    larger.append(each)
+            if clock.is_over:
+                break
+            longest = min(LONGEST_SEARCH, clock.left)
+        tried = larger
     if known:
         return max(known, key=polytope_share)
     reason = reasons[0] if reasons else "no gain was found"
