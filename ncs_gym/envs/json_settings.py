@@ -82,7 +82,7 @@ def to_json(value: Any) -> Any:
     What is of a class of others, or holds a function, is returned as it is.
     """
     if isinstance(value, LinearPlant):
-        if value.remainder is not None and value.remainder.family is not None and value.remainder.family.function:
+        if value.members is not None and value.members.function is not None:
             return value
         document = value.document
         _plants[_key(document)] = value

@@ -91,9 +91,9 @@ class ErrorRecursion:
             first = ErrorStatistics(plant.kalman_covariances[2], plant.initial_error.shape_matrix, 0)
         self.first = first
         # Next to that of others, the deviation of a state that nothing disturbs would become smaller for ever, and all
-        # would where nothing disturbs any: covariances would not recur.
-        share = 2.0 ** -(covariance_bits + 4)
-        self._shares, self._smallest = share * plant.half_widths, share**2 * np.sqrt(np.diag(error_set.shape_at(0)))
+        # would where nothing disturbs any: covariances would not recur. Deviations are no smaller than this share of
+        # the largest one, each in units of what the certified set allows.
+        self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shape_at(0)))
 
     def coarser(self) -> ErrorRecursion:
         """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
@@ -156,9 +156,9 @@ class ErrorRecursion:
         return gain, self._rounded(covariance)
 
     def _rounded(self, covariance: np.ndarray) -> np.ndarray:
-        deviations = np.sqrt(covariance.diagonal())
-        smallest = self._shares * (deviations / self.plant.half_widths).max()
-        return _rounded(covariance, self._bits, np.maximum(smallest, self._smallest))
+        largest = (np.sqrt(covariance.diagonal()) / self._units).max()
+        smallest = self._share * min(max(largest, self._share), 1.0) * self._units
+        return _rounded(covariance, self._bits, smallest)
 
 
 def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndarray:

@@ -527,7 +527,7 @@ class LinearPlant(ReadOnlyArrays):
         # The further states of a model move as they should: stored inputs keep their limits.
         remainder = self.remainder
         if remainder is not None:
-            if remainder.family is not None:
+            if self.members is not None:
                 raise ValueError(
                     "inputs become states of the plants of a family one by one: give du_max to its members"
                 )
@@ -755,6 +755,11 @@ class LinearPlant(ReadOnlyArrays):
     def largest_input(self) -> np.ndarray:
         """The largest |u_i| within the limits, shape (m,)."""
         return read_only(np.maximum(-self.input_low, self.input_high))
+
+    @property
+    def members(self) -> Family | None:
+        """The members of which it is the middle (`family`); None for a plant that stands for itself."""
+        return None if self.remainder is None else self.remainder.family
 
     @cached_property
     def reach(self) -> np.ndarray:

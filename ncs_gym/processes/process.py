@@ -125,9 +125,9 @@ class FamilyProcess(Process):
         Raises:
             ValueError: If the plant is that of no family.
         """
-        if plant.remainder is None or plant.remainder.family is None:
+        if plant.members is None:
             raise ValueError("FamilyProcess is for the plant of a family: make it by LinearPlant.family")
-        return _Members(plant, plant.remainder.family, size)
+        return _Members(plant, plant.members, size)
 
 
 class _Members(Process):
@@ -166,8 +166,7 @@ class _Members(Process):
 
 def own_process(plant: LinearPlant) -> Process:
     """Returns what moves where no process is given: the plant's own equations, or those of its family's members."""
-    has_members = plant.remainder is not None and plant.remainder.family is not None
-    return FamilyProcess() if has_members else LinearProcess()
+    return LinearProcess() if plant.members is None else FamilyProcess()
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,7 @@ def around_resting_point(
 
     The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
     fixed one; where the share of the box is known, a better resting point then, and with `search_gain` a better gain.
-    Once the clock has run out, no further gain is tried.
+    Once the clock has run out, no further gain is tried, but for one with the larger margin.
 
     Raises:
         Infeasible: If none is found.
