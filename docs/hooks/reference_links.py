@@ -64,12 +64,13 @@ def _path(target: Any, page: Any) -> str:
 
 def _section(found: re.Match[str], target: Any) -> tuple[str, str]:
     """Returns the anchor of the section that a docstring names, and how the text names it."""
-    wanted = f"{found['number']}. " if found["number"] else found["title"]
-    if wanted is None:
+    title = " ".join((found["title"] or "").split())  # a docstring may break the line within it
+    wanted = f"{found['number']}. " if found["number"] else title
+    if not wanted:
         return "", ""
     for each in _headings(target.toc):
         if each.title.startswith(wanted):
-            return each.url, f", section {found['number']}" if found["number"] else f", {found['title']}"
+            return each.url, f", section {found['number']}" if found["number"] else f", {title}"
     raise ValueError(f"{target.file.src_uri} has no section {wanted!r}")
 
 
