@@ -16,7 +16,7 @@ from ncs_gym.envs.json_settings import from_json
 from ncs_gym.validation import AroundEnvironment, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee
-from shields.runtime.safety_filter import DEFAULT_HORIZON, MODES
+from shields.runtime.safety_filter import MODES, plan_horizon
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,11 @@ class ShieldSettings:
         penalty: Subtracted from the reward for every intervention.
         horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
         on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
+        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does.
 
     Raises:
         ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
-            that a shield takes.
+            that a shield takes, or horizon and steps are none that mode "lookahead" takes.
     """
 
     certificate: Certificate
@@ -40,6 +41,7 @@ class ShieldSettings:
     penalty: float = 0.0
     horizon: int | None = None
     on_unproved: str = "warn"
+    least_safe_steps: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.certificate, Certificate):
@@ -47,8 +49,8 @@ class ShieldSettings:
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
         LostGuarantee(self.on_unproved)
-        if self.mode == "lookahead" and self.horizon is None:
-            object.__setattr__(self, "horizon", DEFAULT_HORIZON)
+        if self.mode == "lookahead":
+            object.__setattr__(self, "horizon", plan_horizon(self.horizon, self.least_safe_steps))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -92,7 +92,7 @@ class Arm:
                 return loop
             if self.mode in FILTERS:
                 return replace(loop, filter=EstimateFilterSettings(self.mode, certificate, penalty, horizon))
-            return replace(loop, shield=ShieldSettings(certificate, self.mode, penalty, horizon, "ignore"))
+            return replace(loop, shield=ShieldSettings(certificate, self.mode, penalty, horizon, on_unproved="ignore"))
 
         training = filtered(settings.intervention_penalty * self.penalizes_interventions)
         if not self.filters_training:

@@ -107,7 +107,7 @@ class GuaranteeMonitor:
         self._input_delay = 0 if downlink is None else downlink.input_delay
         self._within_step = plant.grid_rows is not None or len(plant.mixed_rows) > 0
         self._is_promised = downlink is None or downlink.contract is not None
-        self._test = safety_filter.test
+        self._test, self._least = safety_filter.test, safety_filter.least_safe_steps
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * plant.half_widths / (2.0 if self._input_delay else 1.0)
         # Of the newest sample at present, while the contract of the certificate holds.
@@ -197,6 +197,15 @@ class GuaranteeMonitor:
         is_large = _not(state.certified)
         reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
         return _first(reason, is_large, LARGE_ERROR)
+
+    def safe_steps(self, state: MonitorState, stored: Any) -> Any:
+        """Returns for how many steps the box is kept whatever the network does: that of plans with inputs `stored`.
+
+        At most as many as are asked for, behind a downlink from the step on at which the next input takes effect. That
+        takes no contract of the samples: nothing but the bounds, which what is `broken` contradicts, and that what is
+        decided is applied. It is 0 while the state at present, or the way to it, is not proved to be in the box.
+        """
+        return np.minimum(stored, self._least) * ((state.broken == 0) & (state.wait == 0)) * self._is_promised
 
     def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
         if not self._under_way:

@@ -114,6 +114,11 @@ class MonitoredFilter:
         return len(self._stored)
 
     @property
+    def safe_steps(self) -> int:
+        """For so many steps the box is kept whatever the network does (`GuaranteeMonitor.safe_steps`)."""
+        return int(self._monitor.safe_steps(self._state, len(self._stored)))
+
+    @property
     def reason(self) -> str:
         """Why the state is not proved safe now; empty while it is."""
         return EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]

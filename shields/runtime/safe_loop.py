@@ -106,6 +106,8 @@ class SafeLoop(CopiedWhole):
         on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
             "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" if you read `guaranteed`.
             When one is raised, the call has come to its end: go on with `decide`.
+        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does; see
+            `SafetyFilter`.
 
     Attributes:
         filter: Makes the decisions.
@@ -139,8 +141,9 @@ class SafeLoop(CopiedWhole):
         downlink_contract: ChannelContract | None = None,
         on_unproved: str = "warn",
         echo_age: int | None = None,
+        least_safe_steps: int = 0,
     ) -> None:
-        self._filter = SafetyFilter(certificate, plant, mode, horizon)
+        self._filter = SafetyFilter(certificate, plant, mode, horizon, least_safe_steps)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self._lost = LostGuarantee(on_unproved)
@@ -387,6 +390,16 @@ class SafeLoop(CopiedWhole):
     def plan_length(self) -> int:
         """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
         return 0 if self._phase is _Phase.STOPPED else self._monitored.plan_length
+
+    @property
+    def safe_steps(self) -> int:
+        """For so many steps the box is kept whatever the network does; at most `least_safe_steps`, 0 in other modes.
+
+        It falls by at most one per step, while what `reason` names is nothing that contradicts the bounds, and if what
+        is decided is applied.
+        """
+        unknown = self._phase is _Phase.STOPPED or self._unknown is not None or self._applied.is_other
+        return 0 if unknown else self._monitored.safe_steps
 
     @property
     def estimate(self) -> np.ndarray:

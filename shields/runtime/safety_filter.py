@@ -55,7 +55,11 @@ class SafetyFilter(ReadOnlyArrays):
             proposed and says whether "switch" would have; it protects nothing. "lookahead" lets an input pass after
             which a certified plan keeps the state in the box until it is in S, and stores that plan
             (docs/lookahead.md).
-        horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
+        horizon: Longest plan of mode "lookahead", in steps; None is 6, or more if `least_safe_steps` takes more. Other
+            modes take none.
+        least_safe_steps: For so many steps the box is to be kept whatever the network does, of mode "lookahead"; 0 asks
+            for none. An input passes if it begins a certified plan that leaves as many inputs stored, and where no
+            input does, the longest plan is followed (docs/lookahead.md, "When the network goes silent").
 
     Attributes:
         test: The test of an input.
@@ -64,13 +68,15 @@ class SafetyFilter(ReadOnlyArrays):
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
         ValueError: If the mode is unknown, or "boundary" for more than twelve inputs, or the horizon is no whole number
-            from 1 to 50 or given for another mode than "lookahead".
+            from 1 to 50, or `least_safe_steps` none from 0 to one less than the horizon, or one of both is given for
+            another mode than "lookahead".
     """
 
     certificate: Certificate
     plant: LinearPlant
     mode: str = "project"
     horizon: int | None = None
+    least_safe_steps: int = 0
     test: SetTest = field(init=False, repr=False)
     lookahead: Lookahead | None = field(init=False, repr=False, default=None)
     _no_plan: np.ndarray = field(init=False, repr=False)
@@ -99,12 +105,14 @@ class SafetyFilter(ReadOnlyArrays):
         if self.mode == "lookahead":
             from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
 
-            given = DEFAULT_HORIZON if self.horizon is None else self.horizon
-            horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
+            horizon, least = plan_horizon(self.horizon, self.least_safe_steps), int(self.least_safe_steps)
             object.__setattr__(self, "horizon", horizon)
-            object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, MARGIN))
+            object.__setattr__(self, "least_safe_steps", least)
+            object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, least, MARGIN))
         elif self.horizon is not None:
             raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
+        elif self.least_safe_steps != 0:
+            raise ValueError(f'least_safe_steps is for mode "lookahead", mode {self.mode!r} takes none')
 
     @cached_property
     def _single(self) -> tuple[tuple[int], tuple[int]]:
@@ -157,7 +165,7 @@ class SafetyFilter(ReadOnlyArrays):
             if not low <= u <= high:  # neither NaN
                 return None
         test_margin, margin = self.test.margins_alone(estimate, errors, proposed)
-        if test_margin >= MARGIN:
+        if test_margin >= MARGIN and not self.least_safe_steps:
             return Decision(proposed, False, True, False, margin, REASONS[SAFE], self._no_plan)
         if isnan(test_margin):
             return None
@@ -198,7 +206,7 @@ class SafetyFilter(ReadOnlyArrays):
         decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
         if self.lookahead is not None:
             stored = plan.copy() if stored is None else stored
-            self.lookahead.keep(decided, np.flatnonzero(~passed & valid), estimates, errors, stored)
+            self.lookahead.keep(decided, valid, estimates, errors, stored)
         if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~decided.passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
@@ -355,6 +363,20 @@ class SafetyFilter(ReadOnlyArrays):
 
     def _expressible(self, inputs: np.ndarray) -> np.ndarray:
         return expressible(inputs.T, self.plant).T
+
+
+def plan_horizon(horizon: int | None, least_safe_steps: int) -> int:
+    """Returns the length of the longest plans of mode "lookahead".
+
+    Raises:
+        ValueError: If either is no whole number in its range, or such plans are too short for so many safe steps.
+    """
+    least = as_count(least_safe_steps, "least_safe_steps", low=0, high=LONGEST_HORIZON - 1)
+    given = max(DEFAULT_HORIZON, least + 1) if horizon is None else horizon
+    longest = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
+    if longest <= least:
+        raise ValueError(f"least_safe_steps = {least} takes plans of {least + 1} steps, got horizon = {longest}")
+    return longest
 
 
 def _as_array(value: Any) -> np.ndarray:

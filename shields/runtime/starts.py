@@ -154,10 +154,12 @@ def first_store(
     possible or by the estimate, shape (n,), and a first plan is certified.
     """
     lookahead = safety_filter.lookahead
-    if lookahead is None or known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN):
+    inside = known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN)
+    if lookahead is None or (inside and not lookahead.least):
         return np.empty((0, safety_filter.plant.m)), known.in_safe_set
     plan = safety_filter.first_plan(estimate, errors)
-    return plan, len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))
+    in_box = len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))
+    return plan, known.in_safe_set or in_box
 
 
 def _in_box(safety_filter: SafetyFilter, center: np.ndarray, errors: PredictedErrors) -> bool:

@@ -77,8 +77,9 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         penalty: float = 0.0,
         horizon: int | None = None,
         on_unproved: str = "warn",
+        least_safe_steps: int = 0,
     ) -> None:
-        self._make(env, certificate, mode, penalty, horizon, on_unproved)
+        self._make(env, certificate, mode, penalty, horizon, least_safe_steps, on_unproved)
         inner = self._inner
         self._look_at({*inner.episode_channels})
         self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
@@ -209,7 +210,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         is_safe = np.array([each[-1].in_safe_set for each in known])
         if len(self._stored):
             self._stored[..., restarted] = np.nan
-            for e in np.flatnonzero(restarted & ~is_safe).tolist():
+            chosen = restarted if self._filter.least_safe_steps else restarted & ~is_safe
+            for e in np.flatnonzero(chosen).tolist():
                 estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.single(e)
                 plan, is_safe[e] = first_store(self._filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
@@ -294,7 +296,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
             self._lost.note(reasons, np.arange(self.num_envs) if chosen is None else chosen)
         ahead = {}
         if len(self._stored):
-            ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)
+            stored = ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)
+            ahead["shield_safe_steps"] = self._monitor.safe_steps(state, stored)
         return ahead | {
             "shield_intervened": decided.intervened,
             "input_proposed": proposed.T,

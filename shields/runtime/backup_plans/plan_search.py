@@ -1,4 +1,4 @@
-"""The search for a certified plan whose first input is close to the proposed one.
+"""The search for a certified plan that is long enough and whose first input is close to the proposed one.
 
 Candidates come first: a given beginning, and then a gain at the predicted centers, limited or saturated. The solution
 of a convex program is tried last; whatever a solver says about it is not believed.
@@ -47,16 +47,6 @@ class Plans(NamedTuple):
     lengths: np.ndarray
     distances: np.ndarray
 
-    def some(self, chosen: np.ndarray) -> Plans:
-        """Returns those of some environments, given by their indices."""
-        return Plans(*(part[chosen] for part in self))
-
-    def improve(self, chosen: np.ndarray, others: Plans) -> None:
-        """Puts other plans of the environments chosen in place where they begin closer to the proposed inputs."""
-        closer = others.distances < self.distances[chosen]
-        for part, other in zip(self, others, strict=True):
-            part[chosen[closer]] = other[closer]
-
 
 class Planner:
     """Finds certified plans (docs/lookahead.md).
@@ -68,15 +58,17 @@ class Planner:
         first: The one-step test.
         fallback: The certificate's: the regulators have gains of their own around the same resting point.
         horizon: Largest length N of a plan.
+        wanted: Length of a plan that is long enough, at most N. A shorter one is taken only where none is: the longest.
         margin: By which plans must pass the test.
 
     Attributes:
         test: The plan test.
         horizon: N.
+        wanted: The same.
     """
 
-    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
-        self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
+    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, wanted: int, margin: float) -> None:
+        self.test, self.horizon, self.wanted = PlanTest(Prediction(first, horizon), margin), horizon, wanted
         self._plant, self._fallback, gain = first.plant, fallback, fallback.gain
         self._rest = read_only(np.concatenate(fallback[1:]))
         braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
@@ -85,13 +77,18 @@ class Planner:
         self._loops = np.concatenate(loops, axis=1)
         self._program = PlanProgram(self.test.prediction)
 
+    def ranks(self, lengths: np.ndarray) -> np.ndarray:
+        """Returns the lengths of plans as far as they count: up to what is long enough."""
+        return np.minimum(lengths, self.wanted)
+
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns a plan, (j, m), of a single environment, if the first candidates of `beginning_with` are enough."""
         plans = self._continued(estimate, proposed)
         certified = self.test.certified(estimate[None], self.test.tightenings_of(shape[None]), plans[None])[0]
+        certified = certified[:, self.wanted - 1 :]
         which = int(certified.any(axis=1).argmax())
-        length = int(certified[which].argmax()) + 1
-        return plans[which, :length] if certified[which, length - 1] else None
+        more = int(certified[which].argmax())
+        return plans[which, : self.wanted + more] if certified[which, more] else None
 
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
@@ -99,14 +96,20 @@ class Planner:
         """Returns certified plans whose first inputs are the proposed ones.
 
         After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
-        then K, or the saturated regulator. The first candidate that is certified counts; the solver is not asked.
+        then K, or the saturated regulator. The first candidate that is certified and long enough counts; the solver is
+        not asked.
         """
+        return self._best(
+            estimates, self.test.tightenings_of(shapes), self._begun(estimates, proposed, stored), proposed
+        )
+
+    def _begun(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
+        """Returns what `beginning_with` tries, shape (E, 4, N, m)."""
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, :2] = self._continued(estimates, proposed)
         beginnings[:, 2:, 0] = proposed[:, None]
         beginnings[:, 2, 1:] = stored[:, 1:]
-        candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 1, 0]])
-        return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
+        return completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 1, 0]])
 
     @own_error_state  # what is not finite passes no test
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
@@ -130,15 +133,18 @@ class Planner:
     ) -> Plans:
         """Returns certified plans whose first inputs are close to the proposed ones.
 
-        Candidates are the projected input and then the regulator, what is stored, and either gain from the start. The
-        solver is asked where none of them is certified; where plans end in S also if nothing is stored. Plans that end
-        in P would begin closer by it in a single step, but not in a loop (docs/lookahead.md), for three times the time.
+        Candidates are the projected input and then the regulator, what is stored, either gain from the start, and where
+        one input is no plan that is long enough, what begins with the proposal. The solver is asked where none of them
+        is certified; where plans end in S also if nothing is stored. Plans that end in P would begin closer by it in a
+        single step, but not in a loop (docs/lookahead.md), for three times the time.
         `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
         """
         tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
         candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
+        if self.wanted > 1:  # otherwise none of them is certified
+            candidates = np.concatenate([self._begun(estimates, proposed, stored), candidates], axis=1)
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
             needed = plans.lengths == 0
@@ -146,18 +152,34 @@ class Planner:
                 needed |= np.isnan(stored[:, 0, 0])
             left = np.flatnonzero(needed & (plans.distances > 0.0))
             if left.size:
-                plans.improve(left, self._solved(estimates[left], tightening.some(left), proposed[left]))
+                self._improve(plans, left, self._solved(estimates[left], tightening.some(left), proposed[left]))
         return plans
 
+    def _improve(self, plans: Plans, chosen: np.ndarray, others: Plans) -> None:
+        """Puts other plans of the environments chosen in place where they have a higher rank, or begin closer."""
+        own, other = self.ranks(plans.lengths[chosen]), self.ranks(others.lengths)
+        better = (other > own) | ((other == own) & (others.distances < plans.distances[chosen]))
+        for part, improved in zip(plans, others, strict=True):
+            part[chosen[better]] = improved[better]
+
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
-        """Returns the certified plan, of P of shape (E, P, N, m), that begins closest, and of equal ones the first."""
+        """Returns one certified plan of P for each environment, shape (E, P, N, m).
+
+        Of each that is long enough, the shortest such beginning counts, of others the longest. The plan of the highest
+        rank is returned; of several the one that begins closest, and of equal ones the first.
+        """
         certified = self.test.certified(estimates, tightening, plans)
-        any_length = certified.any(axis=-1)
-        lengths = np.where(any_length, certified.argmax(axis=-1) + 1, 0)
+        enough = certified[..., self.wanted - 1 :]
+        lengths = np.where(enough.any(axis=-1), self.wanted + enough.argmax(axis=-1), 0)
+        if self.wanted > 1:
+            longest = self.horizon - certified[..., ::-1].argmax(axis=-1)
+            lengths = np.where((lengths == 0) & certified.any(axis=-1), longest, lengths)
+        ranks = self.ranks(lengths)
         distances = np.sqrt(np.square(plans[:, :, 0] - proposed[:, None]).sum(axis=-1))
-        distances = np.where(any_length, distances, np.inf)
-        best, rows = distances.argmin(axis=1), np.arange(len(plans))
-        return Plans(plans[rows, best], lengths[rows, best], distances[rows, best])
+        distances = np.where(lengths > 0, distances, np.inf)
+        highest = ranks == ranks.max(axis=1, keepdims=True)
+        best, rows = np.where(highest, distances, np.inf).argmin(axis=1), np.arange(len(plans))
+        return Plans(*(part[rows, best] for part in (plans, lengths, distances)))
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
         """Returns the shortest certified parts of the program's plans, as inputs that can be applied.

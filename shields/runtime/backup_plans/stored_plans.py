@@ -22,6 +22,11 @@ class Lookahead:
     proposed one is applied and what follows it in its plan is stored. Without any, the next stored input is applied;
     where nothing is stored, K x_hat.
 
+    A plan that leaves at least `least` inputs stored is long enough. Where g > 0 of them are asked for, an input that
+    passes the one-step test is only a plan of one input, and is applied as it is only if it begins one that is long
+    enough. Where there is none, of the plans found and the stored one the longest is applied. So the smaller of g and
+    the number of inputs stored never falls by more than one per step.
+
     Its methods change decisions about N proposals in place, given the numbers of `some` of them, estimates x_hat (n,
     N), what is known of the Sigma_k of each, proposals (m, N) [physical units], and plans still stored (horizon, m, N),
     NaN beyond their ends.
@@ -30,26 +35,31 @@ class Lookahead:
         test: The one-step test.
         fallback: The certificate's.
         horizon: Longest plan, in steps.
+        least: g, smaller than the horizon.
         margin: By which plans must pass their test.
 
     Attributes:
+        least: g.
         planner: Finds the plans.
     """
 
-    def __init__(self, test: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
-        self._test, self._margin = test, margin
-        self.planner = Planner(test, fallback, horizon, margin)
+    def __init__(self, test: SetTest, fallback: Fallback, horizon: int, least: int, margin: float) -> None:
+        self._test, self.least, self._margin = test, least, margin
+        self.planner = Planner(test, fallback, horizon, least + 1, margin)
 
     def keep(
-        self, decided: Decision, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
+        self, decided: Decision, valid: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
     ) -> None:
-        """Lets inputs that failed the one-step test pass where a certified plan begins with them.
+        """Lets inputs within the limits (`valid`, shape (N,)) pass where a plan that is long enough begins with them.
 
         Of these decisions `input` is the proposed one, and `plan` is all NaN.
         """
+        some = np.flatnonzero(valid if self.least else valid & ~decided.passed)
         if some.size:
             known = self._rows(some, estimates, errors, decided.input, stored)
-            begun = self._begin(decided, some, self.planner.beginning_with(*known))
+            found = self.planner.beginning_with(*known)
+            found.lengths[found.lengths < self.planner.wanted] = 0
+            begun = self._begin(decided, some, found)
             decided.intervened[some[begun]] = False
 
     def complete(
@@ -62,14 +72,15 @@ class Lookahead:
         stored: np.ndarray,
     ) -> None:
         """Changes decisions of mode "project" about proposals that were not let pass."""
-        some = np.flatnonzero((decided.reason != SAFE) & (decided.reason != PLANNED))
+        some = np.flatnonzero((decided.reason != PLANNED) & ((decided.reason != SAFE) | (self.least > 0)))
         if not some.size:
             return
         changed = np.zeros(some.shape, np.bool_)
         searched = np.flatnonzero(decided.reason[some] != INVALID)
         if searched.size:
             changed[searched] = self._plan(decided, some[searched], estimates, errors, proposed, stored)
-        left = ~changed & (decided.reason[some] != PROJECTED) & ~np.isnan(stored[0, 0, some])
+        passes = (decided.reason[some] == SAFE) | (decided.reason[some] == PROJECTED)
+        left = ~changed & (self._ranks(stored[..., some]) > passes)
         resumed = some[left]
         decided.input[:, resumed], decided.plan[:-1, :, resumed] = stored[0][:, resumed], stored[1:, :, resumed]
         decided.fallback[resumed], decided.stored[resumed], decided.reason[resumed] = False, True, STORED
@@ -88,14 +99,22 @@ class Lookahead:
         proposed: np.ndarray,
         stored: np.ndarray,
     ) -> np.ndarray:
-        """Begins new plans where one is found that is closer than the projected input; returns where, (len(some),)."""
-        projected = decided.reason[some] == PROJECTED
-        closest = np.where(projected, decided.input[:, some], np.nan)
+        """Begins new plans where one is found that is closer than the input that passes, or longer; returns where.
+
+        Nowhere is it shorter, as far as lengths count, than what is stored.
+        """
+        passes = (decided.reason[some] == SAFE) | (decided.reason[some] == PROJECTED)
+        closest = np.where(passes, decided.input[:, some], np.nan)
         x_hat, shapes, wanted, plans = self._rows(some, estimates, errors, proposed, stored)
         found = self.planner.find(x_hat, shapes, wanted, closest.T, plans)
-        farther = projected & (found.distances >= norms(closest - proposed[:, some]))
-        found.lengths[farther] = 0
+        ranks = self.planner.ranks(found.lengths)
+        farther = passes & (ranks <= 1) & (found.distances >= norms(closest - proposed[:, some]))
+        found.lengths[farther | (ranks < self._ranks(stored[..., some]))] = 0
         return self._begin(decided, some, found)
+
+    def _ranks(self, stored: np.ndarray) -> np.ndarray:
+        """Returns the ranks of stored plans, shape (horizon, m, N)."""
+        return self.planner.ranks(np.count_nonzero(~np.isnan(stored[:, 0]), axis=0))
 
     def _rows(
         self, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, inputs: np.ndarray, stored: np.ndarray
@@ -109,7 +128,7 @@ class Lookahead:
         begun = found.lengths > 0
         if not np.count_nonzero(begun):
             return begun
-        inputs, lengths, _ = found.some(begun)
+        inputs, lengths = found.inputs[begun], found.lengths[begun]
         kept = np.arange(1, self.planner.horizon) < lengths[:, None]
         some = some[begun]
         decided.input[:, some] = inputs[:, 0].T

@@ -23,7 +23,10 @@ from tests.shields.attacks.worlds import (
     ALL_TIMES,
     BOX,
     ERROR,
+    FALL,
+    KEPT,
     SAFE_SET,
+    SILENCE,
     through_estimators,
     through_loop,
     through_shield,
@@ -31,7 +34,7 @@ from tests.shields.attacks.worlds import (
 
 pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning")
 
-MODES = ("project", "switch", "boundary", "lookahead")
+MODES = ("project", "switch", "boundary", "lookahead", SILENCE)
 # Environments and steps behind one network in the part, and behind each of them in the whole.
 SIZES = {
     "SafetyShield": ((None, 60), (None, 400)),
@@ -40,7 +43,7 @@ SIZES = {
 }
 # How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
 # than the safe set.
-CLOSE = {SAFE_SET: 0.9, BOX: 0.4, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
+CLOSE = {SAFE_SET: 0.9, BOX: 0.4, KEPT: 0.0, FALL: 0.0, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
 SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 0.8}
 WITH_REMAINDER = [name for name in CASES if name.endswith("with remainder")]
 
@@ -87,7 +90,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
             assert not far
     counts = sum((outcome.counts for outcome in outcomes), Counter())
     assert counts["overridden"] < counts["steps"]
-    if mode != "lookahead":  # there a plan may save every proposal
+    if "lookahead" not in mode:  # there a plan may save every proposal
         assert counts["overridden"] > 0 or through == "SafetyShield"  # which has few steps
         assert counts["guaranteed"] == counts["steps"]
     elif through == "VectorSafetyShield":
@@ -110,6 +113,20 @@ def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, c
             certified = error_set.shape_at(age)
             running = np.frombuffer(shape).reshape(certified.shape)
             assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
+
+
+@pytest.mark.cases(len(CASES))
+@pytest.mark.parametrize("name", [name for name in CASES if name not in WITH_REMAINDER])
+def test_the_box_is_kept_for_the_promised_steps_whatever_the_network_does(name):
+    counts, closest = Counter(), 0.0
+    for seed in range(2):
+        outcome = attacked(name, SILENCE, LOOP, seed, seed, has_outages=True)
+        assert not {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0 and claim != AGE}
+        closest, counts = max(closest, outcome.largest[KEPT]), counts + outcome.counts
+    assert counts["kept"] > 0.1 * counts["steps"]
+    assert case(name).contract is None or counts["kept though not guaranteed"] > 0
+    assert closest > 0.3
+    assert outcome.largest[FALL] == 1.0
 
 
 @contextmanager

@@ -16,15 +16,19 @@ from tests.ncs_gym.envs.same_draws import holding_gain
 from tests.shields.attacks.adversary import Adversary, Between, Traffic, boundary, box_of, farthest, gauges, region_of
 from tests.shields.attacks.cases import Case, box_ellipsoid
 
-SAFE_SET, BOX, ALL_TIMES, ERROR, AGE = (
+SAFE_SET, BOX, KEPT, FALL, ALL_TIMES, ERROR, AGE = (
     "in the safe set",
     "in the box",
+    "in the box for so many steps",
+    "safe steps fall by at most one",
     "in the box at all times",
     "error in its ellipsoid",
     "age within the contract",
 )
 # Episodes are begun anew after so many steps, in the middle of plans; in vectors after so many.
 EPISODE, VECTOR_EPISODE = 60, 20
+# Mode "lookahead", asked for as many safe steps as its plans can have.
+SILENCE = "lookahead for silence"
 # What is no input; a loop puts its own in the place of it.
 NO_INPUTS = (None, np.nan, "left", np.zeros(9), 10**400)
 
@@ -55,18 +59,18 @@ class Watch:
 
     def __init__(self, case: Case, mode: str, delay: int) -> None:
         self.case, self.outcome, self.delay = case, Outcome(), delay
-        self.claims_safe_set = mode != "lookahead"
+        self.claims_safe_set = mode not in ("lookahead", SILENCE)
         self.safe, self.box = region_of(case.certificate.safe_set), box_of(case.plant)
         counts = case.plant.between_samples is not None if case.at_all_times is None else case.at_all_times
         self.between = Between(case.plant) if counts else None
         self.states: np.ndarray | None = None
-        self.held = np.zeros(1, np.bool_)
+        self.held, self.left = np.zeros(1, np.bool_), np.zeros(1, np.int64)
         # Estimates, shapes and where an episode goes on, of the steps until they belong to the present.
         self.expected: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
-    def begin(self, states: np.ndarray, held: np.ndarray, begun: Any = True) -> None:
-        """States (n, N), where they are guaranteed (N,), and which of them episodes start in."""
-        self.states, self.held = states, held
+    def begin(self, states: np.ndarray, held: np.ndarray, left: np.ndarray, begun: Any = True) -> None:
+        """States (n, N); where they are guaranteed, how long the box is kept, and where episodes start, (N,) each."""
+        self.states, self.held, self.left = states, held, left
         for _, _, valid in self.expected:
             valid[:] &= ~np.broadcast_to(begun, valid.shape)
 
@@ -75,6 +79,7 @@ class Watch:
         states: np.ndarray,
         inputs: np.ndarray,
         held: np.ndarray,
+        left: np.ndarray,
         ages: np.ndarray,
         reasons: Any,
         goes_on: Any = True,
@@ -84,18 +89,24 @@ class Watch:
         lost = goes_on & self.held & ~held
         if lost.any():
             outcome.lost |= set(np.atleast_1d(reasons)[lost])
-        outcome.see(BOX, self.box.gauges(states), held)
+        out = self.box.gauges(states)
+        outcome.see(BOX, out, held)
+        outcome.see(KEPT, out, goes_on & (self.left > 0))
+        outcome.see(FALL, (self.left - left).astype(float), np.broadcast_to(goes_on, held.shape))
         levels = self.safe.gauges(states)
         if self.claims_safe_set:
             outcome.see(SAFE_SET, levels, held)
         if self.between is not None:
-            outcome.see(ALL_TIMES, self.between.gauges(self.states, inputs), goes_on & self.held & held)
+            claimed = goes_on & (self.held & held | (self.left > 0))
+            outcome.see(ALL_TIMES, self.between.gauges(self.states, inputs), claimed)
         if self.case.contract is not None:
             outcome.see(AGE, ages / self.case.contract.max_age, np.ones_like(held))
         outcome.counts["steps"] += held.size
         outcome.counts["guaranteed"] += np.count_nonzero(held)
+        outcome.counts["kept"] += np.count_nonzero(left)
+        outcome.counts["kept though not guaranteed"] += np.count_nonzero(~held & (left > 0))
         outcome.counts["outside S"] += np.count_nonzero(held & (levels > 1.0))
-        self.begin(states, held, ~goes_on)
+        self.begin(states, held, left, ~goes_on)
 
     def compare(self, estimates: np.ndarray, shapes: np.ndarray, states: np.ndarray, alarmed: Any, first: bool) -> None:
         """Compares the estimates (n, N) that belong to these states now with what they claim, shapes (N, n, n).
@@ -141,17 +152,24 @@ def starts_of(case: Case, mode: str, rng: np.random.Generator, count: int) -> np
     plant, safe = case.plant, region_of(case.certificate.safe_set)
     scale = plant.half_widths if hasattr(safe, "rows") else np.sqrt(np.diag(case.certificate.L))
     starts = case.start * boundary(safe, scale, rng, count)
-    if mode != "lookahead":
+    if mode not in ("lookahead", SILENCE):
         return starts
     spread = rng.uniform(0.2, 0.95, count) * boundary(box_of(plant), plant.half_widths, rng, count)
     return np.where(rng.random(count) < 0.3, starts, spread)
+
+
+def planning(case: Case, mode: str) -> dict[str, Any]:
+    """Settings of a shield or loop in this mode."""
+    if mode == SILENCE:
+        return {"mode": "lookahead", "horizon": case.horizon, "least_safe_steps": case.horizon - 1}
+    return {"mode": mode, "horizon": case.horizon if mode == "lookahead" else None}
 
 
 def through_shield(case: Case, mode: str, network: int, count: int | None, steps: int, seed: int) -> Outcome:
     """Attacks `SafetyShield`, or with a count `VectorSafetyShield`, around environments."""
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
     plant, certificate, nature, many = case.plant, case.certificate, Nature(), count is not None
-    first = box_ellipsoid(plant, 0.6) if mode == "lookahead" else Ellipsoid((0.999 * case.start) ** 2 * certificate.L)
+    first = box_ellipsoid(plant, 0.6) if "lookahead" in mode else Ellipsoid((0.999 * case.start) ** 2 * certificate.L)
     settings: dict[str, Any] = {
         "plant": plant,
         "channel": uplink,
@@ -162,19 +180,23 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         "noise": "extreme",
         "initial_set": first,
     }
-    horizon = case.horizon if mode == "lookahead" else None
+    given = planning(case, mode) | {"on_unproved": "ignore"}
     if many:
         autoreset = ("NextStep", "SameStep")[seed % 2]
         env = NCSVectorEnv(count, max_episode_steps=VECTOR_EPISODE, autoreset_mode=autoreset, **settings)
-        shield: Any = VectorSafetyShield(env, certificate, mode, horizon=horizon, on_unproved="ignore")
+        shield: Any = VectorSafetyShield(env, certificate, **given)
     else:
         env = SeenEnv(**settings)
         env.render_mode = "rgb_array"  # nothing is drawn: there is no renderer
-        shield = SafetyShield(env, certificate, mode, horizon=horizon, on_unproved="ignore")
+        shield = SafetyShield(env, certificate, **given)
 
     def column(value: Any) -> np.ndarray:
         """A value of the infos with the environment as the last axis."""
         return np.moveaxis(np.asarray(value), 0, -1) if many else np.asarray(value)[..., None]
+
+    def kept(info: dict[str, Any]) -> np.ndarray:
+        """For how many steps the box is said to be kept."""
+        return column(info.get("shield_safe_steps", np.zeros(count or (), np.int64)))
 
     protocol = env.downlink_protocol
     watch, size = Watch(case, mode, 0 if protocol is None else protocol.input_delay), count or 1
@@ -187,7 +209,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
             states = starts_of(case, mode, rng, size)
             options = {"state": states.T if many else states[:, 0]}
         _, info = shield.reset(seed=seed if watch.states is None else None, options=options)
-        watch.begin(column(info["state"]), column(info["shield_guaranteed"]), begun)
+        watch.begin(column(info["state"]), column(info["shield_guaranteed"]), kept(info), begun)
         counts["starts outside S"] += np.count_nonzero(watch.held & (watch.safe.gauges(watch.states) > 1.0))
         return info
 
@@ -207,7 +229,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         *_, info = shield.step(actions.T if many else actions[:, 0])
         held, ages = column(info["shield_guaranteed"]), column(info["measurement_age"])
         goes_on = env.episodes == episodes
-        watch.step(column(info["state"]), column(info["input"]), held, ages, info["shield_reason"], goes_on)
+        watch.step(column(info["state"]), column(info["input"]), held, kept(info), ages, info["shield_reason"], goes_on)
         broken = ["contract_broken", "downlink_broken", *([] if case.process else ["assumption_violated"])]
         outcome.lost |= {key for key in broken if np.any(info[key])}
         planned = np.asarray(info.get("shield_plan_length", 0))
@@ -243,6 +265,7 @@ def through_loop(
     aware: bool = True,
     late: int = 0,
     is_silent: bool = False,
+    has_outages: bool = False,
     rough: float = 1.0,
 ) -> Outcome:
     """Attacks `SafeLoop` beside a plant that is written out here, with worst noise and traffic of any pattern.
@@ -256,6 +279,7 @@ def through_loop(
         aware: Whether the loop knows of its downlink.
         late: How many steps older than promised samples may be.
         is_silent: Whether no sample arrives at all.
+        has_outages: Whether now and then none arrives for up to three times as long as plans are.
         rough: By how much disturbances are larger than assumed.
     """
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
@@ -265,8 +289,8 @@ def through_loop(
     delay = 0 if downlink is None else contract_of(downlink).max_age
     channel = Channel(jitter=oldest, quantization_step=uplink.quantization_step)
     behind = {"downlink": downlink} if aware else {}
-    horizon = case.horizon if mode == "lookahead" else None
-    loop = SafeLoop(certificate, plant, channel, mode, horizon, on_unproved="ignore", **behind)
+    loop = SafeLoop(certificate, plant, channel, on_unproved="ignore", **planning(case, mode), **behind)
+    outage = 0
     adversary, watch = Adversary(plant, certificate, rng, 1), Watch(case, mode, loop.input_delay)
     counts, D = watch.outcome.counts, rough**2 * plant.disturbance.shape_matrix
     N = plant.sensor_error_with(uplink.quantization_step).shape_matrix
@@ -275,7 +299,7 @@ def through_loop(
             x = starts_of(case, mode, rng, 1)
             present = x + farthest(plant.initial_error.shape_matrix, adversary.axes)
             loop.start(present[:, 0], initial_set=x[:, 0])
-            watch.begin(x, np.array([loop.guaranteed]))
+            watch.begin(x, np.array([loop.guaranteed]), np.array([loop.safe_steps]))
             uplinks, downlinks = Traffic(oldest, max_age, 1), Traffic(delay, delay, 1)
             actuator, commands, samples = Actuator(delay, plant.m, limits), deque(maxlen=delay + 1), []
             actuator.start(loop.episode)
@@ -295,8 +319,11 @@ def through_loop(
         x, present = nominal + adversary.disturbances(nominal, D), plant.A @ present + plant.B @ u[:, None]
         samples = [(plant.H @ x + adversary.noise(N))[:, 0], *samples[:oldest]]
         arrived = [Packet(k + 1 - age, samples[age], loop.episode) for age, _ in uplinks.arrivals(rng, k + 1)]
-        loop.receive([] if is_silent else hostile_packets(rng, arrived, k + 1))
-        watch.step(x, u[:, None], np.array([loop.guaranteed]), np.array([loop.measurement_age]), loop.reason)
+        if has_outages:
+            outage = max(outage - 1, 0) or (rng.random() < 0.1) * int(rng.integers(1, 3 * case.horizon))
+        loop.receive([] if is_silent or outage else hostile_packets(rng, arrived, k + 1))
+        held, left = np.array([loop.guaranteed]), np.array([loop.safe_steps])
+        watch.step(x, u[:, None], held, left, np.array([loop.measurement_age]), loop.reason)
         counts["overridden"] += decision.intervened
         counts["planned"] += len(decision.plan) > 0
         counts["stored"] += bool(decision.stored)

@@ -1,0 +1,115 @@
+"""For how many steps the box is kept when the network goes silent, and what it costs to ask for them.
+
+    python benchmarks/silence.py [--envs 64] [--steps 150] [--ids CartPole ...]
+
+Registered environments with a contract, of one direction, under adversarial disturbances. With random actions, "safe"
+is the largest number of steps of a ladder that mode "lookahead", asked for it, promises at 95 % of the steps over the
+environment's own network; "overridden" the share of steps overridden when it is asked for, and when none are.
+"left at" is how old the newest sample had become when a state left the box first, the smallest of all episodes: samples
+come as rarely as the contract allows for a while and then no more for sixty steps, and the agent pushes all the time,
+behind mode "project", and behind "lookahead" that is asked for the steps. "never" stands for no state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym import BrokenContractWarning, ClippedObservationWarning, NCSEnv, TraceChannel
+from shields import VectorSafetyShield
+
+IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
+LADDER = (5, 10, 15, 20, 25, 30, 35, 40, 45)
+# Share of steps at which all steps asked for are promised.
+MOST_STEPS = 0.95
+# Steps of an episode before the network goes silent, and afterwards.
+HEARD, SILENT = 40, 60
+
+
+def shielded(name: str, count: int, least: int | None, **settings: Any) -> VectorSafetyShield:
+    """Returns environments behind mode "lookahead" that is asked for so many steps; for None behind "project"."""
+    env = gym.make_vec(name, count, disturbance="adversarial", terminate_on_violation=False, **settings)
+    given = {"mode": "project"} if least is None else {"mode": "lookahead", "least_safe_steps": least}
+    return VectorSafetyShield(env, **given, on_unproved="ignore")
+
+
+def over_its_network(name: str, count: int, steps: int, least: int) -> tuple[float, float]:
+    """Returns the shares of steps at which all steps asked for are promised, and at which the shield overrides."""
+    env, rng = shielded(name, count, least), np.random.default_rng(0)
+    env.reset(seed=0)
+    promised, overridden = 0, 0
+    for _ in range(steps):
+        *_, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
+        promised += np.count_nonzero(info["shield_safe_steps"] == least)
+        overridden += np.count_nonzero(info["shield_intervened"])
+    return promised / (count * steps), overridden / (count * steps)
+
+
+def rare_then_silent(name: str) -> TraceChannel:
+    """Returns a channel over which samples come as rarely as the contract allows, and then no more."""
+    env = gym.make(name).unwrapped
+    assert isinstance(env, NCSEnv)
+    contract = env.certificate_contract
+    assert contract is not None
+    period = contract.max_age - env.channel.delay + 1
+    heard = [env.channel.delay if k % period == 0 else -1 for k in range(HEARD)]
+    return TraceChannel(trace=(*heard, *[-1] * SILENT), quantization_step=env.channel.quantization_step)
+
+
+def left_at(name: str, count: int, least: int | None) -> int | None:
+    """Returns how old the newest sample had become when a state left the box, the least of all; None if none did."""
+    channel = rare_then_silent(name)
+    env, rng = shielded(name, count, least, channel=channel), np.random.default_rng(1)
+    pushed = rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
+    env.reset(seed=1)
+    ages, out, oldest = [], np.zeros(count, np.bool_), np.zeros(count, np.int64)
+    for _ in range(HEARD + SILENT):
+        *_, info = env.step(pushed)
+        now = (info["cost"] > 0.0) & ~out
+        oldest = np.maximum(oldest, info["measurement_age"])
+        ages += oldest[now].tolist()
+        out |= now
+    return min(ages, default=None)
+
+
+def row(name: str, count: int, steps: int) -> str:
+    """Returns the row of an environment."""
+    env = gym.make(name).unwrapped
+    assert isinstance(env, NCSEnv)
+    assert env.certificate_contract is not None
+    free, most = over_its_network(name, count, steps, 0)[1], (0, float("nan"))
+    for least in LADDER:
+        promised, overridden = over_its_network(name, count, steps, least)
+        if promised < MOST_STEPS:
+            break
+        most = least, overridden
+    ages = [left_at(name, count, each) for each in (None, most[0])]
+    texts = ["never" if age is None else str(age) for age in ages]
+    seconds = f"{most[0] * env.plant.dt:.2g}" if env.plant.dt else "-"
+    return (
+        f"{name.removeprefix('ncs_gym/'):20} {env.certificate_contract.max_age:8} {most[0]:5} {seconds:>8} "
+        f"{100 * free:6.1f} {100 * most[1]:6.1f} {texts[0]:>8} {texts[1]:>10}"
+    )
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--envs", type=int, default=64)
+    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--ids", nargs="+", default=IDS)
+    options = parser.parse_args()
+    for category in (BrokenContractWarning, ClippedObservationWarning):
+        warnings.simplefilter("ignore", category)
+    print(f"{'':20} {'contract':>8} {'safe':>5} {'':>8} {'overridden [%]':>13} {'left at an age of':>18}")
+    print(f"{'':20} {'[steps]':>8} {'':>5} {'[s]':>8} {'none':>6} {'asked':>6} {'project':>8} {'lookahead':>10}")
+    for name in options.ids:
+        print(row(f"ncs_gym/{name}-v0", options.envs, options.steps), flush=True)
+
+
+if __name__ == "__main__":
+    main()

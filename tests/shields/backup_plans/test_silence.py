@@ -1,0 +1,120 @@
+"""Plans that are as long as is asked for: what passes, what is stored of it, and that a silent network uses it up."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, NCSVectorEnv, TraceChannel
+from shields import SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.runtime.backup_plans.plan_search import completed
+from shields.runtime.guarantee import ALARM
+from tests.certificates import certificate_of
+from tests.shields.attacks.cases import case
+
+LEAST, HORIZON = 7, 12
+CART = case("cart-pole")
+# Samples for thirty steps, then none for forty.
+PAUSES = TraceChannel(trace=(0,) * 30 + (-1,) * 40)
+
+
+def cart_filter(least, horizon):
+    return SafetyFilter(CART.certificate, CART.plant, "lookahead", horizon, least)
+
+
+def beliefs(count):
+    """Estimates, error shapes and proposals all over the box."""
+    rng, plant = np.random.default_rng(0), CART.plant
+    estimates = rng.uniform(-0.7, 0.7, (count, plant.n)) * plant.half_widths
+    proposals = rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
+    return estimates, rng.choice([0.2, 0.6, 1.0], count)[:, None, None] * CART.certificate.Sigma, proposals
+
+
+def test_what_passes_leaves_enough_or_as_much_as_anything_that_is_tried():
+    least = 30  # which costs some proposals, other than a few steps
+    careful, free = cart_filter(least, 36), cart_filter(0, 36)
+    estimates, shapes, proposals = beliefs(400)
+    decided, usual = careful.decide_many(estimates, shapes, proposals), free.decide_many(estimates, shapes, proposals)
+    lengths = np.count_nonzero(~np.isnan(decided.plan[..., 0]), axis=1)
+    enough = lengths >= least
+    assert 0.1 < enough.mean() < 0.9
+    # Nothing is refused to somebody who asks for no steps in order to keep what cannot be kept.
+    assert (decided.passed == usual.passed).all()
+    passes = enough & ~decided.intervened
+    assert 20 < np.count_nonzero(passes) < np.count_nonzero(~usual.intervened)
+    np.testing.assert_array_equal(decided.input[passes], proposals[passes])
+    # K x_hat and what follows from it is one of the plans that are tried.
+    test, nothing = careful.lookahead.planner.test, np.full((400, 1, 36, CART.plant.m), np.nan)
+    held = completed(CART.plant, CART.certificate.fallback, estimates, nothing, CART.certificate.K[None])
+    certified = test.certified(estimates, test.tightenings_of(shapes), held)[:, 0]
+    left = np.where(certified.any(axis=1), 35 - certified[:, ::-1].argmax(axis=1), 0)
+    assert (np.minimum(lengths, least) >= np.minimum(left, least)).all()
+    assert (left > 0).any()
+
+
+def test_no_steps_is_what_is_done_without_asking():
+    estimates, shapes, proposals = beliefs(200)
+    usual = SafetyFilter(CART.certificate, CART.plant, "lookahead", HORIZON)
+    made = usual, cart_filter(0, HORIZON)
+    for one, other in zip(*(each.decide_many(estimates, shapes, proposals) for each in made), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("is_vector", [False, True], ids=["scalar", "vector"])
+def test_silence_uses_them_up_one_by_one_and_samples_bring_them_back(is_vector):
+    settings = {"plant": CART.plant, "channel": PAUSES, "contract": CART.contract, "disturbance": "adversarial"}
+    given = {"mode": "lookahead", "horizon": HORIZON, "least_safe_steps": LEAST, "on_unproved": "ignore"}
+    if is_vector:
+        env = VectorSafetyShield(NCSVectorEnv(3, **settings), CART.certificate, **given)
+    else:
+        env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", **settings), CART.certificate, **given)
+    rng, m = np.random.default_rng(0), CART.plant.m
+    _, info = env.reset(seed=1)
+    before, falls, rises, lost = info["shield_safe_steps"], 0, 0, 0
+    assert np.all(np.asarray(before) == LEAST)
+    for _ in range(250):
+        actions = rng.uniform(-1.0, 1.0, (3, m) if is_vector else m).astype(np.float32)
+        *_, info = env.step(actions)
+        now = info["shield_safe_steps"]
+        assert np.all(now >= np.asarray(before) - 1)
+        assert np.all(info["shield_plan_length"] >= now)
+        falls, rises = falls + np.count_nonzero(now < before), rises + np.count_nonzero(now > before)
+        lost += np.count_nonzero(~np.asarray(info["shield_guaranteed"]) & (np.asarray(now) > 0))
+        before = now
+    assert falls > LEAST
+    assert rises > 1
+    assert lost > LEAST  # the box is kept where the contract is broken
+
+
+def test_nothing_is_promised_on_bounds_that_a_measurement_contradicts():
+    env = SafetyShield(
+        gym.make("ncs_gym/TruckTrailerCruise-v0", channel=Channel(), allow_assumption_violation=True,
+                 disturbance=lambda rng, plant, nominal: 40.0 * plant.disturbance.sample_boundary(rng)),
+        mode="lookahead", least_safe_steps=3, on_unproved="ignore",
+    )  # fmt: skip
+    _, info = env.reset(seed=0)
+    assert info["shield_safe_steps"] == 3
+    for _ in range(30):
+        *_, info = env.step(np.zeros(1, np.float32))
+        assert info["shield_safe_steps"] == 0 or info["shield_reason"] != ALARM
+    assert info["shield_reason"] == ALARM
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"least_safe_steps": 3}, "least_safe_steps is for mode \"lookahead\", mode 'project' takes none"),
+        ({"mode": "lookahead", "least_safe_steps": 6, "horizon": 6}, "takes plans of 7 steps, got horizon = 6"),
+        ({"mode": "lookahead", "least_safe_steps": 50}, "least_safe_steps must be a whole number"),
+        ({"mode": "lookahead", "least_safe_steps": -1}, "least_safe_steps must be a whole number"),
+        ({"mode": "lookahead", "least_safe_steps": 2.5}, "least_safe_steps must be a whole number"),
+        ({"mode": "lookahead", "least_safe_steps": None}, "least_safe_steps must be a whole number"),
+    ],
+)
+def test_wrong_numbers_of_steps_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), **given)
+
+
+def test_horizon_is_long_enough_by_itself():
+    made = SafetyFilter(certificate_of(CART.plant, CART.contract), CART.plant, "lookahead", least_safe_steps=9)
+    assert (made.horizon, made.least_safe_steps) == (10, 9)
