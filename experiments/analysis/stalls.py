@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -49,13 +50,13 @@ def count_interval(starts: np.ndarray, steps: int) -> tuple[float, float]:
     return float(low), float(spread * chi2.ppf(0.975, 2.0 * clusters + 2.0) / 2.0)
 
 
-def broken_contracts(ages: np.ndarray, dt: float, also: int | None = None) -> list[dict[str, Any]]:
+def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) -> list[dict[str, Any]]:
     """Returns how often contracts would have been broken in a record, once for every stall.
 
     Args:
         ages: Age of the newest sample at every step, shape (k,) [steps].
         dt: Duration of a step [s].
-        also: A `max_age` that is among them.
+        also: Values of `max_age` that are among them.
 
     Returns:
         Rows of JSON values, from the age that was kept, or the largest a contract can have, down to 0: all ages up to
@@ -63,10 +64,10 @@ def broken_contracts(ages: np.ndarray, dt: float, also: int | None = None) -> li
     """
     largest, steps = min(int(ages.max()), MAX_AGE), len(ages)
     decades = (10**power * each for power in (1, 2) for each in _OF_A_DECADE)
-    chosen = {*range(_ALL_UP_TO + 1), *decades, largest} | ({also} if also is not None else set())
+    chosen = {*range(_ALL_UP_TO + 1), *decades, largest, *also}
     hours = steps * dt / 3600.0
     rows = []
-    for age in sorted((each for each in chosen if each <= largest or each == also), reverse=True):
+    for age in sorted((each for each in chosen if each <= largest or each in also), reverse=True):
         starts, lengths = stalls(ages, age)
         first = int((starts < steps // 2).sum())
         rows.append(

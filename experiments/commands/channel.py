@@ -27,15 +27,18 @@ def channel(settings: ChannelSettings) -> None:
     log = PacketLog.load(settings.file, settings.ping_period, step)
     dt = settings.sampling_period or (log.period if env is None else env.plant.dt)
     contract = None if env is None else env.contract
-    found = _numbers(log, dt, None if contract is None else contract.max_age)
+    asked = () if contract is None else (contract.max_age, contract.max_age + settings.least_safe_steps)
+    found = _numbers(log, dt, asked)
     print(_text(log, found))
     if env is not None:
         print(wrapped(_compared(contract, found)))
+    if settings.least_safe_steps and contract is not None:
+        print(wrapped(_beyond(contract, settings.least_safe_steps, found)))
     if settings.out is not None:
         write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
 
 
-def _numbers(log: PacketLog, dt: float, asked: int | None) -> dict[str, Any]:
+def _numbers(log: PacketLog, dt: float, asked: tuple[int, ...]) -> dict[str, Any]:
     arrived = log.delays[np.isfinite(log.delays)]
     if not len(arrived):
         raise ValueError("none of the packets arrived")
@@ -132,7 +135,7 @@ def _rate(rate: float) -> str:
 def _compared(contract: Any, found: dict[str, Any]) -> str:
     if contract is None:
         return "The environment's certificate needs no contract."
-    row = next(row for row in found["contracts"] if row["max_age"] == contract.max_age)
+    row = _row(found, contract.max_age)
     low, high = map(_rate, row["per_hour_ci95"])
     said = f"The environment's contract, a newest sample of at most {in_steps(contract.max_age)}, was"
     if row["times"] == 0:
@@ -140,3 +143,22 @@ def _compared(contract: Any, found: dict[str, Any]) -> str:
     share = f"{100.0 * row['broken']:.3g} % of steps"
     times = "once" if row["times"] == 1 else f"{row['times']:,} times"
     return f"{said} broken {times}, {_rate(row['per_hour'])} per hour [{low}, {high}], in {share}."
+
+
+def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:
+    """Says how often the record is silent for longer than a plan lasts that keeps the box for so many more steps."""
+    oldest = contract.max_age + least
+    row = _row(found, oldest)
+    low, high = map(_rate, row["per_hour_ci95"])
+    often = f"{row['times']:,} times, {_rate(row['per_hour'])} per hour [{low}, {high}]"
+    if row["times"] == 0:
+        often = f"never; a record of this length excludes more than {high} times per hour"
+    return (
+        f"A shield that promises {in_steps(least)} (shield_safe_steps) while the contract is kept keeps the box until "
+        f"the newest sample is {in_steps(oldest)} old, {_time(oldest * found['sampling_period'])}. In the record it "
+        f"was older {often}."
+    )
+
+
+def _row(found: dict[str, Any], age: int) -> dict[str, Any]:
+    return next(row for row in found["contracts"] if row["max_age"] == age)

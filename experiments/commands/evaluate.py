@@ -42,9 +42,12 @@ def evaluate(settings: EvaluateSettings) -> None:
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
     require_horizon(settings, mode)
-    horizon = (settings.horizon or agent.horizon) if mode == "lookahead" else None
+    least, horizon = settings.least_safe_steps, settings.horizon
+    if mode == "lookahead" and horizon is None and least < (agent.horizon or 0):
+        horizon = agent.horizon
     certificate = certificate_of(loop, settings.certificate or certificate_file(folder))
-    shield = None if mode is None else ShieldSettings(certificate, mode, horizon=horizon, on_unproved="ignore")
+    given = {"horizon": horizon, "least_safe_steps": least, "on_unproved": "ignore"}
+    shield = None if mode is None else ShieldSettings(certificate, mode, **given)
     evaluated = evaluation.evaluate(
         replace(loop, shield=shield),
         lambda observations, infos: agent.act(observations),
@@ -66,6 +69,7 @@ def evaluate(settings: EvaluateSettings) -> None:
             "env": agent.env,
             "channel": loop.channel and asdict(loop.channel),
             "horizon": shield and shield.horizon,
+            "least_safe_steps": least,
             "episodes": settings.episodes,
             "seed": settings.seed,
             "model": {

@@ -13,6 +13,7 @@ from experiments.settings.arguments import Assignments, StepCount, require_horiz
 from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
+from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,6 +279,8 @@ class ChannelSettings:
         ping_period: Time between packets whose file does not say when they were sent, as of ping without -D [s]; by
             default that of ping's summary, or 1.
         env: Id of an environment whose contract is compared with the record.
+        least_safe_steps: For so many steps its shield in mode "lookahead" is asked to keep the box whatever the network
+            does: silences that are longer are counted.
         out: File for the numbers (JSON).
     """
 
@@ -285,9 +288,13 @@ class ChannelSettings:
     sampling_period: float | None = None
     ping_period: float | None = None
     env: str | None = None
+    least_safe_steps: int = 0
     out: Path | None = None
 
     def __post_init__(self) -> None:
+        require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1))
+        if self.least_safe_steps and self.env is None:
+            raise ValueError("--least-safe-steps are those of a shield: give --env, too")
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")
@@ -357,6 +364,7 @@ class LoopSettings:
         vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
+        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does.
         certificate: Certificate file to use instead of synthesizing one; both machines need the same.
         steps: Steps of the controller.
         speed: How much faster than the plant's own time the loop runs; below 1 for slow machines.
@@ -385,6 +393,7 @@ class LoopSettings:
     vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     horizon: int | None = None
+    least_safe_steps: int = 0
     certificate: Path | None = None
     steps: StepCount = 3000
     speed: float = 1.0

@@ -204,14 +204,15 @@ class SafetyFilter(ReadOnlyArrays):
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
         plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
         decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
+        short = None
         if self.lookahead is not None:
             stored = plan.copy() if stored is None else stored
-            self.lookahead.keep(decided, valid, estimates, errors, stored)
+            short = self.lookahead.keep(decided, valid, estimates, errors, stored)
         if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~decided.passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
         if self.lookahead is not None and stored is not None:
-            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
+            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored, short)
         return decided
 
     @own_error_state

@@ -47,6 +47,10 @@ class Plans(NamedTuple):
     lengths: np.ndarray
     distances: np.ndarray
 
+    def some(self, chosen: np.ndarray) -> Plans:
+        """Returns those of some environments, given by their indices."""
+        return Plans(*(part[chosen] for part in self))
+
 
 class Planner:
     """Finds certified plans (docs/lookahead.md).
@@ -77,6 +81,11 @@ class Planner:
         self._loops = np.concatenate(loops, axis=1)
         self._program = PlanProgram(self.test.prediction)
 
+    def none(self, count: int) -> Plans:
+        """Returns no plans for so many environments."""
+        inputs = np.full((count, self.horizon, self._plant.m), np.nan)
+        return Plans(inputs, np.zeros(count, np.int64), np.full(count, np.inf))
+
     def ranks(self, lengths: np.ndarray) -> np.ndarray:
         """Returns the lengths of plans as far as they count: up to what is long enough."""
         return np.minimum(lengths, self.wanted)
@@ -96,20 +105,26 @@ class Planner:
         """Returns certified plans whose first inputs are the proposed ones.
 
         After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
-        then K, or the saturated regulator. The first candidate that is certified and long enough counts; the solver is
-        not asked.
+        then K, or the saturated regulator. The first candidate that is certified and long enough counts, and is all
+        that is looked at; the solver is not asked.
         """
-        return self._best(
-            estimates, self.test.tightenings_of(shapes), self._begun(estimates, proposed, stored), proposed
-        )
+        tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
+        plans = self._best(estimates, tightening, continued[:, :1], proposed)
+        for others in (continued[:, 1:], None):
+            left = np.flatnonzero(plans.lengths < self.wanted)
+            if not left.size:
+                break
+            some = estimates[left], proposed[left]
+            tried = self._limited(*some, stored[left]) if others is None else others[left]
+            self._improve(plans, left, self._best(some[0], tightening.some(left), tried, some[1]))
+        return plans
 
-    def _begun(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
-        """Returns what `beginning_with` tries, shape (E, 4, N, m)."""
-        beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
-        beginnings[:, :2] = self._continued(estimates, proposed)
-        beginnings[:, 2:, 0] = proposed[:, None]
-        beginnings[:, 2, 1:] = stored[:, 1:]
-        return completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 1, 0]])
+    def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
+        """Returns proposals followed by what is stored for later and then K, or by the saturated regulator."""
+        beginnings = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
+        beginnings[:, :, 0] = proposed[:, None]
+        beginnings[:, 0, 1:] = stored[:, 1:]
+        return completed(self._plant, self._fallback, estimates, beginnings, self._gains[::-1])
 
     @own_error_state  # what is not finite passes no test
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
@@ -130,22 +145,23 @@ class Planner:
         proposed: np.ndarray,
         projected: np.ndarray,
         stored: np.ndarray,
+        begun: Plans | None = None,
     ) -> Plans:
         """Returns certified plans whose first inputs are close to the proposed ones.
 
-        Candidates are the projected input and then the regulator, what is stored, either gain from the start, and where
-        one input is no plan that is long enough, what begins with the proposal. The solver is asked where none of them
-        is certified; where plans end in S also if nothing is stored. Plans that end in P would begin closer by it in a
-        single step, but not in a loop (docs/lookahead.md), for three times the time.
+        Candidates are those that begin with the proposal and were too short (`begun`), the projected input and then the
+        regulator, what is stored, and either gain from the start. The solver is asked where none of them is certified;
+        where plans end in S also if nothing is stored. Plans that end in P would begin closer by it in a single step,
+        but not in a loop (docs/lookahead.md), for three times the time.
         `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
         """
         tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
         candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
-        if self.wanted > 1:  # otherwise none of them is certified
-            candidates = np.concatenate([self._begun(estimates, proposed, stored), candidates], axis=1)
         plans = self._best(estimates, tightening, candidates, proposed)
+        if begun is not None:
+            self._improve(plans, np.arange(len(estimates)), begun)
         if self.horizon > 1:
             needed = plans.lengths == 0
             if self.test.prediction.ends:

@@ -64,18 +64,33 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
 
 
+def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_path):
+    # Samples at every step of .02 s; five silences of 20 steps and one of 60.
+    sent = np.cumsum([0.02] * 99 + [0.42] * 5 + [0.02] * 99 + [1.22] + [0.02] * 99)
+    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each},{each}\n" for each in sent))
+    for least, times in ((10, "6 times"), (30, "1 times"), (49, "1 times")):
+        given = ("--env", "ncs_gym/CartPole-v0", "--least-safe-steps", least)
+        found = ncs("channel", tmp_path / "packets.csv", *given)
+        assert found.returncode == 0, found.stderr
+        said = " ".join(found.stdout.split())
+        assert f"keeps the box until the newest sample is {4 + least} steps old" in said
+        assert f"In the record it was older {times}" in said
+
+
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("page", ["contracts.md", "requirements.md"])
 def test_pages_show_what_the_command_prints_of_the_record_of_the_example(page, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     path = ROOT / "examples" / "wifi_record.py"
     subprocess.run([sys.executable, path], cwd=tmp_path, env=environment(), check=True, capture_output=True)
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", 35)
     assert found.returncode == 0, found.stderr
     block = (ROOT / "docs" / page).read_text().partition("    ncs channel packets.csv")[2].partition("\n\n    ")[2]
     shown = [line.removeprefix("    ") for line in block.splitlines()]
     shown = shown[: next(n for n, line in enumerate(shown) if "in 0.169 % of steps" in line) + 1]
     assert [line for line in shown if line and line != "..." and line not in found.stdout.splitlines()] == []
+    promised = "    A shield that" + found.stdout.partition("A shield that")[2].replace("\n", "\n    ")
+    assert (promised.rstrip() in (ROOT / "docs" / page).read_text()) == (page == "contracts.md")
 
 
 def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):

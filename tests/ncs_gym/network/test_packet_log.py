@@ -157,11 +157,11 @@ def test_stalls_are_counted_once_with_their_length_and_rate():
 
 def test_table_has_few_rows_and_the_age_that_is_asked_for():
     ages = np.arange(3000)
-    assert [row["max_age"] for row in broken_contracts(ages, 0.1, also=77)] == [
+    assert [row["max_age"] for row in broken_contracts(ages, 0.1, also=(77,))] == [
         *(1000, 500, 200, 100, 77, 50, 20),
         *range(10, -1, -1),
     ]
-    assert [row["max_age"] for row in broken_contracts(np.array([0, 1, 1]), 0.1, also=4)] == [4, 1, 0]
+    assert [row["max_age"] for row in broken_contracts(np.array([0, 1, 1]), 0.1, also=(4,))] == [4, 1, 0]
 
 
 def test_interval_of_independent_stalls_is_that_of_poisson():
