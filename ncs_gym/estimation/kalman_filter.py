@@ -117,7 +117,8 @@ class ErrorRecursion:
 
         It is the first gain whose ellipsoid lies inside the certified set of age 0. After the Kalman and the
         set-membership gain comes the certified one of the estimate's age, which (C2) maps into that set. Without a
-        contract there is none, and None says that the sample must not be used.
+        contract there is none, and None says that the sample must not be used. After an outage no ellipsoid lies inside
+        at first, and the gain is chosen for the way back.
         """
         covariance, shape, age = statistics
         newest, ages = self.error_set.shape_at(0), self.error_set.ages
@@ -133,6 +134,8 @@ class ErrorRecursion:
             certified = self.error_set.shape_at(age)
             if certified is not None and is_inside(shape, certified):
                 gain, updated = ages.gains[age - 1], newest  # by (C2)
+            else:
+                gain, updated = self.sets.on_the_way_back(shape)
         return gain, ErrorStatistics(covariance, updated, 0)
 
     def prefers(self, replayed: ErrorStatistics, present: ErrorStatistics) -> bool:

@@ -62,8 +62,9 @@ class SetMembership:
 
         It is the first of these that lies inside the set of the next age: A Sigma_k A'/lam + D/(1-lam) with the
         trace-optimal lam, the same with the certified rate, the certified set itself. That one is sound if E(Sigma_k)
-        lies inside the set of its own age, which (E1) or (C1) maps into it. Beyond the contract no set is certified;
-        the trace-optimal shape still holds the error.
+        lies inside the set of its own age, which (E1) or (C1) maps into it. If none does, lam is chosen for the way
+        back: the shape reaches least far out of the set. Beyond the contract no set is certified; the trace-optimal
+        shape still holds the error.
 
         Args:
             shape: Sigma_k, shape (n, n).
@@ -82,37 +83,59 @@ class SetMembership:
         if is_inside(carried, certified):
             return carried
         present = self.error_set.shape_at(age)
-        return certified if present is not None and is_inside(shape, present) else self._bounded(predicted)
+        if present is not None and is_inside(shape, present):
+            return certified
+        rates, inward = MULTIPLIERS[..., None], np.linalg.inv(np.linalg.cholesky(certified))
+        shapes = np.concatenate([predicted[None], moved / rates + D / (1.0 - rates)])
+        best = _least_reach(inward @ shapes @ inward.T)
+        return self._bounded(self.rounded_up(shapes[best]) if best else predicted)
 
     def _bounded(self, shape: np.ndarray) -> np.ndarray:
         """Returns a shape, or one around all differences of states that do not lie beyond `plant.state_limit`."""
         limit = self._largest_extent
         return shape if (np.diag(shape) <= limit).all() else self.plant.n * np.diag(limit)
 
-    def updated(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
-        """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T, (n, p)."""
+    def updated(self, shape: np.ndarray, gain: np.ndarray, mu: float | None = None) -> np.ndarray:
+        """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu): sound for any gain T, (n, p), and any mu.
+
+        By default mu is the trace-optimal one.
+        """
         kept = self._identity - gain.dot(self.plant.H)
         size = np.abs(gain)
         extent = np.sqrt(shape.diagonal())
         carried = enlarged_by_rounding(kept.dot(shape).dot(kept.T), extent + size.dot(self._abs_H.dot(extent)))
         noise = enlarged_by_rounding(gain.dot(self.noise).dot(gain.T), size.dot(self._noise_extent))
-        total = INFLATION * outer_sum(carried, noise, self.plant.weight) + self.plant.estimate_rounding
-        return self.rounded_up(total)
+        total = outer_sum(carried, noise, self.plant.weight) if mu is None else carried / mu + noise / (1.0 - mu)
+        return self.rounded_up(INFLATION * total + self.plant.estimate_rounding)
 
     def gain(self, shape: np.ndarray) -> np.ndarray:
-        """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), S = Sigma_k, with the trace-optimal mu.
+        """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), S = Sigma_k, with the trace-optimal mu."""
+        axes, shares = self._updates(shape)
+        weights = (axes * (self.plant.weight @ axes)).sum(axis=0)
+        return self._gain(shape, float(MULTIPLIERS[int(np.argmin((weights / shares).sum(axis=1))), 0]))
 
-        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (docs/shield_proof.md); with S = G G' and
-        G'H'N^-1HG = V diag(j) V' the weighted trace is a sum of w_i / (mu + (1-mu) j_i).
+    def on_the_way_back(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the T_mu, and its updated shape, that reaches least far out of the certified set of age 0."""
+        axes, shares = self._updates(shape)
+        inner = self._to_ball @ axes
+        mu = float(MULTIPLIERS[_least_reach((inner / shares[:, None]) @ inner.T), 0])
+        gain = self._gain(shape, mu)
+        return gain, self.updated(shape, gain, mu)
+
+    def _updates(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns G V, shape (n, n), and mu + (1-mu) j for every multiplier, shape (multipliers, n).
+
+        The updated shape of T_mu is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (docs/shield_proof.md); with S = G G' and
+        G'H'N^-1HG = V diag(j) V' that is G V diag(mu + (1-mu) j)^-1 V' G'.
         """
-        H = self.plant.H
         values, vectors = np.linalg.eigh(shape)
         factor = vectors * np.sqrt(np.maximum(values, 0.0))
         gains, basis = np.linalg.eigh(factor.T @ self._information @ factor)
-        axes = factor @ basis
-        weights = (axes * (self.plant.weight @ axes)).sum(axis=0)
-        traces = (weights / (MULTIPLIERS + (1.0 - MULTIPLIERS) * np.maximum(gains, 0.0))).sum(axis=1)
-        mu = float(MULTIPLIERS[int(np.argmin(traces)), 0])
+        return factor @ basis, MULTIPLIERS + (1.0 - MULTIPLIERS) * np.maximum(gains, 0.0)
+
+    def _gain(self, shape: np.ndarray, mu: float) -> np.ndarray:
+        """Returns T_mu."""
+        H = self.plant.H
         spread = shape @ H.T / mu
         innovation = H @ spread + self.noise / (1.0 - mu)
         try:
@@ -145,6 +168,11 @@ class SetMembership:
         turned = (self._ball_error.dot(extent) / np.maximum(extent, 1e-300)).max().item()
         rounded.flat[:: size + 1] += 2.0 * size * turned * extent**2
         return rounded
+
+
+def _least_reach(shapes: np.ndarray) -> int:
+    """Returns which shape, of (k, n, n), has the smallest largest eigenvalue."""
+    return int(np.argmin(np.linalg.eigvalsh(shapes)[:, -1]))
 
 
 def enlarged_by_rounding(product: np.ndarray, extent: np.ndarray) -> np.ndarray:

@@ -1,0 +1,96 @@
+"""After an outage of any length a kept contract brings the error back into its certified set, in a few periods."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, certified_error_set
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
+from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.validation import own_error_state
+from tests.plants import random_plant
+
+IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
+
+
+def registered(name):
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    return env.plant, env.certificate_contract
+
+
+def unstable(seed):
+    """A random plant whose eigenvalues reach beyond the circle."""
+    plant = random_plant(seed, *[(2, 1), (3, 2, 1), (4, 2, 2), (4, 1, 3)][seed % 4])
+    return replace(plant, A=plant.A * (1.0 + 0.04 * (seed % 3)) / plant.spectral_radius), ChannelContract(1 + seed % 3)
+
+
+@own_error_state
+def steps_back(plant, contract, outage, period):
+    """How many steps after an outage of so many the error's ellipsoid lies in the certified set again.
+
+    Samples come every `period` steps before and after; None if it does not within 60.
+    """
+    error_set = certified_error_set(plant, contract)
+    recursion, steps = ErrorRecursion(plant, contract.quantization_step, error_set), 0
+
+    def heard_after(known, count):
+        for _ in range(count):
+            known = recursion.predicted(known)
+        return recursion.updated(known)[1]
+
+    known = recursion.first
+    for _ in range(5):
+        known = heard_after(known, period)
+        assert is_inside(known.shape, error_set.shape_at(0))
+    known = heard_after(known, outage)
+    while not is_inside(known.shape, error_set.shape_at(0)):
+        if steps >= 60:
+            return None
+        known, steps = heard_after(known, period), steps + period
+    return steps
+
+
+@pytest.mark.parametrize("contracts", [2, 10, 100])
+@pytest.mark.parametrize("name", IDS)
+def test_registered_plants_come_back(name, contracts):
+    plant, contract = registered(name)
+    for period in {1, contract.max_age}:
+        assert steps_back(plant, contract, contracts * contract.max_age, period) <= 40
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_unstable_plants_come_back(seed):
+    plant, contract = unstable(seed)
+    for contracts in (2, 100):
+        assert steps_back(plant, contract, contracts * contract.max_age, contract.max_age) <= 40
+
+
+def test_the_ellipsoid_of_the_way_back_holds_the_error():
+    # With errors, disturbances and noise on the boundary, farthest in the direction that the next prediction turns to.
+    plant, contract = registered("BatchReactor")
+    recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
+    rng, known = np.random.default_rng(0), recursion.first
+    errors = np.linalg.cholesky(known.shape) @ directions(rng, plant.n)
+    outside, largest = 0, 0.0
+    for step in range(90):
+        known = recursion.predicted(known)
+        errors = plant.A @ errors - np.linalg.cholesky(plant.disturbance.shape_matrix) @ directions(rng, plant.n)
+        if step < 30 or step % 3:  # an outage, and then the oldest samples that the contract allows
+            continue
+        gain, known = recursion.updated(known)
+        noise = np.linalg.cholesky(recursion.sets.noise) @ directions(rng, plant.p)
+        errors = errors - gain @ (plant.H @ errors + noise)
+        gauges = np.sqrt((errors * np.linalg.solve(known.shape, errors)).sum(axis=0))
+        outside += not is_inside(known.shape, recursion.error_set.shape_at(0))
+        largest = max(largest, gauges.max())
+        assert gauges.max() <= 1.0
+    assert outside > 2
+    assert largest > 0.3
+
+
+def directions(rng, size, count=2000):
+    """Random unit vectors, shape (size, count)."""
+    vectors = rng.standard_normal((size, count))
+    return vectors / np.linalg.norm(vectors, axis=0)
