@@ -8,7 +8,7 @@ Takes about two seconds on one core.
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import numpy as np
 
@@ -17,7 +17,9 @@ PERIOD, SPAN = 0.02, 7200.0  # [s]
 
 def main() -> None:
     """Writes the record into the file that is named, packets.csv by default."""
-    path = sys.argv[1] if len(sys.argv) > 1 else "packets.csv"
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("path", nargs="?", default="packets.csv", help="file of the record (%(default)s)")
+    path = parser.parse_args().path
     rng = np.random.default_rng(0)
     sent = PERIOD * np.arange(round(SPAN / PERIOD))
     received = sent + rng.gamma(4.0, 0.002, len(sent))
