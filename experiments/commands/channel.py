@@ -134,31 +134,38 @@ def _rate(rate: float) -> str:
 
 def _compared(contract: Any, found: dict[str, Any]) -> str:
     if contract is None:
-        return "The environment's certificate needs no contract."
+        return "The environment's certificate needs no contract: it holds through any silence."
     row = _row(found, contract.max_age)
-    low, high = map(_rate, row["per_hour_ci95"])
     said = f"The environment's contract, a newest sample of at most {in_steps(contract.max_age)}, was"
     if row["times"] == 0:
-        return f"{said} kept throughout; a record of this length excludes more than {high} breaks per hour."
-    share = f"{100.0 * row['broken']:.3g} % of steps"
-    times = "once" if row["times"] == 1 else f"{row['times']:,} times"
-    return f"{said} broken {times}, {_rate(row['per_hour'])} per hour [{low}, {high}], in {share}."
+        return f"{said} kept throughout; a record of this length excludes more than {_most(row)} breaks per hour."
+    return f"{said} broken {_times(row)}, in {100.0 * row['broken']:.3g} % of steps."
 
 
 def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:
-    """Says how often the record is silent for longer than a plan lasts that keeps the box for so many more steps."""
+    """Returns how often samples were older than contract and promised steps allow together."""
     oldest = contract.max_age + least
     row = _row(found, oldest)
-    low, high = map(_rate, row["per_hour_ci95"])
-    often = f"{row['times']:,} times, {_rate(row['per_hour'])} per hour [{low}, {high}]"
     if row["times"] == 0:
-        often = f"never; a record of this length excludes more than {high} times per hour"
+        older = f"never older; a record of this length excludes more than {_most(row)} times per hour"
+    else:
+        older = f"older {_times(row)}"
     return (
-        f"A shield that promises {in_steps(least)} (shield_safe_steps) while the contract is kept keeps the box until "
-        f"the newest sample is {in_steps(oldest)} old, {_time(oldest * found['sampling_period'])}. In the record it "
-        f"was older {often}."
+        f"If a shield promises {in_steps(least)} (shield_safe_steps) at every step at which the contract is kept, the "
+        f"box is kept at least until the newest sample is {in_steps(oldest)} old, "
+        f"{_time(oldest * found['sampling_period'])}. In the record it was {older}."
     )
 
 
 def _row(found: dict[str, Any], age: int) -> dict[str, Any]:
     return next(row for row in found["contracts"] if row["max_age"] == age)
+
+
+def _times(row: dict[str, Any]) -> str:
+    low, high = map(_rate, row["per_hour_ci95"])
+    times = "once" if row["times"] == 1 else f"{row['times']:,} times"
+    return f"{times}, {_rate(row['per_hour'])} per hour [{low}, {high}]"
+
+
+def _most(row: dict[str, Any]) -> str:
+    return _rate(row["per_hour_ci95"][1])

@@ -279,8 +279,8 @@ class ChannelSettings:
         ping_period: Time between packets whose file does not say when they were sent, as of ping without -D [s]; by
             default that of ping's summary, or 1.
         env: Id of an environment whose contract is compared with the record.
-        least_safe_steps: For so many steps its shield in mode "lookahead" is asked to keep the box whatever the network
-            does: silences that are longer are counted.
+        least_safe_steps: Steps that a shield of it in mode "lookahead" promises while the contract is kept: the command
+            counts longer silences. Whether it promises them is to be seen in `info["shield_safe_steps"]`.
         out: File for the numbers (JSON).
     """
 
@@ -294,7 +294,7 @@ class ChannelSettings:
     def __post_init__(self) -> None:
         require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1))
         if self.least_safe_steps and self.env is None:
-            raise ValueError("--least-safe-steps are those of a shield: give --env, too")
+            raise ValueError("--least-safe-steps are those of a shield of --env: give both")
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")

@@ -48,7 +48,7 @@ SETTINGS = [
                           "violation_penalty": np.inf}.items()),
     (CompareSettings, {"horizon": 0, "mode": "lookahead"}, f"{HORIZON} 0"),
     (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
-    (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield: give --env"),
+    (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield of --env"),
     *((LoopSettings, given, f"--least-safe-steps {message}")
       for given, message in [({"least_safe_steps": 50}, "must be at least 0 and at most 49"),
                              ({"least_safe_steps": 5}, "5 is for mode lookahead, which is not asked for"),

@@ -68,12 +68,12 @@ def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_pat
     # Samples at every step of .02 s; five silences of 20 steps and one of 60.
     sent = np.cumsum([0.02] * 99 + [0.42] * 5 + [0.02] * 99 + [1.22] + [0.02] * 99)
     (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each},{each}\n" for each in sent))
-    for least, times in ((10, "6 times"), (30, "1 times"), (49, "1 times")):
+    for least, times in ((10, "6 times"), (30, "once"), (49, "once")):
         given = ("--env", "ncs_gym/CartPole-v0", "--least-safe-steps", least)
         found = ncs("channel", tmp_path / "packets.csv", *given)
         assert found.returncode == 0, found.stderr
         said = " ".join(found.stdout.split())
-        assert f"keeps the box until the newest sample is {4 + least} steps old" in said
+        assert f"the box is kept at least until the newest sample is {4 + least} steps old" in said
         assert f"In the record it was older {times}" in said
 
 
@@ -89,7 +89,7 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(page, t
     shown = [line.removeprefix("    ") for line in block.splitlines()]
     shown = shown[: next(n for n, line in enumerate(shown) if "in 0.169 % of steps" in line) + 1]
     assert [line for line in shown if line and line != "..." and line not in found.stdout.splitlines()] == []
-    promised = "    A shield that" + found.stdout.partition("A shield that")[2].replace("\n", "\n    ")
+    promised = "    If a shield" + found.stdout.partition("If a shield")[2].replace("\n", "\n    ")
     assert (promised.rstrip() in (ROOT / "docs" / page).read_text()) == (page == "contracts.md")
 
 
