@@ -261,23 +261,23 @@ async def _controller(
     uplink, downlink = loop.promised
     contract = contract_of(uplink)  # echoes are sent at every step, whatever samples are
     age = ECHO_AGE if contract is None else contract.max_age + ECHO_MARGIN
-    given = {"downlink": downlink, "echo_age": age, "on_unproved": "ignore"}
-    given["least_safe_steps"] = settings.least_safe_steps
-    certificate = Certificate.load(loop.certificate)
-    safe_loop = SafeLoop(certificate, plant, uplink, settings.shield, settings.horizon, **given)
+    safe_loop = SafeLoop(
+        Certificate.load(loop.certificate),
+        plant,
+        uplink,
+        settings.shield,
+        settings.horizon,
+        least_safe_steps=settings.least_safe_steps,
+        downlink=downlink,
+        echo_age=age,
+        on_unproved="ignore",
+    )
     transport = await UdpTransport.open(local=(HERE if settings.role == "all" else "0.0.0.0", settings.port))
     start, known = np.zeros(plant.n), not settings.restarted
     node = ControllerNode(safe_loop, wire, transport, StepClock(loop.dt(env)), start, known=known)
     inputs = plant.input_names
-    columns = [
-        "time",
-        "episode",
-        "step",
-        "guaranteed",
-        "safe_steps",
-        "reason",
-        *(f"x_hat_{name}" for name in plant.state_names),
-    ]
+    columns = ["time", "episode", "step", "guaranteed", "safe_steps", "reason"]
+    columns += [f"x_hat_{name}" for name in plant.state_names]
     columns += [*(f"proposed_{name}" for name in inputs), *(f"u_{name}" for name in inputs)]
     columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "refused_why"]
     columns += ["microseconds"]
@@ -291,16 +291,8 @@ async def _controller(
         safe, decision = node.loop, node.decision
         estimate = safe.estimate.tolist()
         values = [None] * plant.m if proposed is None else np.asarray(proposed, dtype=np.float64).tolist()
-        row = [
-            f"{time.time():.6f}",
-            node.episode,
-            safe.steps,
-            int(safe.guaranteed),
-            safe.safe_steps,
-            safe.reason,
-            *estimate,
-            *values,
-        ]
+        row = [f"{time.time():.6f}", node.episode, safe.steps, int(safe.guaranteed), safe.safe_steps, safe.reason]
+        row += [*estimate, *values]
         row += [*decision.input.tolist(), int(decision.intervened), float(decision.margin), safe.measurement_age]
         took = node.clock.time_of(safe.steps), asyncio.get_running_loop().time()
         row += [" ".join(map(str, node.arrived)), node.missing, node.skipped, node.refused.total()]

@@ -105,19 +105,16 @@ def require_limits(settings: Any, **limits: float | tuple[float, float]) -> None
 
 
 def require_horizon(settings: Any, *modes: str | None) -> None:
-    """Raises unless the horizon, if there is one, is in its range and belongs to one of these modes or arms.
-
-    The same of the least safe steps, if the settings have them.
+    """Raises unless horizon and least safe steps, if there are any, are in range and for one of these modes or arms.
 
     Raises:
         ValueError: If it does not.
     """
-    require_limits(settings, horizon=(1, LONGEST_HORIZON))
-    if (horizon := settings.horizon) is not None and not any("lookahead" in (mode or "") for mode in modes):
-        raise ValueError(f"--horizon {horizon} is for mode lookahead, which is not asked for")
-    least = getattr(settings, "least_safe_steps", 0)
-    require_limits(settings, least_safe_steps=(0, LONGEST_HORIZON - 1))
-    if least and not any("lookahead" in (mode or "") for mode in modes):
-        raise ValueError(f"--least-safe-steps {least} is for mode lookahead, which is not asked for")
+    require_limits(settings, horizon=(1, LONGEST_HORIZON), least_safe_steps=(0, LONGEST_HORIZON - 1))
+    horizon, least = settings.horizon, getattr(settings, "least_safe_steps", 0)
+    given = {"--horizon": horizon, "--least-safe-steps": least or None}
+    for name, value in given.items():
+        if value is not None and not any("lookahead" in (mode or "") for mode in modes):
+            raise ValueError(f"{name} {value} is for mode lookahead, which is not asked for")
     if horizon is not None and horizon <= least:
         raise ValueError(f"--least-safe-steps {least} takes plans of {least + 1} steps, got --horizon {horizon}")

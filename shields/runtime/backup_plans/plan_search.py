@@ -87,7 +87,7 @@ class Planner:
         return Plans(inputs, np.zeros(count, np.int64), np.full(count, np.inf))
 
     def ranks(self, lengths: np.ndarray) -> np.ndarray:
-        """Returns the lengths of plans as far as they count: up to what is long enough."""
+        """Returns how much plans of these lengths count: a longer one for more, until it is long enough."""
         return np.minimum(lengths, self.wanted)
 
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
@@ -110,13 +110,15 @@ class Planner:
         """
         tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
         plans = self._best(estimates, tightening, continued[:, :1], proposed)
-        for others in (continued[:, 1:], None):
+        for next_of in (
+            lambda some: continued[some, 1:],
+            lambda some: self._limited(estimates[some], proposed[some], stored[some]),
+        ):
             left = np.flatnonzero(plans.lengths < self.wanted)
             if not left.size:
                 break
-            some = estimates[left], proposed[left]
-            tried = self._limited(*some, stored[left]) if others is None else others[left]
-            self._improve(plans, left, self._best(some[0], tightening.some(left), tried, some[1]))
+            found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left])
+            self._improve(plans, left, found)
         return plans
 
     def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
