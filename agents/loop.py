@@ -29,11 +29,11 @@ class ShieldSettings:
         penalty: Subtracted from the reward for every intervention.
         horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
         on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
-        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does.
+        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does.
 
     Raises:
         ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
-            that a shield takes, or horizon and steps are none that mode "lookahead" takes.
+            that a shield takes, or mode "lookahead" does not take the horizon or the steps.
     """
 
     certificate: Certificate

@@ -364,7 +364,8 @@ class LoopSettings:
         vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
-        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does.
+        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; without
+            --horizon plans become long enough for them.
         certificate: Certificate file to use instead of synthesizing one; both machines need the same.
         steps: Steps of the controller.
         speed: How much faster than the plant's own time the loop runs; below 1 for slow machines.

@@ -199,11 +199,15 @@ class GuaranteeMonitor:
         return _first(reason, is_large, LARGE_ERROR)
 
     def safe_steps(self, state: MonitorState, stored: Any) -> Any:
-        """Returns for how many steps the box is kept whatever the network does: that of plans with inputs `stored`.
+        """Returns for how many steps the box is kept whatever the network does, at most as many as are asked for.
 
-        At most as many as are asked for, behind a downlink from the step on at which the next input takes effect. That
-        takes no contract of the samples: nothing but the bounds, which what is `broken` contradicts, and that what is
-        decided is applied. It is 0 while the state at present, or the way to it, is not proved to be in the box.
+        Behind a downlink they are counted from the step at which the next input takes effect. No contract of the
+        samples is assumed, only the bounds and that what is decided is applied. It is 0 once that is `broken`, and
+        while the present state, or the way to it, is not proved to be in the box.
+
+        Args:
+            state: The present one.
+            stored: Number of inputs stored for the steps to come, shape () or (N,).
         """
         return np.minimum(stored, self._least) * ((state.broken == 0) & (state.wait == 0)) * self._is_promised
 

@@ -115,7 +115,7 @@ class MonitoredFilter:
 
     @property
     def safe_steps(self) -> int:
-        """For so many steps the box is kept whatever the network does (`GuaranteeMonitor.safe_steps`)."""
+        """Number of steps for which the box is kept whatever the network does (`GuaranteeMonitor.safe_steps`)."""
         return int(self._monitor.safe_steps(self._state, len(self._stored)))
 
     @property

@@ -106,7 +106,7 @@ class SafeLoop(CopiedWhole):
         on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
             "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" if you read `guaranteed`.
             When one is raised, the call has come to its end: go on with `decide`.
-        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does; see
+        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; see
             `SafetyFilter`.
 
     Attributes:
@@ -393,10 +393,10 @@ class SafeLoop(CopiedWhole):
 
     @property
     def safe_steps(self) -> int:
-        """For so many steps the box is kept whatever the network does; at most `least_safe_steps`, 0 in other modes.
+        """Number of steps for which the box is kept whatever the network does; 0 in other modes than "lookahead".
 
-        It falls by at most one per step, while what `reason` names is nothing that contradicts the bounds, and if what
-        is decided is applied.
+        At most `least_safe_steps`. It falls by at most one per step, unless a measurement contradicts the bounds or
+        another input than the decided one is applied; then it is 0.
         """
         unknown = self._phase is _Phase.STOPPED or self._unknown is not None or self._applied.is_other
         return 0 if unknown else self._monitored.safe_steps

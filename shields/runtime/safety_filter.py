@@ -57,9 +57,9 @@ class SafetyFilter(ReadOnlyArrays):
             (docs/lookahead.md).
         horizon: Longest plan of mode "lookahead", in steps; None is 6, or more if `least_safe_steps` takes more. Other
             modes take none.
-        least_safe_steps: For so many steps the box is to be kept whatever the network does, of mode "lookahead"; 0 asks
-            for none. An input passes if it begins a certified plan that leaves as many inputs stored, and where no
-            input does, the longest plan is followed (docs/lookahead.md, "When the network goes silent").
+        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; 0 asks for
+            none. An input passes if it begins a certified plan that leaves as many inputs stored; where no such plan is
+            found, the longest is followed (docs/lookahead.md, "When the network goes silent"). Other modes take none.
 
     Attributes:
         test: The test of an input.
@@ -68,8 +68,8 @@ class SafetyFilter(ReadOnlyArrays):
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
         ValueError: If the mode is unknown, or "boundary" for more than twelve inputs, or the horizon is no whole number
-            from 1 to 50, or `least_safe_steps` none from 0 to one less than the horizon, or one of both is given for
-            another mode than "lookahead".
+            from 1 to 50, or `least_safe_steps` none from 0 to one less than the horizon, or either is given for another
+            mode than "lookahead".
     """
 
     certificate: Certificate

@@ -167,7 +167,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
     | `episode_interventions` | int | steps | number of steps of this episode with `shield_intervened` |
     | `episode_guaranteed` | float | - | share of the states of this episode, the first included, proved as now |
     | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
-    | `shield_safe_steps` | int | steps | in mode "lookahead" only: the box is kept so long whatever the network does |
+    | `shield_safe_steps` | int | steps | in mode "lookahead" only: the box is kept so long, whatever the network does |
 
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
     is in S; `shield_guaranteed` then says whether the state is proved to be in the box now and to stay there.
@@ -186,7 +186,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         on_unproved: What reset and step do, once per episode and reason, where x in S is not proved: "warn" with a
             `GuaranteeLostWarning`, "raise" a `GuaranteeLostError` after the step, "ignore" if you read the infos.
-        least_safe_steps: For so many steps mode "lookahead" is to keep the box whatever the network does; see
+        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; see
             `SafetyFilter`.
 
     Raises:

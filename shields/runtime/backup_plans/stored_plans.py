@@ -22,10 +22,10 @@ class Lookahead:
     proposed one is applied and what follows it in its plan is stored. Without any, the next stored input is applied;
     where nothing is stored, K x_hat.
 
-    A plan that leaves at least `least` inputs stored is long enough. Where g > 0 of them are asked for, an input that
-    passes the one-step test is only a plan of one input, and is applied as it is only if it begins one that is long
-    enough. Where there is none, of the plans found and the stored one the longest is applied. So the smaller of g and
-    the number of inputs stored never falls by more than one per step.
+    A plan that leaves at least g inputs stored is long enough. For g > 0 an input that passes the one-step test is only
+    a plan of one input, and is applied as it is only if it begins one that is long enough. Where none is found, the
+    longest of the plans found and the stored one is applied. So the smaller of g and the number of inputs stored never
+    falls by more than one per step.
 
     Its methods change decisions about N proposals in place, given the numbers of `some` of them, estimates x_hat (n,
     N), what is known of the Sigma_k of each, proposals (m, N) [physical units], and plans still stored (horizon, m, N),
