@@ -49,8 +49,7 @@ class ShieldSettings:
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
         LostGuarantee(self.on_unproved)
-        if self.mode == "lookahead":
-            object.__setattr__(self, "horizon", plan_horizon(self.horizon, self.least_safe_steps))
+        object.__setattr__(self, "horizon", plan_horizon(self.mode, self.horizon, self.least_safe_steps))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -102,17 +102,13 @@ class SafetyFilter(ReadOnlyArrays):
         for name, each in columns.items():
             object.__setattr__(self, name, read_only(each[:, None]))
         object.__setattr__(self, "_remembered", {})
-        if self.mode == "lookahead":
+        horizon, least = plan_horizon(self.mode, self.horizon, self.least_safe_steps), int(self.least_safe_steps)
+        object.__setattr__(self, "horizon", horizon)
+        object.__setattr__(self, "least_safe_steps", least)
+        if horizon is not None:
             from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
 
-            horizon, least = plan_horizon(self.horizon, self.least_safe_steps), int(self.least_safe_steps)
-            object.__setattr__(self, "horizon", horizon)
-            object.__setattr__(self, "least_safe_steps", least)
             object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, least, MARGIN))
-        elif self.horizon is not None:
-            raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
-        elif self.least_safe_steps != 0:
-            raise ValueError(f'least_safe_steps is for mode "lookahead", mode {self.mode!r} takes none')
 
     @cached_property
     def _single(self) -> tuple[tuple[int], tuple[int]]:
@@ -204,15 +200,14 @@ class SafetyFilter(ReadOnlyArrays):
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
         plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
         decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
-        short = None
         if self.lookahead is not None:
             stored = plan.copy() if stored is None else stored
-            short = self.lookahead.keep(decided, valid, estimates, errors, stored)
+            self.lookahead.keep(decided, valid, estimates, errors, stored)
         if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~decided.passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
         if self.lookahead is not None and stored is not None:
-            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored, short)
+            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
     @own_error_state
@@ -366,13 +361,19 @@ class SafetyFilter(ReadOnlyArrays):
         return expressible(inputs.T, self.plant).T
 
 
-def plan_horizon(horizon: int | None, least_safe_steps: int) -> int:
-    """Returns the length of the longest plans of mode "lookahead".
+def plan_horizon(mode: str, horizon: int | None, least_safe_steps: int) -> int | None:
+    """Returns the length of the longest plans of a mode [steps]; None for those that plan nothing.
 
     Raises:
-        ValueError: If either is no whole number in its range, or such plans are too short for so many safe steps.
+        ValueError: If either number is given for such a mode, or is no whole number in its range, or plans of the
+            horizon are too short for so many safe steps.
     """
     least = as_count(least_safe_steps, "least_safe_steps", low=0, high=LONGEST_HORIZON - 1)
+    if mode != "lookahead":
+        for name, given in {"horizon": horizon, "least_safe_steps": least or None}.items():
+            if given is not None:
+                raise ValueError(f'{name} is for mode "lookahead", mode {mode!r} takes none')
+        return None
     given = max(DEFAULT_HORIZON, least + 1) if horizon is None else horizon
     longest = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
     if longest <= least:

@@ -210,8 +210,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         is_safe = np.array([each[-1].in_safe_set for each in known])
         if len(self._stored):
             self._stored[..., restarted] = np.nan
-            chosen = restarted if self._filter.least_safe_steps else restarted & ~is_safe
-            for e in np.flatnonzero(chosen).tolist():
+            for e in np.flatnonzero(restarted).tolist():
                 estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.single(e)
                 plan, is_safe[e] = first_store(self._filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan

@@ -24,7 +24,7 @@ from shields.certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.guarantee import LoopObservation, LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
-from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.safety_filter import SafetyFilter, plan_horizon
 from shields.runtime.starts import StartKnown, starts_known
 
 E = TypeVar("E", NCSEnv, NCSVectorEnv)
@@ -66,8 +66,10 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
             wanted = "a Certificate, its document or path, or None"
             raise ValueError(f"certificate must be {wanted}, got {shown(certificate)}")
         recorded = certificate.document if isinstance(certificate, Certificate) else certificate
-        given = {"mode": mode, "penalty": penalty, "horizon": horizon, "on_unproved": on_unproved}
-        RecordConstructorArgs.__init__(self, certificate=recorded, least_safe_steps=least, **given)
+        plan_horizon(mode, horizon, least)
+        given = {"mode": mode, "penalty": penalty, "on_unproved": on_unproved, "least_safe_steps": int(least)}
+        given["horizon"] = None if horizon is None else int(horizon)  # a spec is JSON
+        RecordConstructorArgs.__init__(self, certificate=recorded, **given)
         read = None if certificate is None else Certificate.read(certificate)
         inner = self._inner = self._environment_in(env)
         for space in ("action_space", "single_action_space"):

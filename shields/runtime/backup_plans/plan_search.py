@@ -62,17 +62,17 @@ class Planner:
         first: The one-step test.
         fallback: The certificate's: the regulators have gains of their own around the same resting point.
         horizon: Largest length N of a plan.
-        wanted: Length of a plan that is long enough, at most N. A shorter one is taken only where none is: the longest.
+        enough: Length of a plan that is long enough, at most N. A shorter one is taken only where none is: the longest.
         margin: By which plans must pass the test.
 
     Attributes:
         test: The plan test.
         horizon: N.
-        wanted: The same.
+        enough: The same.
     """
 
-    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, wanted: int, margin: float) -> None:
-        self.test, self.horizon, self.wanted = PlanTest(Prediction(first, horizon), margin), horizon, wanted
+    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, enough: int, margin: float) -> None:
+        self.test, self.horizon, self.enough = PlanTest(Prediction(first, horizon), margin), horizon, enough
         self._plant, self._fallback, gain = first.plant, fallback, fallback.gain
         self._rest = read_only(np.concatenate(fallback[1:]))
         braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
@@ -81,23 +81,18 @@ class Planner:
         self._loops = np.concatenate(loops, axis=1)
         self._program = PlanProgram(self.test.prediction)
 
-    def none(self, count: int) -> Plans:
-        """Returns no plans for so many environments."""
-        inputs = np.full((count, self.horizon, self._plant.m), np.nan)
-        return Plans(inputs, np.zeros(count, np.int64), np.full(count, np.inf))
-
     def ranks(self, lengths: np.ndarray) -> np.ndarray:
         """Returns how much plans of these lengths count: a longer one for more, until it is long enough."""
-        return np.minimum(lengths, self.wanted)
+        return np.minimum(lengths, self.enough)
 
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns a plan, (j, m), of a single environment, if the first candidates of `beginning_with` are enough."""
         plans = self._continued(estimate, proposed)
         certified = self.test.certified(estimate[None], self.test.tightenings_of(shape[None]), plans[None])[0]
-        certified = certified[:, self.wanted - 1 :]
+        certified = certified[:, self.enough - 1 :]
         which = int(certified.any(axis=1).argmax())
         more = int(certified[which].argmax())
-        return plans[which, : self.wanted + more] if certified[which, more] else None
+        return plans[which, : self.enough + more] if certified[which, more] else None
 
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
@@ -114,11 +109,11 @@ class Planner:
             lambda some: continued[some, 1:],
             lambda some: self._limited(estimates[some], proposed[some], stored[some]),
         ):
-            left = np.flatnonzero(plans.lengths < self.wanted)
+            left = np.flatnonzero(plans.lengths < self.enough)
             if not left.size:
                 break
             found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left])
-            self._improve(plans, left, found)
+            self.improve(plans, left, found)
         return plans
 
     def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
@@ -147,14 +142,12 @@ class Planner:
         proposed: np.ndarray,
         projected: np.ndarray,
         stored: np.ndarray,
-        begun: Plans | None = None,
     ) -> Plans:
         """Returns certified plans whose first inputs are close to the proposed ones.
 
-        Candidates are those that begin with the proposal and were too short (`begun`), the projected input and then the
-        regulator, what is stored, and either gain from the start. The solver is asked where none of them is certified;
-        where plans end in S also if nothing is stored. Plans that end in P would begin closer by it in a single step,
-        but not in a loop (docs/lookahead.md), for three times the time.
+        Candidates are the projected input and then the regulator, what is stored, and either gain from the start. The
+        solver is asked where none of them is certified; where plans end in S also if nothing is stored. Plans that end
+        in P would begin closer by it in a single step, but not in a loop (docs/lookahead.md), for three times the time.
         `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
         """
         tightening = self.test.tightenings_of(shapes)
@@ -162,18 +155,16 @@ class Planner:
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
         candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
         plans = self._best(estimates, tightening, candidates, proposed)
-        if begun is not None:
-            self._improve(plans, np.arange(len(estimates)), begun)
         if self.horizon > 1:
             needed = plans.lengths == 0
             if self.test.prediction.ends:
                 needed |= np.isnan(stored[:, 0, 0])
             left = np.flatnonzero(needed & (plans.distances > 0.0))
             if left.size:
-                self._improve(plans, left, self._solved(estimates[left], tightening.some(left), proposed[left]))
+                self.improve(plans, left, self._solved(estimates[left], tightening.some(left), proposed[left]))
         return plans
 
-    def _improve(self, plans: Plans, chosen: np.ndarray, others: Plans) -> None:
+    def improve(self, plans: Plans, chosen: np.ndarray, others: Plans) -> None:
         """Puts other plans of the environments chosen in place where they have a higher rank, or begin closer."""
         own, other = self.ranks(plans.lengths[chosen]), self.ranks(others.lengths)
         better = (other > own) | ((other == own) & (others.distances < plans.distances[chosen]))
@@ -187,9 +178,9 @@ class Planner:
         rank is returned; of several the one that begins closest, and of equal ones the first.
         """
         certified = self.test.certified(estimates, tightening, plans)
-        enough = certified[..., self.wanted - 1 :]
-        lengths = np.where(enough.any(axis=-1), self.wanted + enough.argmax(axis=-1), 0)
-        if self.wanted > 1:
+        enough = certified[..., self.enough - 1 :]
+        lengths = np.where(enough.any(axis=-1), self.enough + enough.argmax(axis=-1), 0)
+        if self.enough > 1:
             longest = self.horizon - certified[..., ::-1].argmax(axis=-1)
             lengths = np.where((lengths == 0) & certified.any(axis=-1), longest, lengths)
         ranks = self.ranks(lengths)

@@ -49,26 +49,18 @@ class Lookahead:
 
     def keep(
         self, decided: Decision, valid: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
-    ) -> Plans | None:
+    ) -> None:
         """Lets inputs within the limits (`valid`, shape (N,)) pass where a plan that is long enough begins with them.
 
-        Of these decisions `input` is the proposed one, and `plan` is all NaN. Returns the plans that are too short, of
-        all N; None if there can be none.
+        Of these decisions `input` is the proposed one, and `plan` is all NaN.
         """
         some = np.flatnonzero(valid if self.least else valid & ~decided.passed)
-        if not some.size:
-            return None
-        known = self._rows(some, estimates, errors, decided.input, stored)
-        found = self.planner.beginning_with(*known)
-        enough = found.lengths >= self.planner.wanted
-        decided.intervened[some[enough]] = False
-        self._begin(decided, some, found._replace(lengths=found.lengths * enough))
-        if not self.least:
-            return None
-        short = self.planner.none(len(valid))
-        for part, new in zip(short, found, strict=True):
-            part[some] = new
-        return short
+        if some.size:
+            known = self._rows(some, estimates, errors, decided.input, stored)
+            found = self.planner.beginning_with(*known)
+            found.lengths[found.lengths < self.planner.enough] = 0
+            begun = self._begin(decided, some, found)
+            decided.intervened[some[begun]] = False
 
     def complete(
         self,
@@ -78,7 +70,6 @@ class Lookahead:
         errors: PredictedErrors,
         proposed: np.ndarray,
         stored: np.ndarray,
-        short: Plans | None,
     ) -> None:
         """Changes decisions of mode "project" about proposals that were not let pass."""
         some = np.flatnonzero((decided.reason != PLANNED) & ((decided.reason != SAFE) | (self.least > 0)))
@@ -87,8 +78,7 @@ class Lookahead:
         changed = np.zeros(some.shape, np.bool_)
         searched = np.flatnonzero(decided.reason[some] != INVALID)
         if searched.size:
-            begun = None if short is None else short.some(some[searched])
-            changed[searched] = self._plan(decided, some[searched], estimates, errors, proposed, stored, begun)
+            changed[searched] = self._plan(decided, some[searched], estimates, errors, proposed, stored)
         passes = (decided.reason[some] == SAFE) | (decided.reason[some] == PROJECTED)
         left = ~changed & (self._ranks(stored[..., some]) > passes)
         resumed = some[left]
@@ -108,7 +98,6 @@ class Lookahead:
         errors: PredictedErrors,
         proposed: np.ndarray,
         stored: np.ndarray,
-        begun: Plans | None,
     ) -> np.ndarray:
         """Begins new plans where one is found that is closer than the input that passes, or longer; returns where.
 
@@ -117,7 +106,9 @@ class Lookahead:
         passes = (decided.reason[some] == SAFE) | (decided.reason[some] == PROJECTED)
         closest = np.where(passes, decided.input[:, some], np.nan)
         x_hat, shapes, wanted, plans = self._rows(some, estimates, errors, proposed, stored)
-        found = self.planner.find(x_hat, shapes, wanted, closest.T, plans, begun)
+        found = self.planner.find(x_hat, shapes, wanted, closest.T, plans)
+        if self.least:  # what begins with the proposal may be the longest, though it is too short
+            self.planner.improve(found, np.arange(len(some)), self.planner.beginning_with(x_hat, shapes, wanted, plans))
         ranks = self.planner.ranks(found.lengths)
         farther = passes & (ranks <= 1) & (found.distances >= norms(closest - proposed[:, some]))
         found.lengths[farther | (ranks < self._ranks(stored[..., some]))] = 0

@@ -107,12 +107,20 @@ def test_nothing_is_promised_on_bounds_that_a_measurement_contradicts():
         ({"mode": "lookahead", "least_safe_steps": 50}, "least_safe_steps must be a whole number"),
         ({"mode": "lookahead", "least_safe_steps": -1}, "least_safe_steps must be a whole number"),
         ({"mode": "lookahead", "least_safe_steps": 2.5}, "least_safe_steps must be a whole number"),
+        ({"least_safe_steps": False}, "least_safe_steps must be a whole number"),
         ({"mode": "lookahead", "least_safe_steps": None}, "least_safe_steps must be a whole number"),
     ],
 )
 def test_wrong_numbers_of_steps_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), **given)
+
+
+def test_numbers_of_numpy_are_those_of_a_spec():
+    counts = {"least_safe_steps": np.int64(3), "horizon": np.int64(6)}
+    env = SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), mode="lookahead", **counts)
+    made = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert (made.get_wrapper_attr("least_safe_steps"), made.get_wrapper_attr("horizon")) == (3, 6)
 
 
 def test_horizon_is_long_enough_by_itself():
