@@ -1104,16 +1104,19 @@ def weight_of(rows: np.ndarray) -> np.ndarray:
 def inputs_under_way(plant: LinearPlant) -> int:
     """Returns how many of the last states are past inputs, of an `input_delay` or limits of rates; 0 of most plants.
 
-    These are states (u_{k-d}, .., u_{k-1}), of which the input is the newest one in the next step.
+    These are states (u_{k-d}, .., u_{k-1}), of which the input is the newest one in the next step. What is disturbed on
+    its way is none: it may be beyond the limits of inputs.
     """
     n, m = plant.n, plant.m
-    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B[-m:], np.eye(m)):
+    disturbed = plant.nominal_disturbance.shape_matrix.diagonal() > 0.0
+    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B[-m:], np.eye(m)) or disturbed[-m:].any():
         return 0
     stored = m
     while (
         stored + m < n
         and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m])
         and not plant.B[-stored - m : -stored].any()
+        and not disturbed[-stored - m : -stored].any()
     ):
         stored += m
     return stored

@@ -111,6 +111,22 @@ def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
         np.testing.assert_allclose(found, right, atol=1e-7)
 
 
+def test_input_that_is_disturbed_on_its_way_counts_by_the_limits_of_its_state():
+    def of(gain, disturbance):
+        model = {"A": [[0.9, gain], [0.0, 0.0]], "B": [[0.0], [1.0]], "box": [1.0, 2.0], "u_max": 1.0, "dt": 0.1}
+        return LinearPlant(**model | QUIET | {"disturbance_bound": disturbance})
+
+    for disturbance, reached in (([0.01, 0.0], 1.0), ([0.01, 0.5], 2.0)):
+        plant = LinearPlant.family([of(0.1, disturbance), of(0.3, disturbance)])
+        assert inputs_under_way(plant) == (reached == 1.0)
+        np.testing.assert_allclose(plant.reach, [1.0, reached, 1.0])
+        np.testing.assert_allclose(
+            np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.1 * reached, 0.0], rtol=1e-8
+        )
+        # Only what is known without an error is the last input of limits of rates.
+        assert of(0.1, disturbance).with_rate_limits(0.5).n == (2 if reached == 1.0 else 3)
+
+
 def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_members():
     def of(entry, column=0, **more):
         A = np.array(SMALL["A"])
