@@ -327,6 +327,8 @@ class LinearPlant(ReadOnlyArrays):
             as_bound(self.remainder.bound, self.n, "remainder")
             model = {name: getattr(self, name) for name in ("A", "B")}
             model |= {"box": np.vstack([self.box.T, self.box_ends]), "u_max": self.input_ends, "dt": self.dt}
+            if self.members is not None:  # how far states reach depends on whether past inputs are disturbed
+                model["disturbance_bound"] = np.array(inputs_under_way(self))
             self._set("remainder", self.remainder.of_model(model))
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 

@@ -53,7 +53,8 @@ class Remainder:
         """Returns the same remainder, which from now on belongs to this model alone.
 
         Args:
-            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt.
+            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt; of a
+                family disturbance_bound, too.
 
         Raises:
             ValueError: If it belongs to another model, or the members of its family are of another size.

@@ -125,6 +125,10 @@ def test_input_that_is_disturbed_on_its_way_counts_by_the_limits_of_its_state():
         )
         # Only what is known without an error is the last input of limits of rates.
         assert of(0.1, disturbance).with_rate_limits(0.5).n == (2 if reached == 1.0 else 3)
+    quiet = LinearPlant.family([of(0.1, 0.0), of(0.3, 0.0)])
+    assert replace(quiet, disturbance_bound=[0.02, 0.0]).reach[1] == 1.0
+    with pytest.raises(ValueError, match="belongs to a plant with another disturbance_bound"):
+        replace(quiet, disturbance_bound=[0.01, 0.5])
 
 
 def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_members():
