@@ -209,7 +209,11 @@ class GuaranteeMonitor:
             state: The present one.
             stored: Number of inputs stored for the steps to come, shape () or (N,).
         """
-        return np.minimum(stored, self._least) * ((state.broken == 0) & (state.wait == 0)) * self._is_promised
+        return (
+            np.minimum(stored, self._least)
+            * ((state.broken == 0) & (state.wait == 0) & state.inside)
+            * self._is_promised
+        )
 
     def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
         if not self._under_way:

@@ -220,7 +220,8 @@ class SafetyFilter(ReadOnlyArrays):
             estimates: x_hat, shape (N, n).
             error_shapes: Sigma_k, shape (N, n, n), or (n, n) for all.
             proposals: Inputs, shape (N, m) [physical units].
-            stored: In mode "lookahead" the `plan` of the last decisions, shape (N, horizon, m); None for none.
+            stored: In mode "lookahead" the `plan` of the last decisions, shape (N, horizon, m); None for none. What is
+                no plan counts as none, as for single ones.
 
         Returns:
             A `Decision` of arrays, empty ones for N = 0: `input` of shape (N, m), `plan` (N, horizon, m), `reason` of
@@ -245,7 +246,9 @@ class SafetyFilter(ReadOnlyArrays):
         errors = self.errors_of_many(arrays["error_shapes"][None] if one_shape else arrays["error_shapes"])
         errors = errors.of(np.zeros(count, np.intp)) if one_shape else errors
         columns = [np.array(arrays[name].T, order="C") for name in ("estimates", "proposals")]
-        plans = None if stored is None else np.array(arrays["stored"].transpose(1, 2, 0))
+        plans = None
+        if stored is not None and self.lookahead is not None:
+            plans = self.lookahead.all_as_stored(arrays["stored"]).transpose(1, 2, 0).copy()
         decided = self.decide_columns(columns[0], errors, columns[1], plans)
         return decided._replace(
             input=np.array(decided.input.T, order="C"),

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, NCSVectorEnv, TraceChannel
+from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.backup_plans.plan_search import completed
 from shields.runtime.guarantee import ALARM
@@ -97,6 +97,45 @@ def test_nothing_is_promised_on_bounds_that_a_measurement_contradicts():
         *_, info = env.step(np.zeros(1, np.float32))
         assert info["shield_safe_steps"] == 0 or info["shield_reason"] != ALARM
     assert info["shield_reason"] == ALARM
+
+
+@pytest.mark.parametrize("is_vector", [False, True], ids=["scalar", "vector"])
+def test_nothing_is_promised_while_the_state_is_outside_the_box_though_a_plan_leads_back(is_vector):
+    plant = LinearPlant(
+        A=0.5 * np.eye(2), B=[[0.0], [0.3]], box=1.0, u_max=1.0, dt=0.1,
+        disturbance_bound=0.05, sensor_bound=0.01, initial_bound=0.02,
+    )  # fmt: skip
+    given = {"mode": "lookahead", "least_safe_steps": 3, "on_unproved": "ignore"}
+    start, action = np.array([1.2, 0.0]), np.zeros(1, np.float32)
+    if is_vector:
+        shield = VectorSafetyShield(NCSVectorEnv(2, plant=plant, channel=Channel()), **given)
+        start, action = np.array([0.5 * start, start]), np.array([action, action])
+    else:
+        shield = SafetyShield(NCSEnv(plant=plant, channel=Channel()), **given)
+    _, info = shield.reset(seed=0, options={"state": start})
+    assert np.all(info["shield_plan_length"] == 4)
+    np.testing.assert_array_equal(info["shield_safe_steps"], [3, 0] if is_vector else 0)
+    *_, info = shield.step(action)
+    assert np.all(info["shield_safe_steps"] == 3)
+
+
+@pytest.mark.parametrize("least", [0, LEAST])
+@pytest.mark.parametrize("wrong", [np.nan, 1e3], ids=["a gap", "beyond the limits"])
+def test_what_is_no_plan_counts_as_none_of_many_loops_too(least, wrong):
+    made, plant = cart_filter(least, HORIZON), CART.plant
+    lost = np.full((2, plant.n), 10.0) * plant.half_widths  # no plan is found
+    proposals, stored = np.array([[np.nan], [0.0]]), np.full((2, HORIZON, plant.m), np.nan)
+    stored[:, :4] = 0.1 * plant.u_max
+    decided = made.decide_many(lost, CART.certificate.Sigma, proposals, stored)
+    np.testing.assert_array_equal(decided.reason, "stored")
+    stored[:, 0] = wrong
+    decided = made.decide_many(lost, CART.certificate.Sigma, proposals, stored)
+    alone = [
+        made.decide(x, CART.certificate.Sigma, u, plan) for x, u, plan in zip(lost, proposals, stored, strict=True)
+    ]
+    assert [*decided.reason] == [each.reason for each in alone] == ["invalid", "fallback"]
+    np.testing.assert_array_equal(decided.input, [each.input for each in alone])
+    assert np.isnan(decided.plan).all()
 
 
 @pytest.mark.parametrize(
