@@ -8,7 +8,6 @@ that is a row again. What a linear program shows to hold already is not added. A
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -25,14 +24,15 @@ from shields.synthesis.design_problem import Rest, taken_between_samples
 from shields.synthesis.resting_point import units_of_states
 from shields.verification import ACTION_ROUNDING
 
-# The search takes at most so long [s], of its thread's own time: what else a machine does decides no certificate.
-LONGEST_SEARCH = 60.0
+# The search follows at most so many rows from one step to the one before, nearly five times what it takes for any
+# published plant that has a polytope. They are counted, not timed: the speed of a machine decides no certificate.
+MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
 # and for what others imply only up to some part of it. Where the first makes too many rows, a larger one makes fewer.
 MARGINS = (1e-6, 2e-5)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
-# In the details of an `Infeasible`: it is the limits of rows and time that end the search.
+# In the details of an `Infeasible`: it is the limits of rows that end the search.
 _TOO_LARGE = "too_large"
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
@@ -115,7 +115,6 @@ def invariant_polytope(
     feedback: Feedback,
     plant: LinearPlant,
     progress: Callable[[str], object],
-    longest: float | None = None,
     margins: Sequence[float] = MARGINS,
 ) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
@@ -126,18 +125,16 @@ def invariant_polytope(
         feedback: The fallback.
         plant: Its plant.
         progress: Called with a line of text now and then.
-        longest: How long the search takes at most [s of the thread's time]; `LONGEST_SEARCH` by default.
         margins: Those of `MARGINS` that are tried, each where the one before makes too many rows.
 
     Raises:
-        Infeasible: If there is none within `MOST_ROWS` rows and that time; the message says why.
+        Infeasible: If there is none within `MOST_ROWS` rows and `MOST_FOLLOWED` that are followed; the message says why.
     """
-    deadline = time.thread_time() + (LONGEST_SEARCH if longest is None else longest)
     too_large: Infeasible | None = None
     for margin in margins:
         implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
         try:
-            return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied, deadline)
+            return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
         except Infeasible as infeasible:
             if not is_too_large(infeasible):  # with a smaller margin it is a matter of rows
                 raise (too_large or infeasible) from None
@@ -148,18 +145,18 @@ def invariant_polytope(
 
 
 def is_too_large(infeasible: Infeasible) -> bool:
-    """Returns whether there may be a polytope, but not within the limits of rows and time."""
+    """Returns whether there may be a polytope, but not within the limits of rows."""
     return _TOO_LARGE in infeasible.details
 
 
-def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float, deadline: float) -> Polytope:
+def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float) -> Polytope:
     """Returns what `invariant_polytope` does, of rows that cut by more than `implied`."""
     kept = len(step.plant.box)
-    faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied, deadline)
+    faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
     extents = _extents(faces) if step.has_free_states else np.ones(step.plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
         step.widths = step.widths * extents
-        faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied, deadline)
+        faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
     return _rounded(step, _faces_that_count(faces, kept, progress, implied))
 
 
@@ -178,10 +175,9 @@ def invariant_faces(
         progress: Called with a line of text now and then.
 
     Raises:
-        Infeasible: If there are none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds, or `predecessor` raises it.
+        Infeasible: If there are none within `MOST_ROWS` rows and `MOST_FOLLOWED` that are followed, or `predecessor` raises it.
     """
-    deadline = time.thread_time() + LONGEST_SEARCH
-    faces = _faces_that_cut(faces, predecessor, kept, progress, _IMPLIED, deadline)
+    faces = _faces_that_cut(faces, predecessor, kept, progress, _IMPLIED)
     return _faces_that_count(faces, kept, progress, _IMPLIED)
 
 
@@ -191,21 +187,20 @@ def _faces_that_cut(
     kept: int,
     progress: Callable[[str], object],
     implied: float,
-    deadline: float,
 ) -> Faces:
     """Returns the faces of `invariant_faces` with some that later ones imply.
 
-    A row is added if it cuts off more than `implied`; the deadline is one of the thread's time [s].
+    A row is added if it cuts off more than `implied`.
 
     Raises:
-        Infeasible: If there are too many rows, or the deadline comes first.
+        Infeasible: If there are too many rows, or too many are followed.
     """
     if kept > MOST_ROWS:
         raise _none(
             f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
         )
     faces, _ = _without_implied(faces, kept, implied)
-    following = 0
+    following = followed = 0
     while following < len(faces.rows):
         row = faces.some(slice(following, following + 1))
         if following < kept and not _cuts(faces.some(np.arange(len(faces.rows)) != following), row, implied).any():
@@ -215,8 +210,8 @@ def _faces_that_cut(
             faces, following = _without_implied(faces, kept, implied, following)
             if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
                 raise _too_many()
-        if time.thread_time() > deadline:
-            raise _too_large("its search took longer than it may, less with fewer states or longer steps")
+        if followed >= MOST_FOLLOWED:
+            raise _too_large(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(faces.rows)} rows")
         row = predecessor(row)
@@ -225,7 +220,7 @@ def _faces_that_cut(
             faces = faces.followed_by(
                 row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1])
             )
-        following += 1
+        following, followed = following + 1, followed + 1
     return faces
 
 
@@ -422,7 +417,7 @@ def _none(reason: str) -> Infeasible:
 
 
 def _too_large(reason: str) -> Infeasible:
-    """There may be a polytope, but not within the limits of rows and time."""
+    """There may be a polytope, but not within the limits of rows."""
     return Infeasible(reason, "P", 0.0, {_TOO_LARGE: 1.0})
 
 

@@ -28,7 +28,6 @@ from shields.synthesis.diagnosis import Clock, infeasibility_around
 from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, SLACKS, Progress, progress_text
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import (
-    LONGEST_SEARCH,
     MARGINS,
     Feedback,
     feedback_of,
@@ -160,7 +159,6 @@ def _certified_polytope(
     contract: ChannelContract | None,
     progress: Progress,
     rest: Rest,
-    longest: float | None = None,
     margins: Sequence[float] = MARGINS,
 ) -> Certificate:
     """Returns what `certify_polytope` does.
@@ -171,7 +169,7 @@ def _certified_polytope(
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
     K, proofs = exact.rounded(K, DIGITS, axis=1), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
-    polytope = invariant_polytope(feedback, plant, progress, longest, margins)
+    polytope = invariant_polytope(feedback, plant, progress, margins)
     faces = polytope.F
     L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
     L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
@@ -254,10 +252,10 @@ def around_resting_point(
         tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
-        larger, longest = [], LONGEST_SEARCH
+        larger = []
         for each in tried:
             try:
-                found = _certified_polytope(plant, each.K, contract, progress, each.rest, longest, (margin,))
+                found = _certified_polytope(plant, each.K, contract, progress, each.rest, (margin,))
                 return max([found, *known], key=polytope_share)
             except _NOT_CERTIFIED as failure:
                 reasons.append(str(failure))
@@ -265,7 +263,6 @@ def around_resting_point(
                     larger.append(each)
             if clock.is_over:
                 break
-            longest = min(LONGEST_SEARCH, clock.left)
         tried = larger
     if known:
         return max(known, key=polytope_share)

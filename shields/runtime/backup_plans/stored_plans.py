@@ -156,7 +156,8 @@ class Lookahead:
     def all_as_stored(self, plans: np.ndarray) -> np.ndarray:
         """Returns plans, shape (N, horizon, m), NaN beyond their ends; all NaN for those that are none."""
         plant = self._test.plant
-        given = ~np.isnan(plans).all(axis=2)
+        given: np.ndarray = np.asarray(~np.isnan(plans).all(axis=2))
         within = ((plant.input_low <= plans) & (plans <= plant.input_high)).all(axis=2)
-        is_plan = (given == within).all(axis=1) & (given[:, :-1] | ~given[:, 1:]).all(axis=1)
-        return np.where(is_plan[:, None, None], plans, np.nan)
+        goes_on = given[:, :-1] | ~given[:, 1:]
+        is_plan = np.all(given == within, axis=1) & np.all(goes_on, axis=1)
+        return np.where(np.reshape(is_plan, (-1, 1, 1)), plans, np.nan)

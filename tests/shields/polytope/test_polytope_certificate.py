@@ -205,8 +205,8 @@ def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypat
         in text
     )
     monkeypatch.setattr(search, "MOST_ROWS", 400)
-    monkeypatch.setattr(search, "LONGEST_SEARCH", -1.0)
-    assert "longer than" in with_polytope(certificate, plant).provenance["no_polytope"]
+    monkeypatch.setattr(search, "MOST_FOLLOWED", 10)
+    assert "follows more than 10 rows" in with_polytope(certificate, plant).provenance["no_polytope"]
 
 
 def small_plant(**changes):
