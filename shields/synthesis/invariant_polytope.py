@@ -175,7 +175,8 @@ def invariant_faces(
         progress: Called with a line of text now and then.
 
     Raises:
-        Infeasible: If there are none within `MOST_ROWS` rows, `MOST_FOLLOWED` of them followed, or `predecessor` raises it.
+        Infeasible: If there are none within `MOST_ROWS` rows and `MOST_FOLLOWED` that are followed, or `predecessor`
+            raises it.
     """
     faces = _faces_that_cut(faces, predecessor, kept, progress, _IMPLIED)
     return _faces_that_count(faces, kept, progress, _IMPLIED)
