@@ -15,12 +15,13 @@ from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.networked import Networked, VectorNetworked
+from ncs_gym.plants.assumptions import NoNoiseWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.limits import MovedOperatingPointWarning
-from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FamilyProcess, FunctionProcess, GymProcess, LinearProcess, Process, linear_model

@@ -15,20 +15,20 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.plants import between_samples, limits, statespace
+from ncs_gym.plants import between_samples, limits, plant_file, statespace
+from ncs_gym.plants.assumptions import assumptions_of, warn_of_no_noise
+from ncs_gym.plants.description import described
 from ncs_gym.plants.family import plant_of_middle
-from ncs_gym.reading import json_values, read_text
+from ncs_gym.plants.past_inputs import LONGEST_INPUT_DELAY, inputs_under_way, storing
 from ncs_gym.uncertainty.declared_bound import as_bound
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.family import Family
 from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import (
     SMALLEST_DELTA,
     SMALLEST_KEPT,
@@ -45,12 +45,10 @@ from ncs_gym.validation import (
     as_matrix,
     as_names,
     as_number,
-    as_setting,
     own_error_state,
     read_only,
     reason_of,
     shown,
-    warn_caller,
 )
 
 if TYPE_CHECKING:
@@ -68,36 +66,13 @@ THINNEST = 1e-19
 SIMULATED_REACH = 100.0
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
-# Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
-# bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
-STORED_INPUT_REACH = 4.0
-LONGEST_INPUT_DELAY = 100
 # Disturbances of a step of a model whose response to a constant is worse conditioned are not traced back to its cause.
 LARGEST_CONDITION = 1e9
-_FORMAT = "ncs-gym plant 1"
-# What of a remainder, and of the family that it is about, stands in a file.
-_OF_REMAINDER, _OF_FAMILY = ("bound", "proved", "basis"), ("names", "parameters", "members")
-# The kinds of uncertainty: what a plant without it assumes, and the arguments that declare it.
-_KINDS = {
-    "disturbances": ("no disturbance acts on the plant", "disturbance_bound, gamma or process_noise_cov"),
-    "sensor noise": ("the sensors measure without noise", "sensor_bound or measurement_noise_cov"),
-    "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
-}
 # Arguments of the constructor about limits, in this order: those that are fields, too, need not be given.
 _LIMITS = (
     *("state_limits", "input_limits", "output_limits", "mixed_limits", "du_max", "box", "u_max", "offset"),
     *("input_ends", "box_ends", "mixed_rows", "mixed_ends"),
 )
-# Columns of the description: where its texts begin, and where they end.
-_INDENT, _WIDTH = 16, 80
-# What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
-_ZERO = 1e-12
-# Stands for a space at which no line ends.
-_UNBROKEN = "\N{NO-BREAK SPACE}"
-
-
-class NoNoiseWarning(UserWarning):
-    """Nothing is given for an uncertainty, so that the plant assumes there is none; a bound of 0 says so on purpose."""
 
 
 Kind = TypeVar("Kind", bound=type)
@@ -301,7 +276,7 @@ class LinearPlant(ReadOnlyArrays):
             for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
                 self._set(field_name, as_names(getattr(self, field_name), default, field_name))
         self._make_arrays_read_only()
-        _warn_of_no_noise(is_given)
+        warn_of_no_noise(is_given)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -384,7 +359,7 @@ class LinearPlant(ReadOnlyArrays):
         plant = cls(**statespace.sampled_arguments(sys, dt, settings))
         if input_delay:
             delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
-            plant = plant._storing(delay, delay)
+            plant = storing(plant, delay, delay)
         return plant if du_max is None else plant.with_rate_limits(du_max)
 
     @classmethod
@@ -448,7 +423,7 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
         G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        bound = _ellipsoid_around_sum(self.relative_weight, ball, self.disturbance_bound)
+        bound = ellipsoid_around_sum(self.relative_weight, ball, self.disturbance_bound)
         return replace(
             self,
             A=A,
@@ -476,7 +451,7 @@ class LinearPlant(ReadOnlyArrays):
         if per not in ("step", "second"):
             raise ValueError(f"per must be 'step' or 'second', got {shown(per)}")
         change = limits.as_input_limits(du_max, self.m, "du_max") * (self.dt if per == "second" else 1.0)
-        plant = self if inputs_under_way(self) else self._storing(1, delay=0)
+        plant = self if inputs_under_way(self) else storing(self, 1, delay=0)
         rows = np.concatenate([np.zeros((self.m, plant.n - self.m)), -np.eye(self.m), np.eye(self.m)], axis=1)
         rates = limits.Rows(rows / change[:, None], *np.array([[-1.0], [1.0]]) * np.ones(self.m))
         return replace(
@@ -485,89 +460,10 @@ class LinearPlant(ReadOnlyArrays):
             mixed_ends=np.concatenate([plant.mixed_ends, [rates.low, rates.high]], axis=1),
         )
 
-    def _storing(self, stored_inputs: int, delay: int) -> Self:
-        """Returns the plant with the last inputs as further states: x, u_{k-d}, .., u_{k-1}, the oldest input first.
-
-        Disturbances and first errors are those of x alone.
-
-        Args:
-            stored_inputs: Of how many steps.
-            delay: Steps after which an input takes effect: as many, and the oldest one acts; or 0.
-        """
-        if np.any(self.initial_cov):
-            raise ValueError(
-                "with inputs as states the first error must be given by initial_bound: that of initial_cov is a ball "
-                "in all states, and past inputs are known"
-            )
-        if self.between_samples is not None:
-            raise ValueError("between_samples is for plants without input_delay and without limits of rates")
-        n, m, stored = self.n, self.m, self.m * stored_inputs
-        A, B = np.zeros((n + stored, n + stored)), np.zeros((n + stored, m))
-        A[:n, :n], A[n:-m, n + m :] = self.A, np.eye(stored - m)
-        if delay:
-            A[:n, n : n + m] = self.B
-        else:
-            B[:n] = self.B
-        B[-m:] = np.eye(m)
-        box = np.zeros((len(self.box) + stored, n + stored))
-        box[: len(self.box), :n] = self.box
-        box[len(self.box) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.input_half), stored_inputs))
-        ends = np.concatenate([self.box_ends, np.tile(self.input_ends / self.input_half, stored_inputs)], axis=1)
-        # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
-        of_state, of_input = self.mixed_rows[:, :n], self.mixed_rows[:, n:]
-        others = np.zeros((len(of_state), stored if delay else stored + m))
-        others[:, : m if delay else None] = of_input if delay else np.pad(of_input, ((0, 0), (stored, 0)))
-        coupled, coupled_ends = np.concatenate([of_state, others], axis=1), self.mixed_ends
-        if delay:
-            box, ends = np.concatenate([box, coupled]), np.concatenate([ends, coupled_ends], axis=1)
-            coupled, coupled_ends = np.empty((0, n + stored + m)), np.empty((2, 0))
-        ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(stored_inputs, 0, -1)]
-        disturbance = self.disturbance_bound
-        if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the stored inputs
-            ball = Ellipsoid(self.gamma * np.eye(n))
-            disturbance = _ellipsoid_around_sum(self.relative_weight, ball, disturbance)
-        # The further states of a model move as they should: stored inputs keep their limits.
-        remainder = self.remainder
-        if remainder is not None:
-            if self.members is not None:
-                raise ValueError(
-                    "inputs become states of the plants of a family one by one: give du_max to its members"
-                )
-            remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored))))
-        return replace(
-            self,
-            A=A,
-            B=B,
-            box=box,
-            box_ends=ends,
-            mixed_rows=coupled,
-            mixed_ends=coupled_ends,
-            gamma=0.0,
-            H=np.pad(self.H, ((0, 0), (0, stored))),
-            process_noise_cov=np.pad(self.process_noise_cov, (0, stored)),
-            initial_cov=np.zeros((n + stored, n + stored)),
-            disturbance_bound=_padded(disturbance, stored),
-            initial_bound=_padded(self.initial_bound, stored),
-            remainder=remainder,
-            continuous_model=None,
-            error_gain=None if self.error_gain is None else np.pad(self.error_gain, ((0, 0), (0, stored))),
-            operating_state=np.concatenate([self.operating_state, np.tile(self.operating_input, stored_inputs)]),
-            state_names=[*self.state_names, *(f"{name} of {age}" for age in ages for name in self.input_names)],
-            state_units=[*self.state_units, *tuple(self.input_units) * stored_inputs],
-        )
-
     @property
     def document(self) -> dict[str, Any]:
         """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
-        content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
-        if not len(self.mixed_rows):
-            del content["mixed_rows"], content["mixed_ends"]
-        else:
-            content["mixed_ends"] = limits.listed_ends(self.mixed_ends)
-        if self.is_symmetric:  # in the short form
-            del content["box_ends"], content["input_ends"]
-            return {"format": _FORMAT, "plant": content | {"u_max": _as_json(self.u_max)}}
-        return {"format": _FORMAT, "plant": content | {"box_ends": limits.listed_ends(self.box_ends)}}
+        return plant_file.document_of(self)
 
     @classmethod
     def read(cls, given: Mapping[str, Any] | str | os.PathLike[str]) -> Self:
@@ -576,21 +472,7 @@ class LinearPlant(ReadOnlyArrays):
         Raises:
             ValueError: If the file is missing or not that of a plant, or an argument is wrong.
         """
-        document, name = given, "the document"
-        if not isinstance(given, Mapping):
-            name = shown(given)
-            try:
-                document = json_values(read_text(given))
-            except (OSError, TypeError, ValueError, RecursionError) as error:
-                reason = getattr(error, "strerror", None) or "it is not valid JSON"
-                raise ValueError(f"cannot read the plant in {name}: {reason}") from error
-        content = document.get("plant") if isinstance(document, Mapping) and document.get("format") == _FORMAT else None
-        if not isinstance(content, Mapping):
-            raise ValueError(f"{name} is not a plant of format {_FORMAT!r}")
-        arguments = {key: _from_json(value) for key, value in content.items()}
-        box = as_setting(arguments.get("box"))
-        if box is not None:
-            arguments["box"] = box  # an array: `save` wrote computed rows
+        arguments, name = plant_file.arguments_in(given)
         try:
             return cls(**arguments)
         except TypeError as error:  # an argument is missing or unknown
@@ -610,30 +492,12 @@ class LinearPlant(ReadOnlyArrays):
         Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
-        return _describe(self)
+        return described(self)
 
     @property
     def assumptions(self) -> tuple[str, ...]:
         """What a certificate takes for granted beyond the numbers of the bounds, in sentences."""
-        first = [self.initial_cov, *([] if self.initial_bound is None else [self.initial_bound.shape_matrix])]
-        zero = (
-            not np.any(self.nominal_disturbance.shape_matrix),
-            not np.any(self.nominal_sensor_error.shape_matrix),
-            not any(np.any(part) for part in first),
-        )
-        assumed = [
-            f"It is assumed that {text}." for (text, _), is_zero in zip(_KINDS.values(), zero, strict=True) if is_zero
-        ]
-        covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
-        truncated = [name for name in covariances if np.any(getattr(self, name))]
-        if truncated:
-            kept = f"{100.0 * (1.0 - self.delta):.6g} % (delta = {self.delta:g}) of {', '.join(truncated)}"
-            assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
-        if self.remainder is not None:
-            assumed.append(self.remainder.sentence)
-        if self.between_samples is not None:
-            assumed.append("What disturbances have done by any time within a step respects the bound of a whole step.")
-        return tuple(assumed)
+        return assumptions_of(self)
 
     @property
     def n(self) -> int:
@@ -989,12 +853,12 @@ class LinearPlant(ReadOnlyArrays):
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
         others = self.process_noise.bound, self.disturbance_bound, self.remainder_bound
-        return _ellipsoid_around_sum(self.relative_weight, ball, *others)
+        return ellipsoid_around_sum(self.relative_weight, ball, *others)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return _ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
+        return ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -1005,7 +869,7 @@ class LinearPlant(ReadOnlyArrays):
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(inflated(_ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
+        return Ellipsoid(inflated(ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
 
     @cached_property
     def initial_radius_squared(self) -> float:
@@ -1016,7 +880,7 @@ class LinearPlant(ReadOnlyArrays):
     def nominal_initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
         ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
-        return _ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
+        return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -1075,25 +939,10 @@ def inflated(shape: np.ndarray) -> np.ndarray:
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
-def _ellipsoid_around_sum(weight: np.ndarray, first: Ellipsoid, *others: Ellipsoid | None) -> Ellipsoid:
-    """Returns an ellipsoid around the sum, one after the other of the smallest tr(W P); points and None add nothing."""
-    total = first
-    for each in others:
-        if each is not None and np.any(each.shape_matrix):
-            shapes = total.shape_matrix, each.shape_matrix
-            total = Ellipsoid(outer_sum(*shapes, weight)) if np.any(shapes[0]) else each
-    return total
-
-
 def _symmetric_product(G: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Returns G P G'."""
     product = exact.product(G, shape, G.T)
     return 0.5 * (product + product.T)
-
-
-def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:
-    """Returns a bound of the same entries and of some more that are zero."""
-    return None if bound is None else Ellipsoid(np.pad(bound.shape_matrix, (0, zeros)))
 
 
 def weight_of(rows: np.ndarray) -> np.ndarray:
@@ -1101,185 +950,3 @@ def weight_of(rows: np.ndarray) -> np.ndarray:
     gram = exact.product(rows.T, rows)
     squares = np.diag(gram)
     return gram + 1e-6 * np.diag(squares + exact.total(squares) / len(gram) * (squares == 0.0))
-
-
-def inputs_under_way(plant: LinearPlant) -> int:
-    """Returns how many of the last states are past inputs, of an `input_delay` or limits of rates; 0 of most plants.
-
-    These are states (u_{k-d}, .., u_{k-1}), of which the input is the newest one in the next step. What is disturbed on
-    its way is none: it may be beyond the limits of inputs.
-    """
-    n, m = plant.n, plant.m
-    disturbed = plant.nominal_disturbance.shape_matrix.diagonal() > 0.0
-    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B[-m:], np.eye(m)) or disturbed[-m:].any():
-        return 0
-    stored = m
-    while (
-        stored + m < n
-        and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m])
-        and not plant.B[-stored - m : -stored].any()
-        and not disturbed[-stored - m : -stored].any()
-    ):
-        stored += m
-    return stored
-
-
-def _warn_of_no_noise(is_given: tuple[bool, bool, bool]) -> None:
-    """Warns in one sentence of kinds of uncertainty for which nothing is given.
-
-    Args:
-        is_given: Whether anything is given, even zero, for disturbances, sensor noise and the first estimate.
-    """
-    missing = {kind: text for (kind, text), given in zip(_KINDS.items(), is_given, strict=True) if not given}
-    if missing:
-        assumed = ", and ".join(f"that {sentence} (give {names})" for sentence, names in missing.values())
-        message = f"nothing is given for {' and '.join(missing)}: every certificate will assume {assumed}"
-        warn_caller(f"{message}; a bound of 0 says so on purpose", NoNoiseWarning)
-
-
-def _describe(plant: LinearPlant) -> str:
-    """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
-    counts = ((plant.n, "state"), (plant.m, "input"), (plant.p, "output"))
-    sizes = ", ".join(f"{count} {name}{'s' * (count != 1)}" for count, name in counts)
-    radius = f"spectral radius {plant.spectral_radius:.6g}"
-    stable = f"stable ({radius})"
-    unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
-    extents = {
-        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix)), plant.state_names, plant.state_units),
-        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *_outputs(plant)),
-        "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix)), plant.state_names, plant.state_units),
-    }
-    own = plant.n - inputs_under_way(plant)  # rows of past inputs alone limit nothing: inputs have limits
-    lines = {
-        "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
-        "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [row_limit(plant, j) for j in range(len(plant.box)) if plant.box[j, :own].any()],
-        "input limits": [
-            _between(name, low, high, center, unit)
-            for name, low, high, center, unit in zip(
-                plant.input_names,
-                plant.input_low.tolist(),
-                plant.input_high.tolist(),
-                plant.operating_input.tolist(),
-                plant.input_units,
-                strict=True,
-            )
-        ],
-    }
-    if len(plant.mixed_rows):
-        lines["both together"] = [mixed_limit(plant, j) for j in range(len(plant.mixed_rows))]
-    if plant.between_samples is not None:
-        lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
-    for title, (sizes_of, names, units) in extents.items():
-        parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
-        lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]
-    lines["assumptions"] = list(plant.assumptions)
-    shown_lines = (
-        fill(text, _WIDTH, initial_indent=f"{title if number == 0 else '':<{_INDENT}}", subsequent_indent=" " * _INDENT)
-        for title, texts in lines.items()
-        for number, text in enumerate(texts)
-    )
-    return "\n".join(shown_lines).replace(_UNBROKEN, " ")
-
-
-def _as_json(value: Any) -> Any:
-    if isinstance(value, Ellipsoid):
-        return {"shape": value.shape_matrix.tolist()}
-    if isinstance(value, Remainder):
-        given = {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
-        return given if value.family is not None else {name: given[name] for name in _OF_REMAINDER}
-    if isinstance(value, Family):
-        return {name: _as_json(getattr(value, name)) for name in _OF_FAMILY}
-    if isinstance(value, tuple):
-        return list(value)
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def _from_json(value: Any) -> Any:
-    """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape, or a remainder."""
-    if not isinstance(value, dict):
-        return value
-    if set(value) == {*_OF_FAMILY}:
-        return Family(**value)
-    if set(value) - {"family"} == {*_OF_REMAINDER}:
-        return Remainder(**{name: _from_json(each) for name, each in value.items()})
-    if set(value) != {"shape"}:
-        raise ValueError(
-            f'a bound in the file of a plant must be a number, a list or {{"shape": ...}}, got {shown(value)}'
-        )
-    return Ellipsoid(value["shape"])
-
-
-def _sized(size: float, unit: str) -> str:
-    return f"{size:.4g} {unit}".rstrip()
-
-
-def _between(name: str, low: float, high: float, center: float, unit: str) -> str:
-    """Returns the limits of a quantity, given its ends from the operating point and that point."""
-    if center == 0.0 and low == -high:
-        return f"|{name}| <= {_sized(high, unit)}"
-    point = f" (operating point {center:.6g})" if center else ""
-    bottom, top = (0.0 if abs(center + end) <= _ZERO * abs(center) else center + end for end in (low, high))
-    if low == -np.inf:
-        return f"{name} <= {_sized(top, unit)}{point}"
-    if high == np.inf:
-        return f"{name} >= {_sized(bottom, unit)}{point}"
-    return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
-
-
-def row_limit(plant: LinearPlant, j: int) -> str:
-    """Returns what row j of the safe box limits."""
-    row, low, high = plant.box[j], float(plant.box_low[j]), float(plant.box_high[j])
-    limited = np.flatnonzero(row).tolist()
-    if len(limited) == 1:
-        i = limited[0]
-        low, high = sorted([low / float(row[i]), high / float(row[i])])
-        return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
-    if low == -high:
-        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
-        return f"|{terms.removeprefix('+')}| <= 1"
-    return _sum_between(row, low, high, plant.operating_state, plant.state_names)
-
-
-def input_limit(plant: LinearPlant, i: int) -> str:
-    """Returns between what input i is."""
-    low, high, center = float(plant.input_low[i]), float(plant.input_high[i]), float(plant.operating_input[i])
-    return _between(plant.input_names[i], low, high, center, plant.input_units[i])
-
-
-def mixed_limit(plant: LinearPlant, j: int) -> str:
-    """Returns what row j of the limits of states and inputs together limits."""
-    low, high = plant.mixed_ends[:, j].tolist()
-    row, center = np.roll(plant.mixed_rows[j], plant.m), np.concatenate([plant.operating_input, plant.operating_state])
-    return _sum_between(row, low, high, center, [*plant.input_names, *plant.state_names])
-
-
-def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, names: Sequence[str]) -> str:
-    """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units."""
-    size = float(np.abs(row).max())  # in units of its largest entry
-    terms = "".join(
-        f" {'-' if row[i] < 0.0 else '+'} {_factor(abs(float(row[i])) / size)}{names[i]}"
-        for i in np.flatnonzero(row).tolist()
-    )
-    terms = terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}"
-    return _between(terms, low / size, high / size, float(row @ center) / size, "")
-
-
-def _factor(size: float) -> str:
-    return "" if size == 1.0 else f"{size:.4g} "
-
-
-def _deviation(plant: LinearPlant, i: int) -> str:
-    center = plant.operating_state[i]
-    return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
-
-
-def _outputs(plant: LinearPlant) -> tuple[list[str], list[str]]:
-    """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
-    names, units = [], []
-    for j, row in enumerate(plant.H):
-        measured = np.flatnonzero(row)
-        alone = len(measured) == 1 and row[measured[0]] == 1.0
-        names.append(plant.state_names[measured[0]] if alone else f"y{j + 1}")
-        units.append(plant.state_units[measured[0]] if alone else "")
-    return names, units

@@ -227,3 +227,13 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
         options={"xatol": 1e-9},
     )
     return max(-float(best.fun), gauge(0.5))
+
+
+def ellipsoid_around_sum(weight: np.ndarray, first: Ellipsoid, *others: Ellipsoid | None) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, one after the other of the smallest tr(W P); points and None add nothing."""
+    total = first
+    for each in others:
+        if each is not None and np.any(each.shape_matrix):
+            shapes = total.shape_matrix, each.shape_matrix
+            total = Ellipsoid(outer_sum(*shapes, weight)) if np.any(shapes[0]) else each
+    return total

@@ -13,7 +13,8 @@ import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
-from ncs_gym.plants.linear_plant import input_limit, inputs_under_way, mixed_limit, row_limit
+from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
+from ncs_gym.plants.past_inputs import inputs_under_way
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN

@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 from scipy.stats import qmc
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.plants.linear_plant import inputs_under_way
+from ncs_gym.plants.past_inputs import inputs_under_way
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope

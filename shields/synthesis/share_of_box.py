@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from ncs_gym import LinearPlant
-from ncs_gym.plants.linear_plant import inputs_under_way
+from ncs_gym.plants.past_inputs import inputs_under_way
 
 # A box with more rows than states is a polytope, whose corners are too many to count in more dimensions or with more
 # rows than this.

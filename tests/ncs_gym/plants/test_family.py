@@ -12,7 +12,7 @@ import pytest
 from scipy.linalg import expm
 
 from ncs_gym import Ellipsoid, LinearPlant, NCSEnv, Remainder, cart_pole, truck_trailer
-from ncs_gym.plants.linear_plant import inputs_under_way
+from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.uncertainty.family import Family
 
 MASSES = {"mass": (3800.0, 4200.0)}

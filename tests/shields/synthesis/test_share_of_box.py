@@ -7,7 +7,7 @@ import pytest
 
 from experiments.runs.experiment import certificate_line
 from ncs_gym import cart_pole, truck_trailer
-from ncs_gym.plants.linear_plant import inputs_under_way
+from ncs_gym.plants.past_inputs import inputs_under_way
 from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box

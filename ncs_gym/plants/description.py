@@ -1,0 +1,141 @@
+"""A plant for people: its size, its limits and bounds with units, and what is assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ncs_gym.plants.past_inputs import inputs_under_way
+
+if TYPE_CHECKING:
+    from ncs_gym.plants.linear_plant import LinearPlant
+
+# Columns of the description: where its texts begin, and where they end.
+_INDENT, _WIDTH = 16, 80
+# What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
+_ZERO = 1e-12
+# Stands for a space at which no line ends.
+_UNBROKEN = "\N{NO-BREAK SPACE}"
+
+
+def described(plant: LinearPlant) -> str:
+    """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
+    counts = ((plant.n, "state"), (plant.m, "input"), (plant.p, "output"))
+    sizes = ", ".join(f"{count} {name}{'s' * (count != 1)}" for count, name in counts)
+    radius = f"spectral radius {plant.spectral_radius:.6g}"
+    stable = f"stable ({radius})"
+    unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
+    extents = {
+        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix)), plant.state_names, plant.state_units),
+        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *_outputs(plant)),
+        "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix)), plant.state_names, plant.state_units),
+    }
+    own = plant.n - inputs_under_way(plant)  # rows of past inputs alone limit nothing: inputs have limits
+    lines = {
+        "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
+        "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
+        "safe box": [row_limit(plant, j) for j in range(len(plant.box)) if plant.box[j, :own].any()],
+        "input limits": [
+            _between(name, low, high, center, unit)
+            for name, low, high, center, unit in zip(
+                plant.input_names,
+                plant.input_low.tolist(),
+                plant.input_high.tolist(),
+                plant.operating_input.tolist(),
+                plant.input_units,
+                strict=True,
+            )
+        ],
+    }
+    if len(plant.mixed_rows):
+        lines["both together"] = [mixed_limit(plant, j) for j in range(len(plant.mixed_rows))]
+    if plant.between_samples is not None:
+        lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
+    for title, (sizes_of, names, units) in extents.items():
+        parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
+        lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]
+    lines["assumptions"] = list(plant.assumptions)
+    shown_lines = (
+        fill(text, _WIDTH, initial_indent=f"{title if number == 0 else '':<{_INDENT}}", subsequent_indent=" " * _INDENT)
+        for title, texts in lines.items()
+        for number, text in enumerate(texts)
+    )
+    return "\n".join(shown_lines).replace(_UNBROKEN, " ")
+
+
+def _sized(size: float, unit: str) -> str:
+    return f"{size:.4g} {unit}".rstrip()
+
+
+def _between(name: str, low: float, high: float, center: float, unit: str) -> str:
+    """Returns the limits of a quantity, given its ends from the operating point and that point."""
+    if center == 0.0 and low == -high:
+        return f"|{name}| <= {_sized(high, unit)}"
+    point = f" (operating point {center:.6g})" if center else ""
+    bottom, top = (0.0 if abs(center + end) <= _ZERO * abs(center) else center + end for end in (low, high))
+    if low == -np.inf:
+        return f"{name} <= {_sized(top, unit)}{point}"
+    if high == np.inf:
+        return f"{name} >= {_sized(bottom, unit)}{point}"
+    return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
+
+
+def row_limit(plant: LinearPlant, j: int) -> str:
+    """Returns what row j of the safe box limits."""
+    row, low, high = plant.box[j], float(plant.box_low[j]), float(plant.box_high[j])
+    limited = np.flatnonzero(row).tolist()
+    if len(limited) == 1:
+        i = limited[0]
+        low, high = sorted([low / float(row[i]), high / float(row[i])])
+        return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
+    if low == -high:
+        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
+        return f"|{terms.removeprefix('+')}| <= 1"
+    return _sum_between(row, low, high, plant.operating_state, plant.state_names)
+
+
+def input_limit(plant: LinearPlant, i: int) -> str:
+    """Returns between what input i is."""
+    low, high, center = float(plant.input_low[i]), float(plant.input_high[i]), float(plant.operating_input[i])
+    return _between(plant.input_names[i], low, high, center, plant.input_units[i])
+
+
+def mixed_limit(plant: LinearPlant, j: int) -> str:
+    """Returns what row j of the limits of states and inputs together limits."""
+    low, high = plant.mixed_ends[:, j].tolist()
+    row, center = np.roll(plant.mixed_rows[j], plant.m), np.concatenate([plant.operating_input, plant.operating_state])
+    return _sum_between(row, low, high, center, [*plant.input_names, *plant.state_names])
+
+
+def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, names: Sequence[str]) -> str:
+    """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units."""
+    size = float(np.abs(row).max())  # in units of its largest entry
+    terms = "".join(
+        f" {'-' if row[i] < 0.0 else '+'} {_factor(abs(float(row[i])) / size)}{names[i]}"
+        for i in np.flatnonzero(row).tolist()
+    )
+    terms = terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}"
+    return _between(terms, low / size, high / size, float(row @ center) / size, "")
+
+
+def _factor(size: float) -> str:
+    return "" if size == 1.0 else f"{size:.4g} "
+
+
+def _deviation(plant: LinearPlant, i: int) -> str:
+    center = plant.operating_state[i]
+    return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
+
+
+def _outputs(plant: LinearPlant) -> tuple[list[str], list[str]]:
+    """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
+    names, units = [], []
+    for j, row in enumerate(plant.H):
+        measured = np.flatnonzero(row)
+        alone = len(measured) == 1 and row[measured[0]] == 1.0
+        names.append(plant.state_names[measured[0]] if alone else f"y{j + 1}")
+        units.append(plant.state_units[measured[0]] if alone else "")
+    return names, units
