@@ -1,6 +1,6 @@
 """Loops over networks as records have them: how often the box is left behind each filter, and what is claimed then.
 
-    python -m benchmarks.recorded_networks [--hours 1] [--envs 64] [--ids CartPole ...]
+    python -m benchmarks.recorded_networks [--hours 1] [--envs 64] [--ids CartPole ...] [--filters ...]
 
 The records are made here, with a seed, in the shapes of real ones: "Wi-Fi" stalls in clusters, for lengths with a heavy
 tail; in a "car" a handover stops everything every half minute, now and then for seconds; an interferer's "burst" takes
@@ -119,12 +119,15 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--envs", type=int, default=64)
     parser.add_argument("--ids", nargs="+", default=[*IDS], choices=[*IDS])
+    parser.add_argument(
+        "--filters", nargs="+", default=FILTERS, choices=FILTERS, metavar="NAME", help=", ".join(FILTERS)
+    )
     options = parser.parse_args()
     warnings.simplefilter("ignore", BrokenContractWarning)
     for name in options.ids:
         print(f"{name:16}{'left per hour':>24}{'ever [%]':>18}{'promised [%]':>18}")
         print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + 2 * "".join(f"{each:>6}" for each in NETWORKS))
-        for each in FILTERS:
+        for each in options.filters:
             given = IDS[name], options.envs, options.hours
             found = [measured(f"ncs_gym/{name}-v0", network, each, *given) for network in NETWORKS]
             left, ever, promised = zip(*found, strict=True)

@@ -176,6 +176,7 @@ class SafeLoop(CopiedWhole):
             age += ", older than the contract allows"
         proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
         proved += "" if self._echo_age is not None else ", if everything that is decided is applied"
+        least = self._filter.least_safe_steps
         is_started, delay = self._phase is not _Phase.STOPPED, counted(self._input_delay, "step")
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
@@ -184,6 +185,7 @@ class SafeLoop(CopiedWhole):
             ("downlink", f"inputs take effect {delay} after the decision" if self._input_delay else ""),
             ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
             ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),
+            ("in silence", f"the box is kept for {counted(self.safe_steps, 'step')} at least" if least else ""),
         ]
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel
-from shields import SafetyFilter, SafetyShield, VectorSafetyShield
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.backup_plans.plan_search import completed
 from shields.runtime.guarantee import ALARM
 from tests.certificates import certificate_of
@@ -83,6 +83,15 @@ def test_silence_uses_them_up_one_by_one_and_samples_bring_them_back(is_vector):
     assert falls > LEAST
     assert rises > 1
     assert lost > LEAST  # the box is kept where the contract is broken
+
+
+def test_a_loop_prints_for_how_long_the_box_is_kept():
+    loop = SafeLoop(CART.certificate, CART.plant, Channel(delay=1), "lookahead", least_safe_steps=5)
+    loop.start(np.zeros(CART.plant.n), initial_set=np.zeros(CART.plant.n))
+    assert loop.safe_steps == 5
+    assert "in silence" in str(loop)
+    assert "the box is kept for 5 steps at least" in " ".join(str(loop).split())
+    assert "in silence" not in str(SafeLoop(CART.certificate, CART.plant, Channel(delay=1), "lookahead"))
 
 
 def test_nothing_is_promised_on_bounds_that_a_measurement_contradicts():
