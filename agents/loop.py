@@ -16,7 +16,7 @@ from ncs_gym.envs.json_settings import from_json
 from ncs_gym.validation import AroundEnvironment, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee
-from shields.runtime.safety_filter import MODES, plan_horizon
+from shields.runtime.safety_filter import plan_horizon
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,8 @@ class ShieldSettings:
     def __post_init__(self) -> None:
         if not isinstance(self.certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate, got {type(self.certificate).__name__}")
-        if self.mode not in MODES:
-            raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
-        LostGuarantee(self.on_unproved)
         object.__setattr__(self, "horizon", plan_horizon(self.mode, self.horizon, self.least_safe_steps))
+        LostGuarantee(self.on_unproved)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,8 +86,7 @@ class SafetyFilter(ReadOnlyArrays):
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.mode, str) and self.mode in MODES):
-            raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
+        horizon, least = plan_horizon(self.mode, self.horizon, self.least_safe_steps), int(self.least_safe_steps)
         if not isinstance(self.certificate, Certificate) or not isinstance(self.plant, LinearPlant):
             kinds = f"{type(self.certificate).__name__} and {type(self.plant).__name__}"
             raise ValueError(f"SafetyFilter takes a Certificate and a LinearPlant, got {kinds}")
@@ -102,7 +101,6 @@ class SafetyFilter(ReadOnlyArrays):
         for name, each in columns.items():
             object.__setattr__(self, name, read_only(each[:, None]))
         object.__setattr__(self, "_remembered", {})
-        horizon, least = plan_horizon(self.mode, self.horizon, self.least_safe_steps), int(self.least_safe_steps)
         object.__setattr__(self, "horizon", horizon)
         object.__setattr__(self, "least_safe_steps", least)
         if horizon is not None:
@@ -368,9 +366,11 @@ def plan_horizon(mode: str, horizon: int | None, least_safe_steps: int) -> int |
     """Returns the length of the longest plans of a mode [steps]; None for those that plan nothing.
 
     Raises:
-        ValueError: If either number is given for such a mode, or is no whole number in its range, or plans of the
-            horizon are too short for so many safe steps.
+        ValueError: If there is no such mode, or either number is given for one that plans nothing, or is no whole
+            number in its range, or plans of the horizon are too short for so many safe steps.
     """
+    if not (isinstance(mode, str) and mode in MODES):
+        raise ValueError(f"mode must be one of {list(MODES)}, got {shown(mode)}")
     least = as_count(least_safe_steps, "least_safe_steps", low=0, high=LONGEST_HORIZON - 1)
     if mode != "lookahead":
         for name, given in {"horizon": horizon, "least_safe_steps": least or None}.items():
