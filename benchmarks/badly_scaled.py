@@ -64,17 +64,19 @@ def main() -> None:
     parser.add_argument("--plants", type=int, default=100)
     options = parser.parse_args()
     counts: Counter[tuple[str, str]] = Counter()
-    seconds = []
+    seconds: dict[str, list[float]] = {"certified": [], "refused": [], "lost": []}
     for seed in tqdm(range(options.plants), unit="plant", leave=False, disable=None):
         (own, taken), (plain, _) = (outcome(random_plant(seed, in_own_units=each)) for each in (True, False))
         counts[own, plain] += 1
-        seconds.append(taken)
+        seconds[own].append(taken)
         if own != plain or "lost" in (own, plain):
             tqdm.write(f"plant {seed}: {own} in its own units, {plain} with units 1")
     print(f"{'in its own units':18s}{'with units 1':14s}{'plants':>6s}")
     for (own, plain), count in sorted(counts.items()):
         print(f"{own:18s}{plain:14s}{count:6d}")
-    print(f"processor time in own units: median {np.median(seconds):.1f} s, longest {max(seconds):.1f} s")
+    for own, times in seconds.items():
+        if times:
+            print(f"{own} in own units: median {np.median(times):.1f} s, longest {max(times):.1f} s of processor time")
 
 
 if __name__ == "__main__":
