@@ -124,17 +124,21 @@ def main() -> None:
     )
     options = parser.parse_args()
     warnings.simplefilter("ignore", BrokenContractWarning)
+    shares_of = "  " + "".join(f"{each:>6}" for each in NETWORKS)
     for name in options.ids:
-        print(f"{name:16}{'left per hour':>24}{'ever [%]':>18}{'promised [%]':>18}")
-        print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + 2 * "".join(f"{each:>6}" for each in NETWORKS))
+        print(f"{name:16}{'left per hour':>24}  {'ever [%]':>18}  {'promised [%]':>18}")
+        print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + 2 * shares_of)
         for each in options.filters:
             given = IDS[name], options.envs, options.hours
             found = [measured(f"ncs_gym/{name}-v0", network, each, *given) for network in NETWORKS]
             left, ever, promised = zip(*found, strict=True)
             texts = ["".join(f"{number:8.1f}" for number in left)]
             for claim, shares in (("ever", ever), ("promised", promised)):
-                texts += [f"{100.0 * share:6.1f}" if each in CLAIMS[claim] else f"{'-':>6}" for share in shares]
+                texts += ["  "] + [
+                    f"{100.0 * share:6.1f}" if each in CLAIMS[claim] else f"{'-':>6}" for share in shares
+                ]
             print(f"{each:16}" + "".join(texts), flush=True)
+        print()
 
 
 if __name__ == "__main__":

@@ -398,7 +398,8 @@ class SafeLoop(CopiedWhole):
         """Number of steps for which the box is kept whatever the network does; 0 in other modes than "lookahead".
 
         At most `least_safe_steps`. It falls by at most one per step, unless a measurement contradicts the bounds or
-        another input than the decided one is applied; then it is 0.
+        another input than the decided one is applied; then it is 0. It takes for granted that what is decided is
+        applied, also where no echo has confirmed that for long.
         """
         unknown = self._phase is _Phase.STOPPED or self._unknown is not None or self._applied.is_other
         return 0 if unknown else self._monitored.safe_steps

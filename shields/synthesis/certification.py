@@ -31,7 +31,8 @@ from shields.synthesis.resting_point import farthest_from_limits, limits_around,
 from shields.verification import verify
 
 # A refusal should take so long at most [s], of its thread's own time: searches after the first for a polytope, and then
-# for changes that would help, end so much earlier, since what is under way then takes some seconds.
+# for changes that would help, begin no later than so much earlier. One that is under way goes on: where polytopes have
+# very many rows, a refusal has been seen to take 82 s.
 LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # Alternations of a search that begins near the design of a similar problem.
 _FEW_ALTERNATIONS = 4
