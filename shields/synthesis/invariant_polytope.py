@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linprog
 from scipy.stats import qmc
 
 from ncs_gym import LinearPlant, exact
@@ -21,6 +20,7 @@ from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
 from shields.synthesis.design_problem import Rest, taken_between_samples
+from shields.synthesis.faces import OPEN, Extremes, Faces
 from shields.synthesis.resting_point import units_of_states
 from shields.verification import ACTION_ROUNDING
 
@@ -36,14 +36,10 @@ _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 _TOO_LARGE = "too_large"
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
-# The ends of one row that are open.
-_OPEN = np.array([-math.inf]), np.array([math.inf])
 # Where fewer rows than this share of the most are left of a search that has too many, it goes on.
 _LEAST_PRUNED = 0.9
 # Significant digits of rows and multipliers; what a row lacks by that is far below the margin.
 _DIGITS = 10
-# The solver's own tolerances, next to units of 1.
-_SOLVER = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 # Points at which the share of the box is counted: the third digit is right.
 _POINTS_LOG2 = 16
 # Steps after which it must be known which points a gain keeps in the box.
@@ -70,32 +66,6 @@ def feedback_of(certificate: Certificate) -> Feedback:
     """Returns the fallback of a certificate."""
     rest = Rest(certificate.resting_state, certificate.resting_input)
     return Feedback(certificate.K, certificate.error_shapes, certificate.D, rest)
-
-
-class Faces(NamedTuple):
-    """Rows with two ends, low <= g z <= high, around z = 0; an end that is open is infinite.
-
-    Attributes:
-        rows: Shape (r, n).
-        low, high: Shape (r,).
-    """
-
-    rows: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    def some(self, chosen: Any) -> Faces:
-        """Returns some of them, given by their numbers or a mask."""
-        return Faces(*(part[chosen] for part in self))
-
-    def followed_by(self, others: Faces) -> Faces:
-        """Returns these and then others."""
-        return Faces(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
-
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        """Returns whether points, shape (count, n), lie between the ends of all rows, shape (count,)."""
-        values = points @ self.rows.T
-        return np.all((self.low <= values) & (values <= self.high), axis=1)
 
 
 def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces:
@@ -201,28 +171,27 @@ def _faces_that_cut(
             f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
         )
     faces, _ = _without_implied(faces, kept, implied)
+    within = Extremes(faces)
     following = followed = 0
-    while following < len(faces.rows):
-        row = faces.some(slice(following, following + 1))
-        if following < kept and not _cuts(faces.some(np.arange(len(faces.rows)) != following), row, implied).any():
+    while following < len(within.faces.rows):
+        if following < kept and not any(_cuts_others(within, following, implied)):
             following += 1
             continue
-        if len(faces.rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
-            faces, following = _without_implied(faces, kept, implied, following)
+        if len(within.faces.rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
+            faces, following = _without_implied(within.faces, kept, implied, following)
             if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
                 raise _too_many()
+            within = Extremes(faces)
         if followed >= MOST_FOLLOWED:
             raise _too_large(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
         if following % 50 == 0:
-            progress(f"polytope: {len(faces.rows)} rows")
-        row = predecessor(row)
-        low, high = _cuts(faces, row, implied)
+            progress(f"polytope: {len(within.faces.rows)} rows")
+        row = predecessor(within.faces.some([following]))
+        low, high = _cuts(within, row, implied)
         if low or high:
-            faces = faces.followed_by(
-                row._replace(low=row.low if low else _OPEN[0], high=row.high if high else _OPEN[1])
-            )
+            within.add(row._replace(low=row.low if low else OPEN[0], high=row.high if high else OPEN[1]))
         following, followed = following + 1, followed + 1
-    return faces
+    return within.faces
 
 
 def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object], implied: float) -> Faces:
@@ -406,7 +375,7 @@ class _ClosedLoop:
         own = Faces(rows * self.widths, faces.low - reached, faces.high - reached)
         within = limits_within_step(self._feedback, self.plant).images
         images = np.concatenate([rows @ self.next, self._K / limits[:, None], within]) * self.widths
-        found = np.array([[bound.multipliers for bound in _extremes(own, image)] for image in images])
+        found = np.array([[bound.multipliers for bound in Extremes(own).of(image)] for image in images])
         found[np.abs(found) < 1e-13] = 0.0
         found[gains] *= limits[:, None, None]
         lower, upper = exact.rounded(found, _DIGITS + 2, axis=2).swapaxes(0, 1)
@@ -426,55 +395,29 @@ def _too_many() -> Infeasible:
     return _too_large(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
 
 
-class _Bound(NamedTuple):
-    """An extreme value of row z in a polytope, infinite if there is none, with the multipliers (r,) that prove it."""
-
-    value: float
-    multipliers: np.ndarray
-
-
-def _extremes(faces: Faces, row: np.ndarray) -> tuple[_Bound, _Bound]:
-    """Returns the least and the largest row z, shape (n,), in a polytope; of a symmetric one they are each other's."""
-    largest = _largest(faces, row)
-    if np.array_equal(-faces.low, faces.high):
-        return _Bound(-largest.value, largest.multipliers), largest
-    least = _largest(faces, -row)
-    return _Bound(-least.value, -least.multipliers), largest
-
-
-def _largest(faces: Faces, row: np.ndarray) -> _Bound:
-    above, below = np.isfinite(faces.high), np.isfinite(faces.low)
-    found = linprog(
-        -row,
-        A_ub=np.concatenate([faces.rows[above], -faces.rows[below]]),
-        b_ub=np.concatenate([faces.high[above], -faces.low[below]]),
-        bounds=(None, None),
-        method="highs",
-        options=_SOLVER,
-    )
-    multipliers = np.zeros(len(faces.rows))
-    if found.status != 0:
-        return _Bound(math.inf, multipliers)
-    prices = -found.ineqlin.marginals
-    multipliers[above] += prices[: np.count_nonzero(above)]
-    multipliers[below] -= prices[np.count_nonzero(above) :]
-    return _Bound(-found.fun, multipliers)
-
-
 def _extents(faces: Faces) -> np.ndarray:
     """Returns how far every coordinate reaches in a polytope, shape (n,); 1 where it has no end."""
-    found = [[bound.value for bound in _extremes(faces, row)] for row in np.eye(faces.rows.shape[1])]
+    within = Extremes(faces)
+    found = [[bound.value for bound in within.of(row)] for row in np.eye(faces.rows.shape[1])]
     extents = np.abs(found).max(axis=1)
     return np.where(np.isfinite(extents), extents, 1.0)
 
 
-def _cuts(faces: Faces, row: Faces, implied: float) -> np.ndarray:
-    """Returns whether the low and the high end of one row cut more than that off a polytope, shape (2,)."""
-    least, largest = _extremes(faces, row.rows[0])
+def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:
+    """Returns whether the low and the high end of one row cut more than that off a polytope."""
+    least, largest = within.of(row.rows[0])
     low, high = float(row.low[0]), float(row.high[0])
     # An open end cuts nothing, even off what is unbounded.
-    cuts_low, cuts_high = low > -math.inf and least.value < low - implied, largest.value > high + implied
-    return np.array([cuts_low, high < math.inf and cuts_high])
+    return -math.inf < low and least.value < low - implied, high < math.inf and largest.value > high + implied
+
+
+def _cuts_others(within: Extremes, number: int, implied: float) -> tuple[bool, bool]:
+    """Returns whether the ends of a face cut more than that off what the other faces bound."""
+    row = within.faces.some([number])
+    within.close(number, -math.inf, math.inf)
+    cuts = _cuts(within, row, implied)
+    within.close(number, float(row.low[0]), float(row.high[0]))
+    return cuts
 
 
 def _without_implied(faces: Faces, kept: int, implied: float, count: int = 0) -> tuple[Faces, int]:
@@ -482,16 +425,14 @@ def _without_implied(faces: Faces, kept: int, implied: float, count: int = 0) ->
 
     The `kept` first stay as they are. Of a row that only cuts with one end the other one is opened.
     """
+    within, stays = Extremes(faces), np.full(len(faces.rows), True)
     for i in range(len(faces.rows) - 1, kept - 1, -1):
-        others, row = faces.some(np.arange(len(faces.rows)) != i), faces.some(slice(i, i + 1))
-        low, high = _cuts(others, row, implied)
-        if not (low or high):
-            faces, count = others, count - (i < count)
-        elif not (low and high):
-            ends = faces.low.copy(), faces.high.copy()
-            ends[int(low)][i] = _OPEN[int(low)][0]
-            faces = Faces(faces.rows, *ends)
-    return faces, count
+        low, high = _cuts_others(within, i, implied)
+        within.close(
+            i, float(within.faces.low[i]) if low else -math.inf, float(within.faces.high[i]) if high else math.inf
+        )
+        stays[i] = low or high
+    return within.faces.some(stays), int(np.count_nonzero(stays[:count]))
 
 
 def _bounding_every_state(faces: Faces, kept: int) -> Faces:
@@ -506,7 +447,7 @@ def _bounding_every_state(faces: Faces, kept: int) -> Faces:
         rank = np.linalg.matrix_rank(rows[closed]) if closed.any() else 0
         if rank == rows.shape[1]:
             break
-        least, largest = (bound.value for bound in _extremes(faces, rows[i]))
+        least, largest = (bound.value for bound in Extremes(faces).of(rows[i]))
         is_bounded = math.isfinite(least) and math.isfinite(largest)
         if not is_bounded or np.linalg.matrix_rank(np.vstack([rows[closed], rows[i]])) == rank:
             continue

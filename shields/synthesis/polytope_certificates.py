@@ -250,6 +250,7 @@ def around_resting_point(
             better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
         larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
         tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
+    tried = _different(tried)
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
         larger = []
@@ -268,6 +269,12 @@ def around_resting_point(
         return max(known, key=polytope_share)
     reason = reasons[0] if reasons else "no gain was found"
     raise Infeasible(reason, "P", 0.0) if fixed else infeasibility_around(plant, contract, reason)
+
+
+def _different(fallbacks: Sequence[Feedback]) -> list[Feedback]:
+    """Returns fallbacks in their order, of those that are the same in a certificate's digits the first."""
+    keys = [(exact.rounded(each.K, DIGITS, axis=1).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
+    return [each for number, each in enumerate(fallbacks) if keys[number] not in keys[:number]]
 
 
 def gains_around(

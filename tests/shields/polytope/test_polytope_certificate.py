@@ -217,7 +217,7 @@ def small_plant(**changes):
 
 
 def test_box_with_nearly_the_same_row_twice_keeps_the_ellipsoid_and_says_what_helps():
-    certificate = synthesize(small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1e-9]])))
+    certificate = synthesize(small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1e-14]])))
     assert certificate.polytope is None
     assert "leave out rows of the box that are nearly the same as others" in " ".join(str(certificate).split())
     assert synthesize(small_plant()).polytope is not None
@@ -325,9 +325,9 @@ def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
     certificate, plant = found("BatchReactor")[1:]
 
     def failing(*_, **__):
-        raise ValueError("A_ub must not contain values inf, nan, or None")
+        raise ArithmeticError("a row of a linear program is too large")
 
-    monkeypatch.setattr(search, "linprog", failing)
+    monkeypatch.setattr(search, "Extremes", failing)
     narrow = with_polytope(certificate, plant)
     assert narrow.polytope is None
     assert "out of reach of float64" in narrow.provenance["no_polytope"]

@@ -1,0 +1,139 @@
+"""Rows with two ends, and what a polytope of them implies of other rows."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import highspy
+import numpy as np
+
+# The ends of one row that are open.
+OPEN = np.array([-math.inf]), np.array([math.inf])
+# The solver's own tolerances, next to units of 1. Programs are small: what a presolve does takes longer than it saves.
+_SOLVER = {
+    "output_flag": False,
+    "primal_feasibility_tolerance": 1e-10,
+    "dual_feasibility_tolerance": 1e-10,
+    "small_matrix_value": 1e-12,
+    "presolve": "off",
+    "solver": "simplex",
+}
+# The solver refuses larger numbers.
+_LARGEST = 1e15
+# What the solver says of a linear program without an end.
+_NO_END = (highspy.HighsModelStatus.kUnbounded, highspy.HighsModelStatus.kUnboundedOrInfeasible)
+
+
+class Faces(NamedTuple):
+    """Rows with two ends, low <= g z <= high, around z = 0; an end that is open is infinite.
+
+    Attributes:
+        rows: Shape (r, n).
+        low, high: Shape (r,).
+    """
+
+    rows: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def some(self, chosen: Any) -> Faces:
+        """Returns some of them, given by their numbers or a mask."""
+        return Faces(*(part[chosen] for part in self))
+
+    def followed_by(self, others: Faces) -> Faces:
+        """Returns these and then others."""
+        return Faces(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Returns whether points, shape (count, n), lie between the ends of all rows, shape (count,)."""
+        values = points @ self.rows.T
+        return np.all((self.low <= values) & (values <= self.high), axis=1)
+
+    @property
+    def are_symmetric(self) -> bool:
+        """Whether the ends of every row are equally far away."""
+        return np.array_equal(-self.low, self.high)
+
+
+class Bound(NamedTuple):
+    """An extreme value of row z in a polytope, infinite if there is none, with the multipliers (r,) that prove it."""
+
+    value: float
+    multipliers: np.ndarray
+
+
+class Extremes:
+    """The least and the largest values that rows take in a polytope.
+
+    Each is a linear program, which goes on from the solution of the one before.
+    """
+
+    def __init__(self, faces: Faces) -> None:
+        """Begins with faces.
+
+        Raises:
+            ArithmeticError: If their numbers are out of the solver's reach.
+        """
+        self._faces, self._n = Faces(*(part.copy() for part in faces)), faces.rows.shape[1]
+        self._columns = np.arange(self._n, dtype=np.int32)
+        self._solver = highspy.Highs()
+        for name, value in _SOLVER.items():
+            self._solver.setOptionValue(name, value)
+        self._solver.addVars(self._n, np.full(self._n, -math.inf), np.full(self._n, math.inf))
+        self._solver.changeObjectiveSense(highspy.ObjSense.kMaximize)
+        self._add(faces)
+
+    @property
+    def faces(self) -> Faces:
+        """The faces of the polytope."""
+        return self._faces
+
+    def add(self, faces: Faces) -> None:
+        """Adds faces.
+
+        Raises:
+            ArithmeticError: If their numbers are out of the solver's reach.
+        """
+        self._faces = self._faces.followed_by(faces)
+        self._add(faces)
+
+    def close(self, number: int, low: float, high: float) -> None:
+        """Gives a face other ends."""
+        self._faces.low[number], self._faces.high[number] = low, high
+        self._solver.changeRowBounds(number, low, high)
+
+    def _add(self, faces: Faces) -> None:
+        rows = np.ascontiguousarray(faces.rows)
+        starts, columns = np.arange(0, rows.size, self._n, dtype=np.int32), np.tile(self._columns, len(rows))
+        _check(rows)
+        self._solver.addRows(len(rows), faces.low, faces.high, rows.size, starts, columns, rows.ravel())
+
+    def of(self, row: np.ndarray) -> tuple[Bound, Bound]:
+        """Returns the least and the largest row z, shape (n,); of a symmetric polytope they are each other's.
+
+        Raises:
+            ArithmeticError: If the row's numbers are out of the solver's reach.
+        """
+        largest = self._largest(row)
+        if self._faces.are_symmetric:
+            return Bound(-largest.value, largest.multipliers), largest
+        least = self._largest(-row)
+        return Bound(-least.value, -least.multipliers), largest
+
+    def _largest(self, row: np.ndarray) -> Bound:
+        _check(row)
+        solver = self._solver
+        solver.changeColsCost(self._n, self._columns, row)
+        solver.run()
+        if solver.getModelStatus() not in (highspy.HighsModelStatus.kOptimal, *_NO_END):
+            solver.clearSolver()  # from the beginning
+            solver.run()
+        if solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
+            return Bound(math.inf, np.zeros(len(self._faces.rows)))
+        return Bound(solver.getObjectiveValue(), np.array(solver.getSolution().row_dual))
+
+
+def _check(rows: np.ndarray) -> None:
+    if not (np.abs(rows) < _LARGEST).all():
+        raise ArithmeticError(f"a row of a linear program has numbers from {_LARGEST:g} on")

@@ -1,0 +1,84 @@
+"""Extreme values of rows in a polytope, against linear programs of their own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from shields.synthesis.faces import Extremes, Faces
+
+
+def faces_of(rng, r, n, *, symmetric=False, some_open=True):
+    rows = rng.standard_normal((r, n)) * 10.0 ** rng.uniform(-2.0, 2.0, (1, n))
+    low, high = -rng.uniform(0.1, 2.0, r), rng.uniform(0.1, 2.0, r)
+    if symmetric:
+        low = -high
+    elif some_open:
+        low[::3], high[1::3] = -math.inf, math.inf
+    return Faces(rows, low, high)
+
+
+def largest(faces, row):
+    above, below = np.isfinite(faces.high), np.isfinite(faces.low)
+    A = np.concatenate([faces.rows[above], -faces.rows[below]])
+    found = linprog(-row, A, np.concatenate([faces.high[above], -faces.low[below]]), bounds=(None, None))
+    return -found.fun if found.status == 0 else math.inf
+
+
+def assert_extreme(within, row):
+    faces = within.faces
+    least, most = within.of(row)
+    assert most.value == pytest.approx(largest(faces, row), rel=1e-6)
+    assert least.value == pytest.approx(-largest(faces, -row), rel=1e-6)
+    for bound, sign in ((least, -1.0), (most, 1.0)):
+        if math.isfinite(bound.value):
+            prices = sign * bound.multipliers
+            np.testing.assert_allclose(bound.multipliers @ faces.rows, row, rtol=1e-6, atol=1e-8)
+            ends = np.where(prices > 0.0, faces.high, -faces.low)
+            taken = np.where(prices != 0.0, np.abs(prices), 0.0) @ np.where(prices != 0.0, ends, 0.0)
+            assert sign * bound.value == pytest.approx(taken, rel=1e-6)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_values_and_multipliers_are_those_of_a_linear_program_of_its_own(seed, symmetric):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 6))
+    within = Extremes(faces_of(rng, 3 * n, n, symmetric=symmetric))
+    for _ in range(4):
+        row = rng.standard_normal(n) * np.abs(within.faces.rows).max(axis=0)
+        assert_extreme(within, row)
+        number = int(rng.integers(len(within.faces.rows)))
+        low, high = float(within.faces.low[number]), float(within.faces.high[number])
+        within.close(number, -math.inf, math.inf)
+        assert_extreme(within, row)
+        within.close(number, low, high)
+        within.add(faces_of(rng, 2, n, symmetric=symmetric, some_open=False))
+        assert_extreme(within, row)
+
+
+def test_what_has_no_end_is_infinite_and_later_faces_give_it_one():
+    within = Extremes(Faces(np.array([[1.0, 0.0]]), np.array([-1.0]), np.array([2.0])))
+    assert [bound.value for bound in within.of(np.array([0.0, 1.0]))] == [-math.inf, math.inf]
+    assert [bound.value for bound in within.of(np.array([3.0, 0.0]))] == pytest.approx([-3.0, 6.0])
+    within.add(Faces(np.array([[1.0, 1.0]]), np.array([-math.inf]), np.array([1.0])))
+    assert [bound.value for bound in within.of(np.array([0.0, 1.0]))] == [-math.inf, pytest.approx(2.0)]
+
+
+def test_the_given_faces_stay_as_they_are():
+    faces = Faces(np.eye(2), -np.ones(2), np.ones(2))
+    Extremes(faces).close(0, -2.0, 2.0)
+    np.testing.assert_array_equal(faces.high, 1.0)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, 1e300])
+def test_numbers_out_of_reach_are_refused(number):
+    rows = np.array([[number, 1.0]])
+    with pytest.raises(ArithmeticError, match="numbers from 1e\\+15 on"):
+        Extremes(Faces(rows, -np.ones(1), np.ones(1)))
+    within = Extremes(Faces(np.eye(2), -np.ones(2), np.ones(2)))
+    with pytest.raises(ArithmeticError, match="numbers from 1e\\+15 on"):
+        within.of(rows[0])
