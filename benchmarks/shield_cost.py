@@ -2,12 +2,15 @@
 
 python benchmarks/shield_cost.py [--seconds 1]
 
+The last column is mode lookahead that asks for plans of so many steps if the network goes silent.
+
 Actions are random; each row is measured once for one environment and once for 64 side by side, one after the other on
 one core.
 """
 
 import argparse
 import time
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,8 +19,14 @@ import ncs_gym
 from shields import SafetyShield, VectorSafetyShield
 
 assert ncs_gym  # registers the ids
-NAMES = ("TruckTrailerCruise-v0", "CartPole-v0", "BatchReactor-v0")
-MODES = (None, "project", "lookahead")
+NAMES = ("TruckTrailerCruise-v0", "CartPole-v0", "BatchReactor-v0", "Convoy-v0")
+ASKED = 10
+SHIELDS: dict[str, dict[str, Any] | None] = {
+    "no shield": None,
+    "project": {"mode": "project"},
+    "lookahead": {"mode": "lookahead"},
+    f"asks for {ASKED}": {"mode": "lookahead", "least_safe_steps": ASKED},
+}
 COUNT = 64
 
 
@@ -39,12 +48,12 @@ def steps_per_second(env: gym.Env | gym.vector.VectorEnv, count: int, seconds: f
     return steps / (time.perf_counter() - start)
 
 
-def row(name: str, mode: str | None, seconds: float) -> list[float]:
-    """Returns the steps per second of one environment and of `COUNT`, behind a mode of the shield; none if None."""
+def column(name: str, shield: dict[str, Any] | None, seconds: float) -> list[float]:
+    """Returns the steps per second of one environment and of `COUNT`, behind a shield of these settings, if any."""
     single, many = gym.make(f"ncs_gym/{name}"), gym.make_vec(f"ncs_gym/{name}", num_envs=COUNT)
-    if mode is not None:
-        given = {"mode": mode, "on_unproved": "ignore"}
-        single, many = SafetyShield(single, **given), VectorSafetyShield(many, **given)
+    if shield is not None:
+        single = SafetyShield(single, on_unproved="ignore", **shield)
+        many = VectorSafetyShield(many, on_unproved="ignore", **shield)
     return [steps_per_second(single, 1, seconds), steps_per_second(many, COUNT, seconds)]
 
 
@@ -53,9 +62,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1.0, help="length of a measurement [s]")
     seconds = parser.parse_args().seconds
-    print(f"{'steps per second':24}{'no shield':>12}{'project':>12}{'lookahead':>12}")
+    print(f"{'steps per second':24}" + "".join(f"{each:>12}" for each in SHIELDS))
     for name in NAMES:
-        rates = np.array([row(name, mode, seconds) for mode in MODES])
+        rates = np.array([column(name, shield, seconds) for shield in SHIELDS.values()])
         for number, label in enumerate((name, f"  {COUNT} side by side")):
             print(f"{label:24}" + "".join(f"{rate:12,.0f}" for rate in rates[:, number]), flush=True)
 

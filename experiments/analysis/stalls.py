@@ -82,3 +82,18 @@ def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) ->
             }
         )
     return rows
+
+
+def how_often(row: dict[str, Any]) -> str:
+    """Returns how often the newest sample was older than a row of `broken_contracts` allows, as words."""
+    low, high = map(rate_text, row["per_hour_ci95"])
+    if row["times"] == 0:
+        return f"at no time; a record of this length excludes more than {high} times per hour"
+    times = "once" if row["times"] == 1 else f"{row['times']:,} times"
+    halves = " and ".join(map(rate_text, row["halves"]))
+    return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}], {halves} in its halves"
+
+
+def rate_text(rate: float) -> str:
+    """Returns a rate in three digits."""
+    return f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis.stalls import broken_contracts
+from experiments.analysis.stalls import broken_contracts, how_often, rate_text
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
@@ -102,10 +102,10 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
             str(row["max_age"]),
             _time(row["max_age"] * dt),
             f"{row['times']:,}",
-            _rate(row["per_hour"]),
-            f"[{', '.join(map(_rate, row['per_hour_ci95']))}]",
+            rate_text(row["per_hour"]),
+            f"[{', '.join(map(rate_text, row['per_hour_ci95']))}]",
             _time(row["longest"] * dt) if row["longest"] else "-",
-            *map(_rate, row["halves"]),
+            *map(rate_text, row["halves"]),
         ]
         for row in found["contracts"]
     ]
@@ -128,44 +128,25 @@ def _time(seconds: float) -> str:
     return f"{seconds:.4g} s" if seconds < 3600.0 else f"{seconds / 3600.0:,.4g} h"
 
 
-def _rate(rate: float) -> str:
-    return f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"
-
-
 def _compared(contract: Any, found: dict[str, Any]) -> str:
     if contract is None:
         return "The environment's certificate needs no contract: it holds through any silence."
     row = _row(found, contract.max_age)
-    said = f"The environment's contract, a newest sample of at most {in_steps(contract.max_age)}, was"
-    if row["times"] == 0:
-        return f"{said} kept throughout; a record of this length excludes more than {_most(row)} breaks per hour."
-    return f"{said} broken {_times(row)}, in {100.0 * row['broken']:.3g} % of steps."
+    share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
+    said = f"The environment's contract, a newest sample of at most {in_steps(contract.max_age)}, was broken"
+    return f"{said} {how_often(row)}{share}."
 
 
 def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:
     """Returns how often samples were older than contract and promised steps allow together."""
     oldest = contract.max_age + least
-    row = _row(found, oldest)
-    if row["times"] == 0:
-        older = f"never older; a record of this length excludes more than {_most(row)} times per hour"
-    else:
-        older = f"older {_times(row)}"
     return (
         f"If a shield promises {in_steps(least)} (shield_safe_steps) at every step at which the contract is kept, the "
         f"box is kept at least until the newest sample is {in_steps(oldest)} old, "
-        f"{_time(oldest * found['sampling_period'])}. In the record it was {older}."
+        f"{_time(oldest * found['sampling_period'])}. In the record it was older "
+        f"{how_often(_row(found, oldest))}."
     )
 
 
 def _row(found: dict[str, Any], age: int) -> dict[str, Any]:
     return next(row for row in found["contracts"] if row["max_age"] == age)
-
-
-def _times(row: dict[str, Any]) -> str:
-    low, high = map(_rate, row["per_hour_ci95"])
-    times = "once" if row["times"] == 1 else f"{row['times']:,} times"
-    return f"{times}, {_rate(row['per_hour'])} per hour [{low}, {high}]"
-
-
-def _most(row: dict[str, Any]) -> str:
-    return _rate(row["per_hour_ci95"][1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import inf
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import shields
+from experiments.analysis.stalls import broken_contracts, how_often
 from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.heatmaps import requirements_map
@@ -21,7 +22,7 @@ from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
 from experiments.terminal import say, text_table, wrapped
-from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym import ChannelContract, LinearPlant, PacketLog
 from ncs_gym.network.requests import spare_samples
 from ncs_gym.reading import json_values, read_file
 from shields import Certificate, Network, Requirement, Requirements
@@ -59,6 +60,7 @@ def requirements(settings: RequirementsSettings) -> None:
     """Runs `ncs requirements`."""
     plant, today = _plant_and_network(settings)
     asked = _values(settings, plant, today)
+    log = None if settings.log is None else PacketLog.load(settings.log, None, plant.dt)
     with claim_folder("requirements", settings):
         store = _Store(settings.out)
         found = shields.requirements(
@@ -89,7 +91,12 @@ def requirements(settings: RequirementsSettings) -> None:
         write_results(settings.out, summary, figures=figures)
     for table in tables:
         print(table.text, end="\n\n")
-    sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today), _requests_text(found, settings)]
+    sentences = [
+        *map(_boundary_text, found.largest_ages),
+        *(() if log is None else _log_texts(log, found, today)),
+        _today_text(found, today),
+        _requests_text(found, settings),
+    ]
     sentences += [_cheapest_text(found, settings, None), _cheapest_text(found, settings, today)]
     for sentence in dict.fromkeys(sentences):
         if sentence:
@@ -337,6 +344,18 @@ def _boundary_text(largest: LargestAge) -> str:
     text = f"{where}: the newest sample may be {largest.certified:g} steps ({largest.certified * period:g} ms) old"
     beyond = "" if largest.none_found is None else f"; for {_shown_age(largest.none_found)} no certificate was found"
     return f"{text}{beyond}."
+
+
+def _log_texts(log: PacketLog, found: Requirements, today: Network | None) -> Iterator[str]:
+    """Yields how often a record would have broken the contract of today, and the widest ones that are certified."""
+    asked = [("The widest contract with a certificate", each.network, each.certified) for each in found.largest_ages]
+    if today is not None and today.contract is not None:
+        asked.insert(0, ("Today's contract", today, today.contract.max_age))
+    for which, network, age in asked:
+        if age is not None and age != inf:
+            dt, oldest = network.sampling_period, int(age) - network.input_delay
+            (row,) = (each for each in broken_contracts(log.ages(dt), dt, (oldest,)) if each["max_age"] == oldest)
+            yield f"{which}, {_steps(oldest)} of {dt:g} s, the record breaks {how_often(row)}."
 
 
 def _shown_age(age: float) -> str:

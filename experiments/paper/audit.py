@@ -212,11 +212,12 @@ def invariance(example: PaperExample) -> Claim:
     """Returns the row about Definition 3 with every error."""
     closed_loop, M, ball = example.closed_loop, example.M, Ball(example.plant.gamma)
     step = worst_step(closed_loop, M, Box(example.disturbance_half_widths), Ball(example.epsilon))
+    alone = worst_step(closed_loop, M, Box(example.disturbance_half_widths), Ball(0.0)).level
     stays = not step.confirmed and stays_inside(closed_loop, M, ball, Ball(example.epsilon))
     return Claim(
         "the set is (gamma, epsilon)-RSI (Definition 3): every e with e'e <= epsilon",
         "x+ in S for all x in S, d, e",
-        f"worst x+'M x+ = {step.level:.4f} with d in the box of Section 5; {_text_of(step)}",
+        f"worst x+'M x+ = {step.level:.4f} with d in the box of Section 5, {alone:.3f} with e = 0; {_text_of(step)}",
         Verdict.FAILS if step.confirmed else Verdict.HOLDS if stays else Verdict.UNDECIDED,
         "row 8 reads Definition 3 with the errors that can occur" if step.confirmed else "",
         Defect.MARGIN,

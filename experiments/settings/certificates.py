@@ -240,6 +240,8 @@ class RequirementsSettings(BackendSettings):
         noises: Factors on the radii of sensor noise and first errors.
         tolerance: Also seek the factor by which all radii may grow in each network.
         keep: Percentage of the largest share that the cheapest network is to keep.
+        log: Record of packets, as `ncs channel` reads it: also says how often its newest sample was older than
+            certificates allow.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Accepted by every command; the search is deterministic and does not use it.
     """
@@ -258,6 +260,7 @@ class RequirementsSettings(BackendSettings):
     noises: tuple[float, ...] = (1.0,)
     tolerance: bool = False
     keep: float = 90.0
+    log: Path | None = None
     force: bool = False
     seed: int = 0
 

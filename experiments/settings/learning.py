@@ -301,7 +301,7 @@ _MARGINS = ("", *(f":{margin}" for margin in MARGINS))
 REGULATED_ARMS = (
     "lqr",
     *(f"governor{margin}" for margin in _MARGINS),
-    *(f"mpc{margin}" for margin in ("", ":20", ":40")),
+    *(f"mpc{margin}" for margin in ("", ":20", ":40", ":50")),
     *(f"lqr+{name}{margin}" for name in ("psf", "trusting", "trusting:lookahead") for margin in _MARGINS),
     "lqr+psf:tube",
     "lqr+shielded",

@@ -101,7 +101,8 @@ def margins_table(summary: dict[str, Any]) -> str:
             needed = [margins_needed(env, family, scenario) for scenario in (AS_TRAINED, ATTACKED)]
             chosen = needed[1] or needed[0]
             price = ["-", "-"] if chosen is None else [_beside(env, chosen, sound), _lost(env, chosen, family)]
-            margins = ["none" if each is None else _margin(each, family) for each in needed]
+            largest = _margin(members(env, family)[-1], family)
+            margins = [f"> {largest}" if each is None else _margin(each, family) for each in needed]
             rows.append([f"{title} {family}", *margins, *price])
     return text_table(rows)
 

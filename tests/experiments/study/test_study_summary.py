@@ -140,7 +140,7 @@ def test_margins_are_the_smallest_without_a_violation(made):
     assert margins_needed(env, "lqr+psf", "attacked") == "lqr+psf:20"
     assert row(margins_table(made[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "20", "%", "-1.5", "-2.0"]
     never = study(**{"lqr+psf:20": (12.0, 0.0, 1.0)})
-    assert row(margins_table(never[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "none", "-0.5", "-1.0"]
+    assert row(margins_table(never[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", ">", "20", "%", "-0.5", "-1.0"]
 
 
 def test_effect_of_the_network_is_shown_of_the_filter_that_trusts_its_estimate_and_of_the_proof(made):
