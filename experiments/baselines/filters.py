@@ -87,8 +87,9 @@ class PredictiveFilter:
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
-    already, nothing is solved. Where the program has no solution, u = K x_hat is applied. The authors apply the rest of the last
-    plan there; where estimates jump it leaves the box more often.
+    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied with a tube, as
+    the authors do, and u = K x_hat without one or when it is used up. (Without a tube the rest of a plan leaves the box
+    more often than K x_hat, with a tube less often.)
 
     After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
     is that of Mayne et al. 2006 (docs/bibliography.md).
@@ -114,7 +115,8 @@ class PredictiveFilter:
         tube: bool = False,
     ) -> None:
         require_valid(certificate, plant)
-        self._plant, self._K = plant, certificate.K
+        self._plant, self._K, self._horizon, self._keeps_plans = plant, certificate.K, horizon, tube
+        self._plans = np.empty((0, horizon - 1, plant.m))
         polytope = certificate.polytope
         self._root = np.linalg.cholesky(certificate.M).T if polytope is None else polytope.rows
         self._ends_in_ellipsoid = polytope is None
@@ -139,26 +141,35 @@ class PredictiveFilter:
         self._between = np.tile(np.minimum(at_samples[:-1], at_samples[1:]), times)
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
-        """Returns the inputs to apply, shape (N, m), as a `Rule`; it remembers nothing."""
-        applied = proposed.copy()
-        for e in np.flatnonzero(~self._followed_by_gain(estimates, proposed)).tolist():
-            planned = self._solved(estimates[e], proposed[e])
-            applied[e] = self._gained(estimates[e]) if planned is None else planned
+        """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
+        if len(self._plans) != len(estimates):
+            self._plans = np.full((len(estimates), self._horizon - 1, self._plant.m), np.nan)
+        self._plans[begun] = np.nan
+        applied, (fine, plans) = proposed.copy(), self._followed_by_gain(estimates, proposed)
+        self._plans[fine] = plans[fine]
+        for e in np.flatnonzero(~fine).tolist():
+            plan = self._solved(estimates[e], proposed[e])
+            if plan is None:
+                plan = np.concatenate([self._plans[e], np.full((1, self._plant.m), np.nan)])
+                if not self._keeps_plans or np.isnan(plan[0]).any():
+                    plan[0] = self._gained(estimates[e])
+            applied[e], self._plans[e] = plan[0], plan[1:]
         return applied
 
-    def _followed_by_gain(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
-        """Returns where a proposed input and then u = K x are a plan, shape (N,)."""
-        plant, states, inputs = self._plant, estimates, proposed
+    def _followed_by_gain(self, estimates: np.ndarray, proposed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns where a proposed input and then u = K x are a plan, (N,), and these inputs, (N, horizon - 1, m)."""
+        plant, states, inputs, plans = self._plant, estimates, proposed, []
         fine = np.ones(len(states), np.bool_)
         for between, limits in zip(self._between, [*self._limits, np.full(len(plant.box_rows), np.inf)], strict=True):
             fine &= (np.abs(self._grid.values(states, inputs)) <= between).all(axis=1)
             states = states @ plant.A.T + inputs @ plant.B.T
             fine &= (np.abs(states @ plant.box_rows.T) <= limits).all(axis=1)
             inputs = self._gained(states)
-        return fine & (self._levels(states) <= self._end_limits).all(axis=-1)
+            plans.append(inputs)
+        return fine & (self._levels(states) <= self._end_limits).all(axis=-1), np.stack(plans[:-1], axis=1)
 
     def _solved(self, estimate: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
-        """Returns the first input of the best plan, shape (m,); None if the solver finds none."""
+        """Returns the inputs of the best plan, shape (horizon, m); None if the solver finds none."""
         plant = self._plant
         missed = np.abs(plant.box_rows @ plant.A @ estimate) - np.abs(plant.box_rows @ plant.B) @ plant.u_max
         if not (missed <= self._limits[0]).all() or (self._end_limits <= 0.0).any():
@@ -172,7 +183,7 @@ class PredictiveFilter:
         inside = (np.abs(centers[:-1] @ plant.box_rows.T) <= self._limits + TOLERANCE).all()
         begun = np.vstack([estimate, centers[:-1]])
         inside &= (np.abs(self._grid.values(begun, plan)) <= self._between + TOLERANCE).all()
-        return plan[0] if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
+        return plan if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
 
     def _levels(self, states: np.ndarray) -> np.ndarray:
         """Returns |x|_M, shape (..., 1), or |g x| for all rows of P, shape (..., r), of states (..., n)."""
