@@ -39,6 +39,8 @@ EXPLANATIONS = (
     OTHER_EPISODE,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
+# Follows an explanation where `safe_steps` are left.
+KEPT_FOR_NOW = "; the box is kept for as many steps as shield_safe_steps says"
 ON_UNPROVED = ("ignore", "warn", "raise")
 
 
@@ -305,7 +307,7 @@ class LostGuarantee:
     def tell_of(self, reason: str) -> None:
         """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
         if reason:
-            self.note(CODES[reason])
+            self.note(CODES[reason.removesuffix(KEPT_FOR_NOW)])
             self.tell()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.network import CommittedInputs, DownlinkProtocol
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState
+from shields.runtime.guarantee import EXPLANATIONS, KEPT_FOR_NOW, GuaranteeMonitor, LoopObservation, MonitorState
 from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
 from shields.runtime.starts import StartKnown, first_store, known_inside
 
@@ -120,5 +120,6 @@ class MonitoredFilter:
 
     @property
     def reason(self) -> str:
-        """Why the state is not proved safe now; empty while it is."""
-        return EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]
+        """Why the state is not proved safe now, and whether the box is kept for some steps; empty while it is."""
+        reason = EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]
+        return reason + KEPT_FOR_NOW if reason and self.safe_steps else reason

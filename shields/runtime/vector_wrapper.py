@@ -21,6 +21,7 @@ from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
     CODES,
     EXPLANATIONS,
+    KEPT_FOR_NOW,
     OTHER_STEPS,
     GuaranteeMonitor,
     LoopObservation,
@@ -31,7 +32,8 @@ from shields.runtime.set_test import norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 from shields.runtime.wrapper import BaseShield
 
-REASONS = np.array(EXPLANATIONS, dtype=object)
+# Why states are not proved safe: without steps for which the box is kept all the same, and with some.
+REASONS = np.array([EXPLANATIONS, [each and each + KEPT_FOR_NOW for each in EXPLANATIONS]], dtype=object)
 
 
 class Clock(NamedTuple):
@@ -293,17 +295,18 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         doubted = np.count_nonzero(reasons) > 0
         if doubted:
             self._lost.note(reasons, np.arange(self.num_envs) if chosen is None else chosen)
-        ahead = {}
+        ahead, kept = {}, 0
         if len(self._stored):
             stored = ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)
-            ahead["shield_safe_steps"] = self._monitor.safe_steps(state, stored)
+            safe_steps = ahead["shield_safe_steps"] = self._monitor.safe_steps(state, stored)
+            kept = (safe_steps > 0).astype(np.intp)
         return ahead | {
             "shield_intervened": decided.intervened,
             "input_proposed": proposed.T,
             "shield_correction": norms(decided.input - proposed),
             "shield_margin": decided.margin,
             "shield_guaranteed": reasons == 0,
-            "shield_reason": REASONS[reasons] if doubted else self._no_reason[: len(reasons)],
+            "shield_reason": REASONS[kept, reasons] if doubted else self._no_reason[: len(reasons)],
             "episode_interventions": interventions.copy(),
         }
 

@@ -78,6 +78,10 @@ def test_silence_uses_them_up_one_by_one_and_samples_bring_them_back(is_vector):
         assert np.all(now >= np.asarray(before) - 1)
         assert np.all(info["shield_plan_length"] >= now)
         falls, rises = falls + np.count_nonzero(now < before), rises + np.count_nonzero(now > before)
+        reasons, kept = np.atleast_1d(info["shield_reason"]), np.atleast_1d(now) > 0
+        for reason, proved, is_kept in zip(reasons, np.atleast_1d(info["shield_guaranteed"]), kept, strict=True):
+            assert (reason == "") == proved
+            assert reason.endswith("kept for as many steps as shield_safe_steps says") == (is_kept and not proved)
         lost += np.count_nonzero(~np.asarray(info["shield_guaranteed"]) & (np.asarray(now) > 0))
         before = now
     assert falls > LEAST
