@@ -19,16 +19,20 @@ import argparse
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
+import matplotlib
 import numpy as np
 from gymnasium.vector import VectorEnv
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator
 
 from experiments.baselines import EstimateFilterSettings
 from experiments.baselines.controllers import REGULATORS, controller
 from experiments.baselines.tuned import tuned_weights
-from experiments.plots.figure_style import CaptionedFigure, legend_below
+from experiments.plots.figure_style import STYLE, CaptionedFigure, legend_below
 from ncs_gym import BrokenContractWarning, NCSEnv, NCSVectorEnv, PacketLog
 from shields import VectorSafetyShield, certificate_for
 
@@ -147,16 +151,23 @@ def measured(env_id: str, network: str, name: str, least: int, count: int, hours
 
 def figure(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
     """Returns the figure of what was measured, by environment, filter and network."""
+    with matplotlib.rc_context(STYLE):
+        return _figure(found)
+
+
+def _figure(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
     drawn = CaptionedFigure((8.0, 0.8 + 0.24 * sum(map(len, found.values())) + 0.5 * len(found)))
     heights = [len(filters) for filters in found.values()]
     axes = drawn.subplots(len(found), 2, squeeze=False, width_ratios=(3, 2), height_ratios=heights)
-    handles = {}
+    handles: dict[str, Artist] = {}
     for (left, claimed), (env, filters) in zip(axes, found.items(), strict=True):
         for axis in (left, claimed):
             axis.set_yticks(range(len(filters)), filters if axis is left else [""] * len(filters))
             axis.set_ylim(len(filters) - 0.4, -0.6)
         left.set_xscale("symlog", linthresh=5.0)
         left.set_xlim(-0.6, 60000.0)
+        left.set_xticks([0, 10, 100, 1000, 10000], ["0", "10", "100", "1,000", "10,000"])
+        left.xaxis.set_minor_locator(NullLocator())
         left.set_title(env, loc="left")
         claimed.set_xlim(96.9, 100.15)
         for row, (name, networks) in enumerate(filters.items()):
@@ -170,6 +181,9 @@ def figure(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
                         claimed.plot(100.0 * share, row + offset, fillstyle=fill, **given)
     axes[-1][0].set_xlabel("ends of episodes per hour")
     axes[-1][1].set_xlabel("steps with a claim [%]")
+    gray: dict[str, Any] = {"color": "#555555", "marker": "o", "linestyle": "", "markersize": 4.5}
+    handles["guaranteed"] = Line2D([], [], **gray)
+    handles["the box is kept for a step at least"] = Line2D([], [], fillstyle="none", **gray)
     legend_below(drawn, handles)
     return drawn
 

@@ -87,9 +87,8 @@ class PredictiveFilter:
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
-    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied with a tube, as
-    the authors do, and u = K x_hat without one or when it is used up. (Without a tube the rest of a plan leaves the box
-    more often than K x_hat, with a tube less often.)
+    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
+    do, and u = K x_hat when it is used up.
 
     After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
     is that of Mayne et al. 2006 (docs/bibliography.md).
@@ -115,7 +114,7 @@ class PredictiveFilter:
         tube: bool = False,
     ) -> None:
         require_valid(certificate, plant)
-        self._plant, self._K, self._horizon, self._keeps_plans = plant, certificate.K, horizon, tube
+        self._plant, self._K, self._horizon = plant, certificate.K, horizon
         self._plans = np.empty((0, horizon - 1, plant.m))
         polytope = certificate.polytope
         self._root = np.linalg.cholesky(certificate.M).T if polytope is None else polytope.rows
@@ -151,8 +150,8 @@ class PredictiveFilter:
             plan = self._solved(estimates[e], proposed[e])
             if plan is None:
                 plan = np.concatenate([self._plans[e], np.full((1, self._plant.m), np.nan)])
-                if not self._keeps_plans or np.isnan(plan[0]).any():
-                    plan[0] = self._gained(estimates[e])
+            if np.isnan(plan[0]).any():
+                plan[0] = self._gained(estimates[e])
             applied[e], self._plans[e] = plan[0], plan[1:]
         return applied
 

@@ -218,24 +218,21 @@ def test_predictive_filter_keeps_the_box_between_samples_where_it_counts_there(l
     assert 0.75 < largest(on_grid, margin=0.2) <= 0.8
 
 
-def test_predictive_filter_applies_the_gain_without_a_plan_and_with_a_tube_the_rest_of_the_last_one(
-    certificate, loaded
-):
+def test_predictive_filter_applies_the_rest_of_its_plan_and_then_the_gain(certificate, loaded):
+    predictive = PredictiveFilter(certificate, loaded, horizon=3)
     inside, outside, zero = np.zeros((1, 2)), 5.0 * loaded.half_widths[None], np.zeros((1, 1))
     lost = np.clip(outside @ certificate.K.T, -loaded.u_max, loaded.u_max)
+    np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)
     pushed = np.full((1, 1), 0.5)
+    np.testing.assert_array_equal(predictive(inside, pushed, ~NEVER), pushed)
     state, plan = loaded.B @ pushed[0], []
     for _ in range(2):
         plan.append(certificate.K @ state)
         state = loaded.A @ state + loaded.B @ plan[-1]
-    for tube, follow in ((False, [lost[0]]), (True, [*plan, lost[0]])):
-        predictive = PredictiveFilter(certificate, loaded, horizon=3, tube=tube)
-        np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)
-        np.testing.assert_array_equal(predictive(inside, pushed, ~NEVER), pushed)
-        for planned in follow:
-            np.testing.assert_allclose(predictive(outside, zero, NEVER)[0], planned, atol=1e-15)
-        predictive(inside, pushed, NEVER)
-        np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)  # another episode
+    for planned in (*plan, lost[0]):
+        np.testing.assert_allclose(predictive(outside, zero, NEVER)[0], planned, atol=1e-15)
+    predictive(inside, pushed, NEVER)
+    np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)  # another episode
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
