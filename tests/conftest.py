@@ -92,12 +92,16 @@ class ProcessorTimes:
         self.by_test[report.nodeid] += getattr(report, "processor_seconds", 0.0)  # a crashed worker tells none
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
-        """Prints the slowest tests and the sum."""
+        """Prints the slowest tests and files, and the sum."""
         if not self.by_test:
             return
-        terminalreporter.section(f"processor time [s], the {SLOWEST} slowest tests and all")
-        for test, seconds in sorted(self.by_test.items(), key=lambda each: -each[1])[:SLOWEST]:
-            terminalreporter.write_line(f"{seconds:8.1f}  {test}")
+        by_file: defaultdict[str, float] = defaultdict(float)
+        for test, seconds in self.by_test.items():
+            by_file[test.partition("::")[0]] += seconds
+        for title, spent in (("files", by_file), ("tests and all", self.by_test)):
+            terminalreporter.section(f"processor time [s], the {SLOWEST} slowest {title}")
+            for name, seconds in sorted(spent.items(), key=lambda each: -each[1])[:SLOWEST]:
+                terminalreporter.write_line(f"{seconds:8.1f}  {name}")
         terminalreporter.write_line(f"{sum(self.by_test.values()):8.1f}  all {len(self.by_test):,} tests")
         terminalreporter.write_line(f"{processor_seconds():8.1f}  with imports and the collection of tests")
 
