@@ -66,7 +66,8 @@ class Bound(NamedTuple):
 class Extremes:
     """The least and the largest values that rows take in a polytope.
 
-    Each is a linear program, which goes on from the solution of the one before.
+    Each is a linear program, in which HiGHS (Huangfu and Hall 2018, docs/bibliography.md) goes on from the solution of
+    the one before.
     """
 
     def __init__(self, faces: Faces) -> None:
