@@ -7,18 +7,14 @@ from typing import Any, NamedTuple
 
 import highspy
 import numpy as np
+from scipy.optimize import linprog
 
 # The ends of one row that are open.
 OPEN = np.array([-math.inf]), np.array([math.inf])
-# The solver's own tolerances, next to units of 1. Programs are small: what a presolve does takes longer than it saves.
-_SOLVER = {
-    "output_flag": False,
-    "primal_feasibility_tolerance": 1e-10,
-    "dual_feasibility_tolerance": 1e-10,
-    "small_matrix_value": 1e-12,
-    "presolve": "off",
-    "solver": "simplex",
-}
+# The solver's own tolerances, next to units of 1.
+_TOLERANCES = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+# Programs are small: what a presolve does takes longer than it saves.
+_SOLVER = {"output_flag": False, "small_matrix_value": 1e-12, "presolve": "off", "solver": "simplex"} | _TOLERANCES
 # The solver refuses larger numbers.
 _LARGEST = 1e15
 # What the solver says of a linear program without an end.
@@ -54,13 +50,6 @@ class Faces(NamedTuple):
     def are_symmetric(self) -> bool:
         """Whether the ends of every row are equally far away."""
         return np.array_equal(-self.low, self.high)
-
-
-class Bound(NamedTuple):
-    """An extreme value of row z in a polytope, infinite if there is none, with the multipliers (r,) that prove it."""
-
-    value: float
-    multipliers: np.ndarray
 
 
 class Extremes:
@@ -110,19 +99,18 @@ class Extremes:
         _check(rows)
         self._solver.addRows(len(rows), faces.low, faces.high, rows.size, starts, columns, rows.ravel())
 
-    def of(self, row: np.ndarray) -> tuple[Bound, Bound]:
-        """Returns the least and the largest row z, shape (n,); of a symmetric polytope they are each other's.
+    def of(self, row: np.ndarray) -> tuple[float, float]:
+        """Returns the least and the largest row z, shape (n,), infinite where there is none.
+
+        Of a symmetric polytope they are each other's.
 
         Raises:
             ArithmeticError: If the row's numbers are out of the solver's reach.
         """
         largest = self._largest(row)
-        if self._faces.are_symmetric:
-            return Bound(-largest.value, largest.multipliers), largest
-        least = self._largest(-row)
-        return Bound(-least.value, -least.multipliers), largest
+        return -largest if self._faces.are_symmetric else -self._largest(-row), largest
 
-    def _largest(self, row: np.ndarray) -> Bound:
+    def _largest(self, row: np.ndarray) -> float:
         _check(row)
         solver = self._solver
         solver.changeColsCost(self._n, self._columns, row)
@@ -130,9 +118,34 @@ class Extremes:
         if solver.getModelStatus() not in (highspy.HighsModelStatus.kOptimal, *_NO_END):
             solver.clearSolver()  # from the beginning
             solver.run()
-        if solver.getModelStatus() != highspy.HighsModelStatus.kOptimal:
-            return Bound(math.inf, np.zeros(len(self._faces.rows)))
-        return Bound(solver.getObjectiveValue(), np.array(solver.getSolution().row_dual))
+        return solver.getObjectiveValue() if solver.getModelStatus() == highspy.HighsModelStatus.kOptimal else math.inf
+
+
+def multipliers_of(faces: Faces, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what proves the least and the largest row z, shape (n,): row as sums of the rows of faces, (r,) each.
+
+    Zeros where there is no such value. Nothing is left here of programs that were solved before.
+    """
+    largest = _multipliers(faces, row)
+    return (largest if faces.are_symmetric else -_multipliers(faces, -row)), largest
+
+
+def _multipliers(faces: Faces, row: np.ndarray) -> np.ndarray:
+    above, below = np.isfinite(faces.high), np.isfinite(faces.low)
+    found = linprog(
+        -row,
+        A_ub=np.concatenate([faces.rows[above], -faces.rows[below]]),
+        b_ub=np.concatenate([faces.high[above], -faces.low[below]]),
+        bounds=(None, None),
+        method="highs",
+        options=_TOLERANCES,
+    )
+    multipliers = np.zeros(len(faces.rows))
+    if found.status == 0:
+        prices = -found.ineqlin.marginals
+        multipliers[above] += prices[: np.count_nonzero(above)]
+        multipliers[below] -= prices[np.count_nonzero(above) :]
+    return multipliers
 
 
 def _check(rows: np.ndarray) -> None:

@@ -20,7 +20,7 @@ from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
 from shields.synthesis.design_problem import Rest, taken_between_samples
-from shields.synthesis.faces import OPEN, Extremes, Faces
+from shields.synthesis.faces import OPEN, Extremes, Faces, multipliers_of
 from shields.synthesis.resting_point import units_of_states
 from shields.verification import ACTION_ROUNDING
 
@@ -375,7 +375,7 @@ class _ClosedLoop:
         own = Faces(rows * self.widths, faces.low - reached, faces.high - reached)
         within = limits_within_step(self._feedback, self.plant).images
         images = np.concatenate([rows @ self.next, self._K / limits[:, None], within]) * self.widths
-        found = np.array([[bound.multipliers for bound in Extremes(own).of(image)] for image in images])
+        found = np.array([multipliers_of(own, image) for image in images])
         found[np.abs(found) < 1e-13] = 0.0
         found[gains] *= limits[:, None, None]
         lower, upper = exact.rounded(found, _DIGITS + 2, axis=2).swapaxes(0, 1)
@@ -398,8 +398,7 @@ def _too_many() -> Infeasible:
 def _extents(faces: Faces) -> np.ndarray:
     """Returns how far every coordinate reaches in a polytope, shape (n,); 1 where it has no end."""
     within = Extremes(faces)
-    found = [[bound.value for bound in within.of(row)] for row in np.eye(faces.rows.shape[1])]
-    extents = np.abs(found).max(axis=1)
+    extents = np.abs([within.of(row) for row in np.eye(faces.rows.shape[1])]).max(axis=1)
     return np.where(np.isfinite(extents), extents, 1.0)
 
 
@@ -408,7 +407,7 @@ def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:
     least, largest = within.of(row.rows[0])
     low, high = float(row.low[0]), float(row.high[0])
     # An open end cuts nothing, even off what is unbounded.
-    return -math.inf < low and least.value < low - implied, high < math.inf and largest.value > high + implied
+    return -math.inf < low and least < low - implied, high < math.inf and largest > high + implied
 
 
 def _cuts_others(within: Extremes, number: int, implied: float) -> tuple[bool, bool]:
@@ -447,7 +446,7 @@ def _bounding_every_state(faces: Faces, kept: int) -> Faces:
         rank = np.linalg.matrix_rank(rows[closed]) if closed.any() else 0
         if rank == rows.shape[1]:
             break
-        least, largest = (bound.value for bound in Extremes(faces).of(rows[i]))
+        least, largest = Extremes(faces).of(rows[i])
         is_bounded = math.isfinite(least) and math.isfinite(largest)
         if not is_bounded or np.linalg.matrix_rank(np.vstack([rows[closed], rows[i]])) == rank:
             continue

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from shields.synthesis.faces import Extremes, Faces
+from shields.synthesis.faces import Extremes, Faces, multipliers_of
 
 
 def faces_of(rng, r, n, *, symmetric=False, some_open=True):
@@ -31,15 +31,16 @@ def largest(faces, row):
 def assert_extreme(within, row):
     faces = within.faces
     least, most = within.of(row)
-    assert most.value == pytest.approx(largest(faces, row), rel=1e-6)
-    assert least.value == pytest.approx(-largest(faces, -row), rel=1e-6)
-    for bound, sign in ((least, -1.0), (most, 1.0)):
-        if math.isfinite(bound.value):
-            prices = sign * bound.multipliers
-            np.testing.assert_allclose(bound.multipliers @ faces.rows, row, rtol=1e-6, atol=1e-8)
+    assert most == pytest.approx(largest(faces, row), rel=1e-6)
+    assert least == pytest.approx(-largest(faces, -row), rel=1e-6)
+    for value, multipliers, sign in zip((least, most), multipliers_of(faces, row), (-1.0, 1.0), strict=True):
+        if math.isfinite(value):
+            np.testing.assert_allclose(multipliers @ faces.rows, row, rtol=1e-6, atol=1e-8)
+            used, prices = multipliers != 0.0, sign * multipliers
             ends = np.where(prices > 0.0, faces.high, -faces.low)
-            taken = np.where(prices != 0.0, np.abs(prices), 0.0) @ np.where(prices != 0.0, ends, 0.0)
-            assert sign * bound.value == pytest.approx(taken, rel=1e-6)
+            assert sign * value == pytest.approx(np.abs(prices[used]) @ ends[used], rel=1e-6)
+        else:
+            np.testing.assert_array_equal(multipliers, 0.0)
 
 
 @pytest.mark.parametrize("symmetric", [False, True])
@@ -62,10 +63,10 @@ def test_values_and_multipliers_are_those_of_a_linear_program_of_its_own(seed, s
 
 def test_what_has_no_end_is_infinite_and_later_faces_give_it_one():
     within = Extremes(Faces(np.array([[1.0, 0.0]]), np.array([-1.0]), np.array([2.0])))
-    assert [bound.value for bound in within.of(np.array([0.0, 1.0]))] == [-math.inf, math.inf]
-    assert [bound.value for bound in within.of(np.array([3.0, 0.0]))] == pytest.approx([-3.0, 6.0])
+    assert within.of(np.array([0.0, 1.0])) == (-math.inf, math.inf)
+    assert within.of(np.array([3.0, 0.0])) == pytest.approx((-3.0, 6.0))
     within.add(Faces(np.array([[1.0, 1.0]]), np.array([-math.inf]), np.array([1.0])))
-    assert [bound.value for bound in within.of(np.array([0.0, 1.0]))] == [-math.inf, pytest.approx(2.0)]
+    assert within.of(np.array([0.0, 1.0])) == (-math.inf, pytest.approx(2.0))
 
 
 def test_the_given_faces_stay_as_they_are():
