@@ -88,7 +88,7 @@ class Extremes:
         self._faces = self._faces.followed_by(faces)
         self._add(faces)
 
-    def close(self, number: int, low: float, high: float) -> None:
+    def set_ends(self, number: int, low: float, high: float) -> None:
         """Gives a face other ends."""
         self._faces.low[number], self._faces.high[number] = low, high
         self._solver.changeRowBounds(number, low, high)

@@ -413,9 +413,9 @@ def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:
 def _cuts_others(within: Extremes, number: int, implied: float) -> tuple[bool, bool]:
     """Returns whether the ends of a face cut more than that off what the other faces bound."""
     row = within.faces.some([number])
-    within.close(number, -math.inf, math.inf)
+    within.set_ends(number, -math.inf, math.inf)
     cuts = _cuts(within, row, implied)
-    within.close(number, float(row.low[0]), float(row.high[0]))
+    within.set_ends(number, float(row.low[0]), float(row.high[0]))
     return cuts
 
 
@@ -427,7 +427,7 @@ def _without_implied(faces: Faces, kept: int, implied: float, count: int = 0) ->
     within, stays = Extremes(faces), np.full(len(faces.rows), True)
     for i in range(len(faces.rows) - 1, kept - 1, -1):
         low, high = _cuts_others(within, i, implied)
-        within.close(
+        within.set_ends(
             i, float(within.faces.low[i]) if low else -math.inf, float(within.faces.high[i]) if high else math.inf
         )
         stays[i] = low or high

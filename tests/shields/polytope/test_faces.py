@@ -54,9 +54,9 @@ def test_values_and_multipliers_are_those_of_a_linear_program_of_its_own(seed, s
         assert_extreme(within, row)
         number = int(rng.integers(len(within.faces.rows)))
         low, high = float(within.faces.low[number]), float(within.faces.high[number])
-        within.close(number, -math.inf, math.inf)
+        within.set_ends(number, -math.inf, math.inf)
         assert_extreme(within, row)
-        within.close(number, low, high)
+        within.set_ends(number, low, high)
         within.add(faces_of(rng, 2, n, symmetric=symmetric, some_open=False))
         assert_extreme(within, row)
 
@@ -71,7 +71,7 @@ def test_what_has_no_end_is_infinite_and_later_faces_give_it_one():
 
 def test_the_given_faces_stay_as_they_are():
     faces = Faces(np.eye(2), -np.ones(2), np.ones(2))
-    Extremes(faces).close(0, -2.0, 2.0)
+    Extremes(faces).set_ends(0, -2.0, 2.0)
     np.testing.assert_array_equal(faces.high, 1.0)
 
 
