@@ -90,6 +90,9 @@ def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_pat
         said = " ".join(found.stdout.split())
         assert f"the box is kept at least until the newest sample is {4 + least} steps old" in said
         assert f"In the record it was older {times}" in said
+    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{0.02 * k},{0.02 * k}\n" for k in range(500)))
+    kept = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+    assert "was broken at no time; a record of this length excludes more than" in " ".join(kept.stdout.split())
 
 
 @pytest.mark.cases(1)
@@ -118,6 +121,7 @@ def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
     assert "Contract kept by the record: max_age = 653 (65.3 s; first half 653, second half" in said
     assert "Span and number of packets disagree" in said
     assert "was broken once" in said
+    assert "at no time" not in said
 
 
 @pytest.mark.parametrize(

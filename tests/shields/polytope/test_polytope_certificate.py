@@ -217,7 +217,7 @@ def small_plant(**changes):
 
 
 def test_box_with_nearly_the_same_row_twice_keeps_the_ellipsoid_and_says_what_helps():
-    certificate = synthesize(small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1e-14]])))
+    certificate = synthesize(small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1e-9]])))
     assert certificate.polytope is None
     assert "leave out rows of the box that are nearly the same as others" in " ".join(str(certificate).split())
     assert synthesize(small_plant()).polytope is not None
