@@ -1,4 +1,4 @@
-"""What the shield costs in time: steps per second without it, behind the one-step test and behind lookahead.
+"""What the shield costs in time: steps per CPU second without it, behind the one-step test and behind lookahead.
 
 python benchmarks/shield_cost.py [--seconds 1]
 
@@ -31,21 +31,21 @@ COUNT = 64
 
 
 def steps_per_second(env: gym.Env | gym.vector.VectorEnv, count: int, seconds: float) -> float:
-    """Returns how many steps an environment, or `count` together, takes in a second of random actions."""
+    """Returns how many steps an environment, or `count` together, takes in a CPU second of random actions."""
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(100)]
     env.reset(seed=0)
     steps, start = 0, None
-    while start is None or time.perf_counter() - start < seconds:
+    while start is None or time.process_time() - start < seconds:
         for action in actions:
             _, _, terminated, truncated, _ = env.step(action)
             if count == 1 and (terminated or truncated):
                 env.reset()
         if start is None:  # the first actions are for what is computed once
-            start = time.perf_counter()
+            start = time.process_time()
         else:
             steps += len(actions) * count
-    return steps / (time.perf_counter() - start)
+    return steps / (time.process_time() - start)
 
 
 def column(name: str, shield: dict[str, Any] | None, seconds: float) -> list[float]:

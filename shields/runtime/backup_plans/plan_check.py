@@ -53,8 +53,7 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        sizes = np.abs(prediction.rows) @ prediction.sizes[1:]
-        self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
+        self._row_rounding = prediction.rounding[:, None, None] * (np.abs(prediction.rows) @ prediction.sizes[1:])
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
         self._most = min(MOST_REMEMBERED, max(1, MOST_NUMBERS // (prediction.steps * len(prediction.rows))))
@@ -76,50 +75,76 @@ class PlanTest:
             self._known = numbers, table
         return table.some([numbers[key] for key in keys])
 
-    @own_error_state  # what is not finite is not certified
     def limits_at(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
         """Returns the largest |row c_j - middle|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass.
 
         Both are NaN if unknown.
         """
-        size = np.abs(estimates)
-        rounding = (size @ self._row_rounding).reshape(tightening.row_limits.shape)
-        row_limits = tightening.row_limits - rounding - self._margin
-        radius = tightening.radius - size @ self._end_rounding  # far below zero for estimates that are too far out
-        return row_limits, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
+        every = slice(None)
+        return self._row_limits(estimates, tightening, every, every), self._radius(estimates, tightening, every)
 
-    def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns row c_j, shape (N, r, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast."""
-        centers = self.prediction.centers(estimates, plans)
-        steps, n, count, number = centers.shape
-        values = self.prediction.rows @ centers.reshape(steps, n, -1)
-        weighting = tightening.weighting.transpose(1, 2, 3, 0)[..., None]
-        weighted = weighting[:, :, 0] * centers[:, 0, None]
-        for i in range(1, n):
-            weighted += weighting[:, :, i] * centers[:, i, None]
-        return values.reshape(steps, -1, count, number), weighted
+    @own_error_state  # what is not finite is not certified
+    def _row_limits(self, estimates: np.ndarray, tightening: Tightening, steps: slice, rows: slice) -> np.ndarray:
+        """Returns what `limits_at` says of some steps and rows."""
+        limits, rounding = tightening.row_limits[:, steps, rows], self._row_rounding[steps, rows]
+        size = np.abs(estimates) @ rounding.reshape(-1, estimates.shape[1]).T
+        return limits - size.reshape(limits.shape) - self._margin
 
     @own_error_state
-    def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
-        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N)."""
+    def _radius(self, estimates: np.ndarray, tightening: Tightening, steps: slice) -> np.ndarray:
+        """Returns the same of the cone at some steps."""
+        radius = tightening.radius[:, steps] - np.abs(estimates) @ self._end_rounding[:, steps]  # may be far below zero
+        return np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
+
+    @own_error_state
+    def certified(
+        self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, shortest: int = 1
+    ) -> np.ndarray:
+        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N).
+
+        Parts of less than `shortest` inputs are not looked at, and count as not certified.
+        """
         block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
         if len(plans) > block:
             parts = [slice(start, start + block) for start in range(0, len(plans), block)]
-            return np.concatenate([self.certified(estimates[e], tightening.some(e), plans[e]) for e in parts])
-        row_limits, radius = self.limits_at(estimates, tightening)
-        values, weighted = self.judged(estimates, tightening, plans)
-        values -= self.prediction.middle[:, None, None]
-        within = np.abs(values) <= row_limits.transpose(1, 2, 0)[..., None]
-        inside = np.all(within[:, : len(self.prediction.plant.box)], axis=1)
-        kept = np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
-        if not self.prediction.ends:
-            kept &= np.all(within, axis=1)
-        kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
+            found = [self.certified(estimates[e], tightening.some(e), plans[e], shortest) for e in parts]
+            return np.concatenate(found)
+        prediction, plant = self.prediction, self.prediction.plant
+        centers, late, k = prediction.centers(estimates, plans), slice(shortest - 1, None), len(plant.box)
+        in_box = self._between(estimates, tightening, centers, slice(None), slice(k))
+        if prediction.ends:
+            kept = self._in_cone(estimates, tightening, centers, late)
+        else:
+            kept = in_box[late] & self._between(estimates, tightening, centers, late, slice(k, None))
+        on_the_way = np.ones_like(in_box)
+        np.logical_and.accumulate(in_box[:-1], axis=0, out=on_the_way[1:])
+        kept &= on_the_way[late]
         if tightening.between.size:
-            kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
-        plant = self.prediction.plant
-        allowed = np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1)
-        return kept.transpose(1, 2, 0) & np.logical_and.accumulate(allowed, axis=-1)
+            kept &= prediction.grid.keeps(estimates, tightening.between, plans, self._margin)[late]
+        allowed = np.logical_and.accumulate(np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1), -1)
+        allowed[..., : shortest - 1] = False
+        allowed[..., late] &= kept.transpose(1, 2, 0)
+        return allowed
+
+    def _between(
+        self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray, steps: slice, rows: slice
+    ) -> np.ndarray:
+        """Returns whether some rows keep their limits at some of the centers, shape (steps, E, P)."""
+        some, of_rows = centers[steps], self.prediction.rows[rows]
+        # Sums over long last axes are fast.
+        values = (of_rows @ some.reshape(*some.shape[:2], -1)).reshape(len(some), -1, *some.shape[2:])
+        values -= self.prediction.middle[rows, None, None]
+        limits = self._row_limits(estimates, tightening, steps, rows)
+        return np.all(np.abs(values, out=values) <= limits.transpose(1, 2, 0)[..., None], axis=1)
+
+    def _in_cone(self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray, steps: slice) -> np.ndarray:
+        """Returns whether |T G c_j| keeps its limit at some of the centers, shape (steps, E, P)."""
+        some, weighting = centers[steps], tightening.weighting[:, steps].transpose(1, 2, 3, 0)[..., None]
+        weighted = weighting[:, :, 0] * some[:, 0, None]
+        for i in range(1, some.shape[1]):
+            weighted += weighting[:, :, i] * some[:, i, None]
+        radius = self._radius(estimates, tightening, steps)
+        return np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
 
     @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:

@@ -88,23 +88,23 @@ class Planner:
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns a plan, (j, m), of a single environment, if the first candidates of `beginning_with` are enough."""
         plans = self._continued(estimate, proposed)
-        certified = self.test.certified(estimate[None], self.test.tightenings_of(shape[None]), plans[None])[0]
-        certified = certified[:, self.enough - 1 :]
+        tightening = self.test.tightenings_of(shape[None])
+        certified = self.test.certified(estimate[None], tightening, plans[None], self.enough)[0, :, self.enough - 1 :]
         which = int(certified.any(axis=1).argmax())
         more = int(certified[which].argmax())
         return plans[which, : self.enough + more] if certified[which, more] else None
 
     def beginning_with(
-        self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
+        self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray, shortest: int
     ) -> Plans:
-        """Returns certified plans whose first inputs are the proposed ones.
+        """Returns certified plans of at least `shortest` inputs whose first inputs are the proposed ones.
 
         After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
         then K, or the saturated regulator. The first candidate that is certified and long enough counts, and is all
         that is looked at; the solver is not asked.
         """
         tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
-        plans = self._best(estimates, tightening, continued[:, :1], proposed)
+        plans = self._best(estimates, tightening, continued[:, :1], proposed, shortest)
         for next_of in (
             lambda some: continued[some, 1:],
             lambda some: self._limited(estimates[some], proposed[some], stored[some]),
@@ -112,7 +112,7 @@ class Planner:
             left = np.flatnonzero(plans.lengths < self.enough)
             if not left.size:
                 break
-            found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left])
+            found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left], shortest)
             self.improve(plans, left, found)
         return plans
 
@@ -171,18 +171,26 @@ class Planner:
         for part, improved in zip(plans, others, strict=True):
             part[chosen[better]] = improved[better]
 
-    def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
-        """Returns one certified plan of P for each environment, shape (E, P, N, m).
+    def _best(
+        self,
+        estimates: np.ndarray,
+        tightening: Tightening,
+        plans: np.ndarray,
+        proposed: np.ndarray,
+        shortest: int = 1,
+    ) -> Plans:
+        """Returns one certified plan of P for each environment, shape (E, P, N, m), of at least `shortest` inputs.
 
         Of each that is long enough, the shortest such beginning counts, of others the longest. The plan of the highest
         rank is returned; of several the one that begins closest, and of equal ones the first.
         """
-        certified = self.test.certified(estimates, tightening, plans)
-        enough = certified[..., self.enough - 1 :]
+        enough = self.test.certified(estimates, tightening, plans, self.enough)[..., self.enough - 1 :]
         lengths = np.where(enough.any(axis=-1), self.enough + enough.argmax(axis=-1), 0)
-        if self.enough > 1:
+        short = np.flatnonzero((lengths == 0).all(axis=1)) if shortest < self.enough else ()
+        if len(short):
+            certified = self.test.certified(estimates[short], tightening.some(short), plans[short], shortest)
             longest = self.horizon - certified[..., ::-1].argmax(axis=-1)
-            lengths = np.where((lengths == 0) & certified.any(axis=-1), longest, lengths)
+            lengths[short] = np.where(certified.any(axis=-1), longest, 0)
         ranks = self.ranks(lengths)
         distances = np.sqrt(np.square(plans[:, :, 0] - proposed[:, None]).sum(axis=-1))
         distances = np.where(lengths > 0, distances, np.inf)

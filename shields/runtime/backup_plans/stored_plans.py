@@ -57,8 +57,7 @@ class Lookahead:
         some = np.flatnonzero(valid if self.least else valid & ~decided.passed)
         if some.size:
             known = self._rows(some, estimates, errors, decided.input, stored)
-            found = self.planner.beginning_with(*known)
-            found.lengths[found.lengths < self.planner.enough] = 0
+            found = self.planner.beginning_with(*known, self.planner.enough)
             begun = self._begin(decided, some, found)
             decided.intervened[some[begun]] = False
 
@@ -107,8 +106,10 @@ class Lookahead:
         closest = np.where(passes, decided.input[:, some], np.nan)
         x_hat, shapes, wanted, plans = self._rows(some, estimates, errors, proposed, stored)
         found = self.planner.find(x_hat, shapes, wanted, closest.T, plans)
-        if self.least:  # what begins with the proposal may be the longest, though it is too short
-            self.planner.improve(found, np.arange(len(some)), self.planner.beginning_with(x_hat, shapes, wanted, plans))
+        short = np.flatnonzero(found.lengths < self.planner.enough)
+        if self.least and short.size:  # what begins with the proposal may be the longest, though it is too short
+            begun = self.planner.beginning_with(x_hat[short], shapes[short], wanted[short], plans[short], 1)
+            self.planner.improve(found, short, begun)
         ranks = self.planner.ranks(found.lengths)
         farther = passes & (ranks <= 1) & (found.distances >= norms(closest - proposed[:, some]))
         found.lengths[farther | (ranks < self._ranks(stored[..., some]))] = 0
