@@ -77,7 +77,7 @@ def _played(
     infos, nothing = [info], np.zeros(count, np.bool_)
     running, ended, guaranteed = ~nothing, nothing, ~nothing
     returns, largest = np.zeros(count), np.full(count, np.nan if level_matrix is None else 0.0)
-    names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned")
+    names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "proved", "promised")
     totals = {name: np.zeros(count, np.int64) for name in names}
     while True:
         guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
@@ -96,6 +96,8 @@ def _played(
             "estimate_violation_steps": plant.constraint_values(info["estimate"].T).max(axis=0) > 0.0,
             "interventions": info.get("shield_intervened", nothing).astype(np.bool_),
             "planned": info.get("shield_plan_length", nothing) > 0,
+            "proved": info.get("shield_guaranteed", nothing).astype(np.bool_),
+            "promised": info.get("shield_safe_steps", nothing) > 0,
         }
         for name, where in happened.items():
             totals[name] += running & where

@@ -56,6 +56,9 @@ class Episode:
             was out of the safe set. NaN without a certificate.
         planned: Steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store; 0 in
             other modes.
+        proved: Steps after which the shield's guarantee held; 0 without a shield.
+        promised: Steps after which the shield promised the box for one step more at least, whatever the network does;
+            0 unless it is asked for such steps.
     """
 
     index: int
@@ -67,6 +70,8 @@ class Episode:
     guaranteed: bool
     largest_level: float
     planned: int = 0
+    proved: int = 0
+    promised: int = 0
 
 
 @dataclass(frozen=True, eq=False)

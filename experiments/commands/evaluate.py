@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
+from typing import Any
 
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
@@ -63,6 +64,9 @@ def evaluate(settings: EvaluateSettings) -> None:
         wrapped(f"{agent.algorithm} of {folder}{statistics} in {agent.env}, {settings.episodes:,} episodes"), end="\n\n"
     )
     print(summary_text(arms, {}))
+    if mode is not None:
+        (arm,) = arms.values()
+        print(wrapped(_proof_text(arm, least)))
     if settings.out is not None:
         content = {
             "arms": arms,
@@ -82,3 +86,10 @@ def evaluate(settings: EvaluateSettings) -> None:
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+
+
+def _proof_text(arm: dict[str, Any], least: int) -> str:
+    """Returns after how many steps something was proved; of the box for a while only if the shield was asked for it."""
+    held = f"The guarantee held after {arm['eval_proved_steps']:,} of {arm['eval_steps']:,} steps"
+    promised = f"after {arm['eval_promised_steps']:,} the box was promised for one step more at least"
+    return f"{held}; {promised}, whatever the network does." if least else f"{held}."

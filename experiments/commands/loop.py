@@ -218,6 +218,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
         proved[row["episode"], row["step"]] = row["guaranteed"]
         counts["steps"] += 1
         counts["proved"] += row["guaranteed"] == "1"
+        counts["promised"] += row["safe_steps"] != "0"
         counts["overridden"] += row["intervened"] == "1"
         counts["reason: " + row["reason"]] += bool(row["reason"])
         ages[int(row["age"])] += 1
@@ -237,6 +238,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
         summary |= {
             "steps of the controller": counts["steps"],
             "proved": counts["proved"],
+            **({"box promised for a step or more": counts["promised"]} if counts["promised"] else {}),
             "overridden": counts["overridden"],
             "decided too late": int(last["skipped"]),
             "datagrams refused": int(last["refused"]),

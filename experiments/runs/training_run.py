@@ -282,7 +282,8 @@ def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, 
         indices = [each.index for each in episodes]
         yield name, indices, indices == list(range(run.episodes))
         for each in episodes:
-            counts = each.violation_steps, each.estimate_violation_steps, each.interventions, each.planned
+            counts = each.violation_steps, each.estimate_violation_steps, each.interventions
+            counts += each.planned, each.proved, each.promised
             counted = 1 <= each.steps <= _LARGEST_COUNT and 0 <= min(counts) <= max(counts) <= each.steps
             numbers = abs(each.episode_return) < LARGEST_NUMBER and 0.0 <= each.largest_level < LARGEST_NUMBER
             yield name, each, counted and numbers

@@ -7,6 +7,8 @@ from gymnasium.vector import VectorWrapper
 
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
+from ncs_gym import Channel
+from shields import certificate_for
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 
@@ -90,6 +92,27 @@ def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
         assert one.episode_return == other.episode_return
     assert free.trajectory.intervened.sum() == free.episodes[0].interventions
     assert (free.trajectory.inputs != free.trajectory.proposed).any()
+
+
+def test_steps_that_were_proved_and_that_were_promised_are_counted_where_the_contract_breaks():
+    infos = []
+    settings = {"mode": "lookahead", "least_safe_steps": 5, "on_unproved": "ignore"}
+    channel = Channel(loss=0.8, max_consecutive_losses=30)
+    env = gym.make("ncs_gym/CartPole-v0").unwrapped
+    shield = ShieldSettings(certificate_for(env.plant, env.certificate_contract), **settings)
+    loop = LoopConfig(env="ncs_gym/CartPole-v0", kwargs={"channel": channel}, shield=shield)
+
+    def noting(observations, info):
+        infos.append(info)
+        return throttle(observations, info)
+
+    played = evaluate(loop, noting, 8, 0).episodes
+    first = played[0]
+    for name, count in {"shield_guaranteed": "proved", "shield_safe_steps": "promised"}.items():
+        before_the_last = sum(int(info[name][0] > 0) for info in infos[1:])
+        assert getattr(first, count) - before_the_last in (0, 1)
+    proved, promised = (sum(getattr(each, name) for each in played) for name in ("proved", "promised"))
+    assert 0 < proved < promised <= sum(each.steps for each in played)
 
 
 def test_levels_are_those_of_the_set_that_the_shield_keeps(certificate, loaded):

@@ -278,6 +278,9 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
         assert set(document["arms"]) == {f"shield: {mode}"}
         assert (document["arms"][f"shield: {mode}"]["plan_rate"] > 0.0) is (mode == "lookahead")
         assert ("from a" in evaluated.stdout) is (mode == "lookahead")
+        assert "The guarantee held after 600 of 600 steps." in " ".join(evaluated.stdout.split())
+    asked = " ".join(ncs("evaluate", out, "--episodes", "3", "--least-safe-steps", "2").stdout.split())
+    assert "held after 600 of 600 steps; after 600 the box was promised for one step more at least" in asked
 
 
 @pytest.mark.slow

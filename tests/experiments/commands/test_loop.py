@@ -62,10 +62,11 @@ def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     out = tmp_path / "loop"
     done = ncs_process(
         *("loop", "--env", CRUISE, "--speed", 5, "--steps", 100, "--room", 4, "--worst", "--mischief", 0.3),
-        *("--port", free_port(), "--out", out, "--live", "yes"),
+        *("--port", free_port(), "--out", out, "--live", "yes", "--shield", "lookahead", "--least-safe-steps", 3),
     )
     assert done.returncode == 0, done.stderr
     summary, controller = check(out)
+    assert summary["box promised for a step or more"] == (controller["safe_steps"] > 0).sum() > 0
     assert summary["steps of the controller"] == len(controller) == 100
     by_reason = [value for name, value in summary.items() if name.startswith("refused, ")]
     assert summary["datagrams refused"] == sum(by_reason) > 0
