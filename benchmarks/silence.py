@@ -35,8 +35,8 @@ from ncs_gym import (
     certified_error_set,
 )
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
-from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields import VectorSafetyShield
+from shields.silence import OUTAGES, way_back
 from tests.plants import random_plant
 
 IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
@@ -45,8 +45,6 @@ LADDER = (5, 10, 15, 20, 25, 30, 35, 40, 45)
 MOST_STEPS = 0.95
 # Steps of an episode before the network goes silent, and afterwards.
 HEARD, SILENT = 40, 60
-# Lengths of outages, in contracts.
-OUTAGES = (2, 10, 100)
 
 
 def shielded(name: str, count: int, least: int | None, **settings: Any) -> VectorSafetyShield:
@@ -95,26 +93,6 @@ def left_at(name: str, count: int, least: int | None) -> int | None:
     return min(ages, default=None)
 
 
-def steps_back(plant: LinearPlant, contract: ChannelContract, outage: int, period: int) -> int:
-    """Returns after how many steps the ellipsoid lies in its certified set again, samples coming so often.
-
-    Raises:
-        RuntimeError: If it does not within 10,000 steps.
-    """
-    error_set = certified_error_set(plant, contract)
-    recursion = ErrorRecursion(plant, contract.quantization_step, error_set)
-    known, gaps = recursion.first, [period] * 5 + [outage] + [period] * 10_000
-    for number, gap in enumerate(gaps):
-        for _ in range(gap):
-            known = recursion.predicted(known)
-        updated = recursion.updated(known)
-        assert updated is not None  # under a contract every sample is used
-        known = updated[1]
-        if number >= 5 and is_inside(known.shape, error_set.shape_at(0)):
-            return (number - 5) * period
-    raise RuntimeError(f"no way back within {10_000 * period} steps")
-
-
 def random_plants(count: int) -> Iterator[tuple[LinearPlant, ChannelContract]]:
     """Yields random plants, every second one unstable, with contracts."""
     for seed in range(count):
@@ -127,9 +105,11 @@ def random_plants(count: int) -> Iterator[tuple[LinearPlant, ChannelContract]]:
 def ways_back(ids: Sequence[str]) -> None:
     """Prints the table of --back."""
 
-    def counts(plant: LinearPlant, contract: ChannelContract) -> list[int]:
+    def counts(plant: LinearPlant, contract: ChannelContract) -> list[float]:
         age = contract.max_age
-        return [steps_back(plant, contract, many * age, period) for many in OUTAGES for period in (1, age)]
+        recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
+        steps = [way_back(recursion, many * age, period) for many in OUTAGES for period in (1, age)]
+        return [np.inf if each is None else each for each in steps]
 
     print(f"{'':20} {'contract':>8}" + "".join(f" {f'{many} contracts':>15}" for many in OUTAGES))
     print(f"{'':20} {'[steps]':>8}" + 3 * f" {'each':>7} {'rarely':>7}")
@@ -138,9 +118,11 @@ def ways_back(ids: Sequence[str]) -> None:
         assert isinstance(env, NCSEnv)
         assert env.certificate_contract is not None
         found = counts(env.plant, env.certificate_contract)
-        print(f"{name:20} {env.certificate_contract.max_age:8}" + "".join(f" {each:7}" for each in found), flush=True)
+        print(
+            f"{name:20} {env.certificate_contract.max_age:8}" + "".join(f" {each:7.0f}" for each in found), flush=True
+        )
     worst = np.max([counts(*each) for each in random_plants(30)], axis=0)
-    print(f"{'30 random plants':20} {'1 to 4':>8}" + "".join(f" {each:7}" for each in worst))
+    print(f"{'30 random plants':20} {'1 to 4':>8}" + "".join(f" {each:7.0f}" for each in worst))
 
 
 def row(name: str, count: int, steps: int) -> str:

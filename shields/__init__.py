@@ -17,6 +17,7 @@ from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
     from shields.nodes import ActuatorNode, ControllerNode, SensorNode
+    from shields.silence import Silence, silence_of
     from shields.synthesis import (
         Network,
         Requirement,
@@ -49,11 +50,13 @@ __all__ = [
     "SafetyFilter",
     "SafetyShield",
     "SensorNode",
+    "Silence",
     "Updates",
     "VectorSafetyShield",
     "certificate_for",
     "certify",
     "requirements",
+    "silence_of",
     "synthesize",
     "verify",
 ]
@@ -65,6 +68,7 @@ _NAMES = {
         *("Network", "Requirement", "Requirements"),
         *("certify", "requirements", "synthesize"),
     ),
+    "silence": ("Silence", "silence_of"),
     "nodes": ("ActuatorNode", "ControllerNode", "SensorNode"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}

@@ -45,7 +45,7 @@ LAYERS = {
         {"verification", "paper", "synthesis"},
         {"certificates"},
         {"runtime"},
-        {"nodes", "torch"},
+        {"nodes", "silence", "torch"},
     ),
     "agents": (
         {"hyperparams", "pickled_data", "results", "step_info"},

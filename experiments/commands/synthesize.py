@@ -40,6 +40,8 @@ def synthesize(settings: SynthesizeSettings) -> None:
         ) from interrupt
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")
+    if (silence := shields.silence_of(certificate, plant)) is not None:
+        print(f"Beyond the contract:\n{silence}")
     print(f"saved to {settings.out}")
 
 

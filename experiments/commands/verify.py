@@ -40,6 +40,8 @@ def verify(settings: VerifySettings) -> None:
         raise CertificateError(
             f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
         )
+    if (silence := shields.silence_of(certificate, plant)) is not None:
+        print(f"Beyond the contract:\n{silence}")
     contract = "" if certificate.contract is None else f"; it rests on {certificate.contract}"
     print(f"{settings.file} verifies{contract}")
 

@@ -121,7 +121,8 @@ class PlanTest:
         kept &= on_the_way[late]
         if tightening.between.size:
             kept &= prediction.grid.keeps(estimates, tightening.between, plans, self._margin)[late]
-        allowed = np.logical_and.accumulate(np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1), -1)
+        within = np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1)
+        allowed = np.logical_and.accumulate(within, axis=-1)
         allowed[..., : shortest - 1] = False
         allowed[..., late] &= kept.transpose(1, 2, 0)
         return allowed

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+import shields
 from agents.agent import Agent
 from ncs_gym import truck_trailer
 from shields import Certificate, certify
@@ -353,6 +354,9 @@ def test_synthesize_then_verify(tmp_path):
     assert json.loads((tmp_path / "report.json").read_text())["valid"] is True
     other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
     assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
+    assert "Beyond the contract" not in made.stdout + checked.stdout  # it has none
+    exceeded = ncs("verify", Path(shields.__file__).parent / "certificates" / "Pendulum-v0.json").stdout
+    assert "until the newest sample is 3 steps (0.15 s) old" in " ".join(exceeded.partition("Beyond")[2].split())
 
 
 @pytest.mark.cases(1)

@@ -1,0 +1,254 @@
+"""What a certificate says of a network that goes silent: how long the box is kept, and how the guarantee returns.
+
+The statement and its proof are in docs/shield_proof.md, "A contract that is exceeded".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ncs_gym import LinearPlant, certified_error_set
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
+from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.validation import own_error_state
+from shields.certificate import Certificate
+from shields.certificate_text import counted, labeled
+from shields.polytope import Polytope
+from shields.runtime.set_test import rows_within_step
+from shields.synthesis.faces import Extremes, Faces
+from shields.verification import ACTION_ROUNDING, require_valid
+
+# More steps are not looked at.
+MOST_STEPS = 200
+# Lengths of outages after which a way back is computed, in contracts, and the longest way that is looked for.
+OUTAGES, LONGEST_WAY = (2, 10, 100), 10_000
+# What limits must be kept by, in units of half their range: far more than the rounding of float64, and the tolerance of
+# the solver that finds supports of polytopes.
+MARGIN = 1e-8
+
+
+class WayBack(NamedTuple):
+    """After how many steps the error lies in its certified set again, counted from the first sample after an outage.
+
+    Attributes:
+        outage: Its length [steps].
+        often: Where samples come at every step then.
+        rarely: Where they come as rarely as the contract allows.
+    """
+
+    outage: int
+    often: int | None
+    rarely: int | None
+
+
+@dataclass(frozen=True)
+class Silence:
+    """What is known in advance of silences that exceed the contract of a certificate.
+
+    `print(silence)` says it in words.
+
+    Attributes:
+        max_age: Steps that the newest sample may be old under the contract, with what a downlink takes of them.
+        dt: Duration of a step [s]; None for a plant that has none.
+        anywhere: For how many steps more the box is kept from any belief that the contract allows, whatever the agent
+            and the disturbance do (every mode of a shield but "monitor").
+        at_half: For how many steps more it is kept with the fallback input, from an estimate in half of the safe set,
+            which is made smaller around its resting point.
+        at_rest: The same from an estimate at the resting point. All three are at most `MOST_STEPS`.
+        ways_back: How the guarantee returns after outages.
+    """
+
+    max_age: int
+    dt: float | None
+    anywhere: int
+    at_half: int
+    at_rest: int
+    ways_back: tuple[WayBack, ...]
+
+    def __str__(self) -> str:
+        def until(steps: int) -> str:
+            most, number = " or more" if steps >= MOST_STEPS else "", self.max_age + steps
+            seconds = "" if self.dt is None else f" ({number * self.dt:.3g} s)"
+            return f"{counted(number, 'step')}{seconds}{most} old"
+
+        kept = (
+            f"the box is kept until the newest sample is {until(self.anywhere)}, from any belief that the contract "
+            f"allows and whatever the agent does; with the fallback input from half of the safe set until it is "
+            f"{until(self.at_half)}, from rest until {until(self.at_rest)}"
+        )
+        ways = [way.rarely for way in self.ways_back]
+        outages = _listed([str(way.outage) for way in self.ways_back])
+        steps = _listed(["not within 10,000" if each is None else f"{each:,}" for each in ways])
+        back = (
+            f"after {outages} steps without a sample the error is in its certified set again {steps} steps after the "
+            "first sample, if samples come as rarely as the contract allows"
+        )
+        return labeled("  silence     ", kept) + "\n" + labeled("  way back    ", back)
+
+
+def silence_of(certificate: Certificate, plant: LinearPlant) -> Silence | None:
+    """Returns what is known of silences that exceed a certificate's contract; None without a contract.
+
+    Args:
+        certificate: Verified exactly here.
+        plant: The plant it was made for.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the plant.
+    """
+    require_valid(certificate, plant)
+    contract = certificate.contract
+    if contract is None:
+        return None
+    fallbacks = _Fallbacks(certificate, plant)
+    recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
+    outages = [many * contract.max_age for many in OUTAGES]
+    ways = [WayBack(steps, *(way_back(recursion, steps, gap) for gap in (1, contract.max_age))) for steps in outages]
+    at_half, at_rest = fallbacks.kept_from(0.5), fallbacks.kept_from(0.0)
+    return Silence(contract.max_age, plant.dt, fallbacks.kept_anywhere(), at_half, at_rest, tuple(ways))
+
+
+class _Fallbacks:
+    """For how many fallback inputs in a row, without a sample, the limits are kept.
+
+    In coordinates around the resting point, with y the state, e the error of its estimate and w the disturbances,
+
+        y_hat_j = (A + B K)^j (y_0 + e_0),    e_j = A^j e_0 - sum_{i<j} A^i w,    y_j = y_hat_j - e_j,
+
+    so that a limit r y_j + s u_j with u_j = K y_hat_j is a sum of supports: of S for y_0, and of E(Sigma) and E(D).
+
+    Args:
+        certificate: Gives S, K and the error set of the oldest sample.
+        plant: Gives A, B, D and the limits.
+    """
+
+    @own_error_state  # what overflows keeps no limit
+    def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
+        within, rest = rows_within_step(plant), certificate.fallback
+        (k, n), m = within.at_samples.shape, plant.m
+        at_samples = np.hstack([within.at_samples, np.zeros((k, m))])
+        inputs = np.hstack([np.zeros((m, n)), np.eye(m)])
+        rows = np.concatenate([at_samples, np.hstack([within.state, within.input]), inputs])
+        low = np.concatenate([within.low_at_samples, within.low, plant.input_low])
+        high = np.concatenate([within.high_at_samples, within.high, plant.input_high])
+        resting = rows @ np.concatenate([rest.resting_state, rest.resting_input])
+        disturbed = np.concatenate([np.zeros(k), within.disturbed, np.zeros(m)])
+        # Where the box counts at samples alone, it is known to hold S.
+        self._rows_on_states, self._first = k, 0 if plant.grid_rows is not None else k
+        self._low, self._high = low - resting, high - resting
+        self._own = disturbed + MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
+        self._on_state, self._on_input = rows[:, :n], rows[:, n:]
+        self._on_estimate = self._on_state + self._on_input @ rest.gain
+        self._powers, self._loops = _powers(plant.A), _powers(plant.A + plant.B @ rest.gain)
+        self._plant, self._set = plant, _Supports(certificate)
+        self._rounded = float(ACTION_ROUNDING) * plant.largest_input
+        self._error = certificate.Sigma
+        self._known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def kept_anywhere(self) -> int:
+        """Returns after how many steps without a sample, from the oldest age that is allowed, the box may be left."""
+        last, age = MOST_STEPS, 1  # the step from the oldest age itself is certified
+        while age < last:
+            last = min(last, age + self._kept(age, last - age))
+            age += 1
+        return last
+
+    def kept_from(self, share: float) -> int:
+        """Returns the same from an estimate in a share of S, with the fallback input at every step."""
+        return self._kept(0, MOST_STEPS, share)
+
+    def _kept(self, age: int, most: int, share: float | None = None) -> int:
+        """Returns for how many steps the limits are kept, `age` steps after the oldest.
+
+        The state is in S then or, if a share is given, its estimate in that share of S.
+        """
+        if not self._keeps(age, 0, share)[self._first :].all():
+            return 0
+        for steps in range(1, most + 1):
+            kept = self._keeps(age, steps, share)
+            if not kept[: self._rows_on_states].all():
+                return steps - 1
+            if not kept.all():  # the next input is not known to be within its limits
+                return steps
+        return most
+
+    @own_error_state
+    def _keeps(self, age: int, j: int, share: float | None) -> np.ndarray:
+        """Returns which limits are kept after j fallback inputs, shape (q,)."""
+        least, largest, reach = self._after(j)
+        error = -self._on_state @ self._powers[j]
+        if share is None:
+            error = error + self._on_estimate @ self._loops[j]
+        else:
+            least, largest = share * least, share * largest
+        D = self._plant.disturbance.shape_matrix
+        grown = _support(error @ self._powers[:age], D).sum(axis=0)  # since the oldest age
+        reach = reach + grown + _support(error @ self._powers[age], self._error)
+        kept: np.ndarray = (self._low <= least - reach) & (largest + reach <= self._high)
+        return kept
+
+    def _after(self, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns what S, and what disturbances and rounding add, after j inputs: the same for every age."""
+        if j not in self._known:
+            disturbed = _support(self._on_state @ self._powers[:j], self._plant.disturbance.shape_matrix)
+            rounded = np.abs(self._on_estimate @ self._loops[:j] @ self._plant.B) @ self._rounded
+            reach = self._own + (disturbed + rounded).sum(axis=0) + np.abs(self._on_input) @ self._rounded
+            self._known[j] = *self._set.of(self._on_estimate @ self._loops[j]), reach
+        return self._known[j]
+
+
+def _powers(matrix: np.ndarray) -> np.ndarray:
+    """Returns the powers of a matrix up to `MOST_STEPS`, shape (MOST_STEPS + 1, n, n)."""
+    powers = [np.eye(len(matrix))]
+    for _ in range(MOST_STEPS):
+        powers.append(matrix @ powers[-1])
+    return np.array(powers)
+
+
+class _Supports:
+    """The least and the largest values of rows in S, around the resting point."""
+
+    def __init__(self, certificate: Certificate) -> None:
+        kept, self._center = certificate.safe_set, certificate.resting_state
+        self._ellipsoid = certificate.ellipsoid
+        self._polytope = None
+        if isinstance(kept, Polytope):
+            shift = kept.rows @ self._center
+            self._polytope = Extremes(Faces(kept.rows, kept.low - shift, kept.high - shift))
+
+    def of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns them for rows, shape (q, n): two arrays of shape (q,)."""
+        if self._polytope is None:
+            reach, shift = _support(rows, self._ellipsoid.shape_matrix), rows @ self._center
+            return -reach - shift, reach - shift
+        extremes = np.array([self._polytope.of(row) for row in rows])
+        return extremes[:, 0], extremes[:, 1]
+
+
+def _support(rows: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Returns the largest values of rows, shape (..., q, n), in E(shape), shape (..., q)."""
+    return np.sqrt(np.maximum(((rows @ shape) * rows).sum(axis=-1), 0.0))
+
+
+def way_back(recursion: ErrorRecursion, outage: int, gap: int) -> int | None:
+    """Returns after how many steps from the first sample on the shape is certified again; None if never.
+
+    Samples came so rarely before the outage, too.
+    """
+    known, certified = recursion.first, recursion.error_set.shape_at(0)
+    for number, steps in enumerate([gap] * 5 + [outage] + [gap] * (LONGEST_WAY // gap)):
+        for _ in range(steps):
+            known = recursion.predicted(known)
+        updated = recursion.updated(known)
+        assert updated is not None  # under a contract every sample is used
+        known = updated[1]
+        if number >= 5 and is_inside(known.shape, certified):
+            return (number - 5) * gap
+    return None
+
+
+def _listed(texts: list[str]) -> str:
+    return ", ".join(texts[:-1]) + f" and {texts[-1]}"

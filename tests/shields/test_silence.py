@@ -1,0 +1,192 @@
+"""What is said in advance of a contract that is exceeded, by simulation and linear programs of its own."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import shields
+from ncs_gym import ChannelContract, NCSVectorEnv, TraceChannel
+from shields import CertificateError, VectorSafetyShield, certificate_for
+from shields.silence import MOST_STEPS
+from tests.certificates import certificate_of
+from tests.plants import named, small
+
+CASES = ("CartPole", "CSTR", "Convoy", "Pendulum", "drifts")
+HEARD, SILENT = 24, 80
+
+
+def registered(name):
+    """A registered plant and its certificate, or one whose set leaves more than a step beyond the contract."""
+    if name == "drifts":
+        plant = small([[1.02, 0.05], [0.0, 0.9]])
+        return plant, certificate_of(plant, ChannelContract(6), "polytope")
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    return env.plant, certificate_for(env.plant, env.certificate_contract)
+
+
+def simulated(plant, certificate, age, steps, start, error, disturbances, from_estimate):
+    """States and fallback inputs, `age` steps after the oldest sample; the disturbances begin there."""
+    rest, K = certificate.resting_state, certificate.K
+    for w in disturbances[:age]:
+        error = plant.A @ error - w
+    x_hat = start if from_estimate else start + error
+    x, states, inputs = x_hat - error, [], []
+    for j in range(steps + 1):
+        u = certificate.resting_input + K @ (x_hat - rest)
+        states.append(x)
+        inputs.append(u)
+        if j < steps:
+            x, x_hat = plant.A @ x + plant.B @ u + disturbances[age + j], plant.A @ x_hat + plant.B @ u
+    return np.array(states), np.array(inputs)
+
+
+def extremes(plant, certificate, age, steps, share=None):
+    """Largest values of the box's rows after so many steps and of the inputs then, and least ones: (2, k), (2, m).
+
+    The map from start, error and disturbances is taken from simulations, the extremes from its linear parts.
+    """
+    n = plant.n
+    sizes = [n, n, *[n] * (age + steps)]
+
+    def values(z):
+        start, error, *disturbances = np.split(z, np.cumsum(sizes)[:-1])
+        given = start, error, np.array(disturbances).reshape(-1, n), share is not None
+        states, inputs = simulated(plant, certificate, age, steps, *given)
+        return np.concatenate([plant.box @ states[-1], inputs[-1]])
+
+    constant = values(np.zeros(sum(sizes)))
+    linear = np.array([values(unit) - constant for unit in np.eye(sum(sizes))]).T
+    P, rest = certificate.polytope, certificate.resting_state
+    roots = [certificate.Sigma] + [plant.disturbance.shape_matrix] * (age + steps)
+    least, largest = [], []
+    for row, offset in zip(linear, constant, strict=True):
+        of_start, *others = np.split(row, np.cumsum(sizes)[:-1])
+        reach = sum(np.sqrt(max(g @ shape @ g, 0.0)) for g, shape in zip(others, roots, strict=True))
+        ends = []
+        for sign in (-1.0, 1.0):
+            A = np.concatenate([P.rows, -P.rows])
+            b = np.concatenate([P.high, -P.low])
+            found = linprog(-sign * of_start, A_ub=A[np.isfinite(b)], b_ub=b[np.isfinite(b)], bounds=(None, None))
+            of_set = -sign * found.fun
+            if share is not None:
+                of_set = of_start @ rest + share * (of_set - of_start @ rest)
+            ends.append(offset + of_set + sign * reach)
+        least.append(ends[0])
+        largest.append(ends[1])
+    k = len(plant.box)
+    return np.array([least[:k], largest[:k]]), np.array([least[k:], largest[k:]])
+
+
+def keeps_box(plant, values, slack):
+    return np.all(plant.box_low - slack <= values[0]) and np.all(values[1] <= plant.box_high + slack)
+
+
+def exceeds_limits(plant, values):
+    return np.any(values[0] < plant.input_low) or np.any(values[1] > plant.input_high)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_numbers_are_those_of_the_worst_start_error_and_disturbances(name):
+    plant, certificate = registered(name)
+    found = shields.silence_of(certificate, plant)
+    assert found.max_age == certificate.contract.max_age
+    assert 1 <= found.anywhere <= found.at_half < found.at_rest < MOST_STEPS
+    cases = [(found.at_half, 0, 0.5), (found.at_rest, 0, 0.0)]
+    for steps, age, share in cases:
+        for j in {1, steps // 2, steps} - {0}:
+            assert keeps_box(plant, extremes(plant, certificate, age, j, share)[0], 0.0)
+        is_left = not keeps_box(plant, extremes(plant, certificate, age, steps + 1, share)[0], -1e-6)
+        assert is_left or exceeds_limits(plant, extremes(plant, certificate, age, steps, share)[1])
+    # The state was in S at some age beyond the oldest one: the box is kept whichever it was, and not a step longer.
+    last = found.anywhere
+    for age in range(1, last, 7):
+        assert keeps_box(plant, extremes(plant, certificate, age, last - age)[0], 0.0)
+    assert any(
+        not keeps_box(plant, extremes(plant, certificate, age, last + 1 - age)[0], -1e-6)
+        or exceeds_limits(plant, extremes(plant, certificate, age, last - age)[1])
+        for age in range(last, 0, -1)
+    )
+
+
+def test_box_is_kept_in_silence_under_the_worst_disturbances():
+    """From estimates in half of the set at the oldest age, with the fallback input; later it is left."""
+    plant, certificate = registered("CartPole")
+    found, h = shields.silence_of(certificate, plant), certificate.contract.max_age
+    trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * SILENT
+    channel = TraceChannel(trace=tuple(trace), quantization_step=certificate.contract.quantization_step)
+    env = gym.make_vec(
+        "ncs_gym/CartPole-v0", 64, channel=channel, disturbance="adversarial", terminate_on_violation=False
+    )
+    shield = VectorSafetyShield(env, certificate, mode="switch", on_unproved="ignore")
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((64, plant.n))
+    starts = 0.45 * directions / certificate.polytope.gauge(directions)[:, None]
+    _, info = shield.reset(seed=0, options={"state": starts})
+    ages, gauges, outside = [], [], []
+    for _ in range(len(trace) - 1):
+        inputs = certificate.resting_input + (info["estimate"] - certificate.resting_state) @ certificate.K.T
+        actions = (inputs - plant.input_middle) / plant.input_half
+        *_, info = shield.step(actions.astype(np.float32))
+        ages.append(info["measurement_age"].max())
+        gauges.append(certificate.polytope.gauge(info["estimate"]))
+        outside.append(info["cost"] > 0.0)
+    oldest = ages.index(h + 1) - 1
+    some = gauges[oldest] <= 0.5
+    assert some.sum() > 16
+    assert not np.array(outside)[: oldest + found.at_half + 1, some].any()
+    assert np.array(outside)[:, some].any()
+
+
+def test_box_is_kept_in_silence_whatever_an_agent_does():
+    plant, certificate = registered("drifts")
+    found, h = shields.silence_of(certificate, plant), certificate.contract.max_age
+    assert found.anywhere > 10
+    assert shields.silence_of(certificate.without_polytope(), plant).anywhere >= found.anywhere
+    trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * 200
+    settings = {"disturbance": "adversarial", "terminate_on_violation": False, "max_episode_steps": 1000}
+    env = NCSVectorEnv(
+        64, plant=plant, channel=TraceChannel(trace=tuple(trace)), contract=certificate.contract, **settings
+    )
+    shield, rng = VectorSafetyShield(env, certificate, on_unproved="ignore"), np.random.default_rng(0)
+    shield.reset(seed=0)
+    pushed, ages, outside = rng.choice([-1.0, 1.0], (64, 1)).astype(np.float32), [], []
+    for _ in range(len(trace) - 1):
+        *_, info = shield.step(pushed)
+        ages.append(info["measurement_age"].max())
+        outside.append((info["cost"] > 0.0).any())
+    assert not any(outside[: ages.index(h + 1) + found.anywhere])
+    assert any(outside)
+
+
+def test_it_is_said_in_words_that_fit_a_terminal():
+    plant, certificate = registered("drifts")
+    found = shields.silence_of(certificate, plant)
+    text = " ".join(str(found).split())
+    assert f"is {6 + found.anywhere} steps ({0.1 * (6 + found.anywhere):.3g} s) old" in text
+    assert "after 12, 60 and 600 steps" in text
+    assert max(map(len, str(found).splitlines())) <= 80
+
+
+def test_limits_within_a_step_only_shorten_it():
+    plant, contract = named("reactor, at all times")
+    certificate = certificate_of(plant, contract, "polytope").without_polytope()
+    found = shields.silence_of(certificate, plant)
+    at_samples = replace(
+        certificate, between_samples=None, fingerprint=replace(plant, between_samples=None).fingerprint
+    )
+    longer = shields.silence_of(at_samples, replace(plant, between_samples=None))
+    assert 1 <= found.anywhere <= longer.anywhere
+    assert 1 <= found.at_rest <= longer.at_rest
+
+
+def test_without_a_contract_there_is_nothing_to_exceed():
+    plant, certificate = registered("TruckTrailerCruise")
+    assert shields.silence_of(certificate, plant) is None
+
+
+def test_certificates_of_other_plants_are_refused():
+    with pytest.raises(CertificateError):
+        shields.silence_of(registered("Pendulum")[1], registered("CartPole")[0])
