@@ -37,6 +37,8 @@ from ncs_gym.network.wire import SHORTEST_KEY
 from ncs_gym.reading import LARGEST_KEY, read_file
 from shields import Certificate, Infeasible, certificate_for
 from shields.atomic_write import write_atomically
+from shields.certificate_text import counted
+from shields.runtime.guarantee import KEPT_FOR_NOW
 from shields.verification import require_valid
 
 # Budget of `--smoke`.
@@ -180,7 +182,9 @@ class _view:
         if now < self._next:
             return
         self._next = now + (_PERIOD if self._live is None else _PERIOD / 8)
-        proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason']}"
+        proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason'].removesuffix(KEPT_FOR_NOW)}"
+        if row["safe_steps"]:
+            proved = f"{proved}, the box kept for {counted(row['safe_steps'], 'step')}"
         counts = f"overridden {self._seen['overridden']}, missing {row['missing']}, late {row['skipped']}"
         known = f"margin {row['margin']:.2f}, age {row['age']}; {counts}, refused {row['refused']}"
         line = f"step {row['step']}: {proved}; {known}"

@@ -103,7 +103,9 @@ def _draw_shield(canvas: Canvas, frame: FrameRecord, right: float) -> None:
     elif annotation.intervened:
         text = f"SHIELD ACTS {count}"
     else:
-        text = f"shield ({annotation.label}): acted {count}"
+        ahead = 0 if annotation.plan is None else len(annotation.plan)  # for as long the box is kept in any case
+        label = f"{ahead} step{'' if ahead == 1 else 's'} ahead" if ahead else annotation.label
+        text = f"shield ({label}): acted {count}"
     _draw_label(canvas, right, text, theme.SHIELD, theme.SHIELD_FILL, filled=frame.intervened)
 
 

@@ -74,6 +74,7 @@ def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     assert controller["guaranteed"].iloc[0] == 1
     assert "outside although proved" in done.stdout
     assert "overridden" in done.stdout
+    assert ", the box kept for 3 steps" in " ".join(done.stdout.split())
     assert "; margin " in done.stdout  # a line or, with rich, the title of the table
     drawn = ncs("render", "--env", CRUISE, "--log", out, "--out", tmp_path / "loop.png")
     assert drawn.returncode == 0, drawn.stderr

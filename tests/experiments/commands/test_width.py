@@ -93,7 +93,15 @@ class Shown:
 
     def loop(self):
         env = registered_env(CRUISE)
-        row = {"step": 12_345, "margin": 0.123, "age": 12, "missing": 12_345, "skipped": 12_345, "refused": 12_345}
+        row = {
+            "step": 12_345,
+            "margin": 0.123,
+            "age": 12,
+            "missing": 12_345,
+            "skipped": 12_345,
+            "refused": 12_345,
+            "safe_steps": 12,
+        }
         row |= {f"x_hat_{name}": -123.4 for name in env.plant.state_names}
         row |= {"intervened": 12_345, "guaranteed": False, "reason": "the state is not known to have stayed " * 3}
         with pytest.MonkeyPatch.context() as patch:
