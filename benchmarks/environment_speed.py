@@ -1,9 +1,10 @@
 """Environment steps per second of CPU time, ours against what a user would pick instead, in one run.
 
-    python benchmarks/environment_speed.py [--seconds 1.0] [--brief | --ids]
+    python benchmarks/environment_speed.py [--seconds 1.0] [--brief | --ids | --ppo]
 
 --brief, which CI prints, leaves out all but one environment and 1024 of them; --ids prints 1024 of every registered id,
-after 200 steps, without those whose packages are missing.
+after 200 steps, without those whose packages are missing; --ppo what share of PPO's time with the defaults of
+stable-baselines3 four scalar environments take.
 All alternatives of a table run in turn, in rounds; a machine that is slow for a while is slow for all of them. The CPU
 time of all processes counts. In brackets stands the ratio to the first row, the median over rounds.
 """
@@ -20,8 +21,11 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import torch
 from plain_truck_trailer import PlainTruckTrailer
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
 
 import ncs_gym  # noqa: F401
 from agents import SB3VecEnv
@@ -151,16 +155,56 @@ def every_id(seconds: float) -> None:
         print(f"  {env_id.removeprefix('ncs_gym/'):30s} {rates[0]:>9s} {rates[1]:>9s}", flush=True)
 
 
+class TimedVecEnv(VecEnvWrapper):
+    """Adds up the CPU time of resets and steps."""
+
+    seconds = 0.0
+
+    def reset(self):
+        return self._timed(self.venv.reset)
+
+    def step_wait(self):
+        return self._timed(self.venv.step_wait)
+
+    def _timed(self, call):
+        start = time.process_time()
+        result = call()
+        self.seconds += time.process_time() - start
+        return result
+
+
+def shares_of_ppo(seconds: float) -> None:
+    """Prints what share of the CPU time of PPO is that of four scalar environments, after the first rollout."""
+    modes = {"bare": None, "project": {}, "lookahead": {"mode": "lookahead"}}
+    print("\nfour scalar environments in PPO's CPU time [%]")
+    print(f"  {'':30s} " + " ".join(f"{mode:>9s}" for mode in modes))
+    for name in ("CSTR", "TruckTrailerCruise", "CartPole"):
+        shares = []
+        for shield in modes.values():
+            wrapper = None if shield is None else lambda env, given=shield: SafetyShield(env, **given)
+            env = TimedVecEnv(make_vec_env(f"ncs_gym/{name}-v0", 4, seed=0, wrapper_class=wrapper))
+            model = PPO("MlpPolicy", env, seed=0, device="cpu").learn(1)
+            env.seconds, start = 0.0, time.process_time()
+            model.learn(round(8192 * seconds), reset_num_timesteps=False)
+            shares.append(100.0 * env.seconds / (time.process_time() - start))
+        print(f"  {name:30s} " + " ".join(f"{share:9.0f}" for share in shares), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=1.0, help="per row")
     parser.add_argument("--brief", action="store_true", help="one environment, and 1024")
     parser.add_argument("--ids", action="store_true", help="1024 environments of every registered id")
+    parser.add_argument("--ppo", action="store_true", help="the share of environments in PPO's time")
     options = parser.parse_args()
     seconds = options.seconds
     warnings.simplefilter("ignore")
     if options.ids:
         every_id(seconds)
+        return
+    if options.ppo:
+        torch.set_num_threads(1)
+        shares_of_ppo(seconds)
         return
     first_steps()
     one = {
