@@ -1,17 +1,23 @@
 """For how many steps the box is kept when the network goes silent, and what it costs to ask for them.
 
-    python -m benchmarks.silence [--envs 64] [--steps 150] [--ids CartPole ...] [--back]
+    python -m benchmarks.silence [--envs 64] [--steps 150] [--ids CartPole ...] [--back | --attack]
 
-Registered environments with a contract, of one direction, under adversarial disturbances. With random actions, "safe"
+Registered environments with a contract under adversarial disturbances. With random actions, "safe"
 is the largest number of steps of a ladder that mode "lookahead", asked for it, promises at 95 % of the steps over the
 environment's own network; "overridden" the share of steps overridden when it is asked for, and when none are.
 "left at" is how old the newest sample had become when a state left the box first, the smallest of all episodes: samples
 come as rarely as the contract allows for a while and then no more for sixty steps, and the agent pushes all the time,
 behind mode "project", and behind "lookahead" that is asked for the steps. "never" stands for no state.
 
-With --back: after how many steps the error's ellipsoid lies in its certified set again, so that the guarantee can
-return, after outages of 2, 10 and 100 contracts; samples come again at every step, or as rarely as the contract allows.
-The last row is the worst of 30 random plants of 2 to 5 states, half of them unstable.
+With --back what `shields.silence_of` says in advance: until which age of the newest sample the box is kept, from any
+belief that the contract allows, and with the fallback input from half of the set and from rest; and after how many
+steps the error's ellipsoid lies in its certified set again, so that the guarantee can return, after outages of 2, 10
+and 100 contracts; samples come again at every step, or as rarely as the contract allows. The last row is the worst of
+30 random plants of 2 to 5 states, half of them unstable.
+
+With --attack: how many promises are broken where samples come as rarely as the contract allows for a while and then no
+more for a while, again and again, an agent pushes one way and then another, and disturbances are adversarial: states
+outside the box within the steps that were promised, and promises that fall by more than one per step.
 """
 
 from __future__ import annotations
@@ -35,11 +41,15 @@ from ncs_gym import (
     certified_error_set,
 )
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
-from shields import VectorSafetyShield
-from shields.silence import OUTAGES, way_back
+from ncs_gym.registration import registered_ids
+from shields import VectorSafetyShield, certificate_for
+from shields.silence import OUTAGES, silence_of, way_back
 from tests.plants import random_plant
 
 IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
+# Steps that the attack asks for, behind a downlink, too.
+ATTACKED = {"CartPole": 35, "CartPoleTwoWay": 20, "CartPoleNonlinear": 20, "BatchReactor": 15, "CSTR": 5}
+ATTACKED |= {"Convoy": 10, "LaneKeeping": 10}
 LADDER = (5, 10, 15, 20, 25, 30, 35, 40, 45)
 # Share of steps at which all steps asked for are promised.
 MOST_STEPS = 0.95
@@ -102,27 +112,46 @@ def random_plants(count: int) -> Iterator[tuple[LinearPlant, ChannelContract]]:
         yield plant, ChannelContract(1 + seed % 4)
 
 
-def ways_back(ids: Sequence[str]) -> None:
-    """Prints the table of --back."""
-
-    def counts(plant: LinearPlant, contract: ChannelContract) -> list[float]:
-        age = contract.max_age
-        recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
-        steps = [way_back(recursion, many * age, period) for many in OUTAGES for period in (1, age)]
-        return [np.inf if each is None else each for each in steps]
-
-    print(f"{'':20} {'contract':>8}" + "".join(f" {f'{many} contracts':>15}" for many in OUTAGES))
-    print(f"{'':20} {'[steps]':>8}" + 3 * f" {'each':>7} {'rarely':>7}")
-    for name in ids:
-        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+def in_advance(ids: Sequence[str] | None) -> None:
+    """Prints the table of --back, of all ids with a contract if none are given."""
+    names = [f"ncs_gym/{name}-v0" for name in ids] if ids else registered_ids()
+    print(f"{'':20} {'kept until an age of':>29}" + "".join(f" {f'{many} contracts':>13}" for many in OUTAGES))
+    print(f"{'[steps]':20} {'contract':>8} {'any':>6} {'half':>6} {'rest':>6}" + 3 * f" {'each':>6} {'rarely':>6}")
+    for name in names:
+        env = gym.make(name).unwrapped
         assert isinstance(env, NCSEnv)
-        assert env.certificate_contract is not None
-        found = counts(env.plant, env.certificate_contract)
-        print(
-            f"{name:20} {env.certificate_contract.max_age:8}" + "".join(f" {each:7.0f}" for each in found), flush=True
-        )
-    worst = np.max([counts(*each) for each in random_plants(30)], axis=0)
-    print(f"{'30 random plants':20} {'1 to 4':>8}" + "".join(f" {each:7.0f}" for each in worst))
+        if env.certificate_contract is None:
+            continue
+        found = silence_of(certificate_for(env.plant, env.certificate_contract), env.plant)
+        assert found is not None
+        kept = [found.max_age + steps for steps in (0, found.anywhere, found.at_half, found.at_rest)]
+        back = [steps for way in found.ways_back for steps in way[1:]]
+        print(f"{name[8:-3]:20} {kept[0]:8}" + "".join(f" {each:6}" for each in [*kept[1:], *back]), flush=True)
+    steps = []
+    for plant, contract in random_plants(30):
+        recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
+        age = contract.max_age
+        ways = [way_back(recursion, many * age, period) for many in OUTAGES for period in (1, age)]
+        steps.append([np.inf if each is None else each for each in ways])
+    print(
+        f"{'30 random plants':20} {'1 to 4':>8}" + " " * 21 + "".join(f" {each:6.0f}" for each in np.max(steps, axis=0))
+    )
+
+
+def broken_promises(name: str, count: int, steps: int, least: int) -> tuple[int, int]:
+    """Returns how many promises were broken, and at how many steps the contract was broken and the box promised."""
+    env, rng = shielded(name, count, least, channel=rare_then_silent(name)), np.random.default_rng(2)
+    _, info = env.reset(seed=2)
+    promised, broken, kept, ended = info["shield_safe_steps"], 0, 0, np.zeros(count, np.bool_)
+    for k in range(steps):
+        if k % 25 == 0:
+            pushed = rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
+        *_, terminated, truncated, info = env.step(pushed)
+        now = info["shield_safe_steps"]
+        broken += np.count_nonzero(((promised > 0) & (info["cost"] > 0.0) | (now < promised - 1)) & ~ended)
+        kept += np.count_nonzero((now > 0) & info["contract_broken"])
+        promised, ended = now, terminated | truncated
+    return broken, kept
 
 
 def row(name: str, count: int, steps: int) -> str:
@@ -150,16 +179,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", type=int, default=64)
     parser.add_argument("--steps", type=int, default=150)
-    parser.add_argument("--ids", nargs="+", default=IDS)
+    parser.add_argument("--ids", nargs="+")
     parser.add_argument("--back", action="store_true")
+    parser.add_argument("--attack", action="store_true")
     options = parser.parse_args()
     if options.back:
-        return ways_back(options.ids)
+        return in_advance(options.ids)
     for category in (BrokenContractWarning, ClippedObservationWarning):
         warnings.simplefilter("ignore", category)
+    if options.attack:
+        print(f"{'':20} {'steps':>9} {'silent and promised':>20} {'broken promises':>16}")
+        for name, least in ATTACKED.items():
+            steps = options.envs * options.steps
+            broken, kept = broken_promises(f"ncs_gym/{name}-v0", options.envs, options.steps, least)
+            print(f"{name:20} {steps:9,} {kept:20,} {broken:16}", flush=True)
+        return None
     print(f"{'':20} {'contract':>8} {'safe':>5} {'':>8} {'overridden [%]':>13} {'left at an age of':>18}")
     print(f"{'':20} {'[steps]':>8} {'':>5} {'[s]':>8} {'none':>6} {'asked':>6} {'project':>8} {'lookahead':>10}")
-    for name in options.ids:
+    for name in options.ids or IDS:
         print(row(f"ncs_gym/{name}-v0", options.envs, options.steps), flush=True)
 
 
