@@ -48,7 +48,7 @@ class WayBack(NamedTuple):
 class Silence:
     """What is known in advance of silences that exceed the contract of a certificate.
 
-    `print(silence)` says it in words.
+    `print(silence)` says it in words. Behind a downlink commands must keep arriving as its contract says.
 
     Attributes:
         max_age: Steps that the newest sample may be old under the contract, with what a downlink takes of them.
