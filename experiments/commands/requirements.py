@@ -28,7 +28,8 @@ from ncs_gym.reading import json_values, read_file
 from shields import Certificate, Network, Requirement, Requirements
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
-from shields.synthesis.network_requirements import Answer, LargestAge, Search, kind_of_share
+from shields.synthesis.network_requirements import LargestAge, kind_of_share
+from shields.synthesis.requirement_search import Answer, Search
 
 _DEFAULT_ENV = "ncs_gym/CartPole-v0"
 # Steps between samples, and losses in a row, that are asked about by default.

@@ -8,7 +8,8 @@ which networks leave a plant certifiable. Importing this package imports the sol
 
 from shields.synthesis.certification import synthesize
 from shields.synthesis.ellipsoid_certificates import certify
-from shields.synthesis.network_requirements import Network, Requirement, Requirements, requirements
+from shields.synthesis.network_requirements import Network, Requirement, Requirements
+from shields.synthesis.requirement_search import requirements
 
 __all__ = [
     "Network",

@@ -18,7 +18,7 @@ from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.runtime.set_test import ellipsoid_test, rows_within_step
 from shields.runtime.starts import starts_known
-from shields.synthesis.network_requirements import with_radii
+from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
 from tests.second_verifier.verify import verify_again
 from tests.verdicts import verified

@@ -24,7 +24,7 @@ from ncs_gym import (
 )
 from ncs_gym.network.contract import contract_of
 from shields import Certificate
-from shields.synthesis.network_requirements import with_radii
+from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 

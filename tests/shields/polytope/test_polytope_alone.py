@@ -11,9 +11,9 @@ from shields import Certificate, Infeasible, VectorSafetyShield, synthesize
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.network_requirements import with_radii
 from shields.synthesis.polytope_certificates import certify_polytope
 from shields.synthesis.polytope_gain import most_tolerant_gain, polytope_margin
+from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
 from tests.plants import named, servo
 from tests.verdicts import verified

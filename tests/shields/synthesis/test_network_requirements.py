@@ -12,7 +12,8 @@ from ncs_gym import Channel, ChannelContract, LinearPlant, contract_of
 from ncs_gym.processes.gym_pendulum import pendulum
 from shields import Infeasible, Network, requirements, synthesize, verify
 from shields.synthesis.certification import carried_over, nearby_certificate
-from shields.synthesis.network_requirements import BoundarySearch, kind_of_share, with_radii
+from shields.synthesis.network_requirements import kind_of_share
+from shields.synthesis.requirement_search import BoundarySearch, with_radii
 
 SERVO = (([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]), 0.01)
 BOUNDS = {
