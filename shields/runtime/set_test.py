@@ -17,7 +17,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
 from ncs_gym.validation import frozen, own_error_state, read_only
 from shields.certificate import Certificate, CertificateError
-from shields.runtime.projection import closest_admissible, closest_between, closest_on_line
+from shields.runtime.projection import closest_admissible, closest_between, closest_in_interval, closest_on_line
 from shields.verification import ACTION_ROUNDING
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
@@ -103,6 +103,8 @@ class SetTest:
         self.middle = read_only(0.5 * (low + high))
         self.half = read_only(0.5 * (high - low) - self.rounding * np.abs(self.middle))
         self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
+        self._limited_rows = read_only(np.concatenate([self.input_rows[self.cone :], np.eye(plant.m)]))
+        self._input_range = read_only(plant.input_middle[:, None]), read_only(plant.input_half[:, None])
         size = np.abs(self.root)
         sizes = np.concatenate([size @ np.abs(plant.A), np.abs(within.state)])
         pushes = np.concatenate([size @ np.abs(plant.B), np.abs(within.input)])
@@ -186,7 +188,7 @@ class SetTest:
         least = np.inf
         if len(self.disturbed):
             left = errors.row_limits - rounding - np.abs(center[self.cone :] - self.middle)
-            least = float(np.minimum.reduce(left))
+            least = left.item(left.argmin())  # NaN if one is, as min() would say, in half the time
         if not self.cone:
             return least, least
         center = center[: self.cone]
@@ -203,9 +205,10 @@ class SetTest:
             form = (float(pushed.dot(pushed)), float(pushed.dot(offset)), float(offset.dot(offset)))
             u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0][1])
         if len(self.disturbed):
-            limits = (errors.row_limits - rounding)[:, None] - margin
-            offset = (center[self.cone :] - self.middle)[:, None]
-            u = self.closest_on_rows(np.array([[u]]), offset, limits).item()
+            ((middle, half),) = self.plant.input_scales
+            offset = [*(center[self.cone :] - self.middle).tolist(), -middle]
+            limits = [*(errors.row_limits - rounding - margin).tolist(), half]
+            u = closest_in_interval(u, offset, self._limited_rows[:, 0].tolist(), limits)
         return u
 
     def closest_on_rows(self, inputs: np.ndarray, offset: np.ndarray, row_limits: np.ndarray) -> np.ndarray:
@@ -213,11 +216,10 @@ class SetTest:
 
         The offset is that from the middle.
         """
-        middle, half = self.plant.input_middle[:, None], self.plant.input_half[:, None]
-        rows = np.concatenate([self.input_rows[self.cone :], np.eye(len(half))])
-        offset = np.concatenate([offset, np.broadcast_to(-middle, inputs.shape)])
-        bounds = np.concatenate([row_limits, np.broadcast_to(half, inputs.shape)])
-        return closest_between(inputs, offset, rows, bounds)
+        count, (middle, half) = inputs.shape[1], self._input_range
+        offset = np.concatenate([offset, np.repeat(-middle, count, axis=1)])
+        bounds = np.concatenate([row_limits, np.repeat(half, count, axis=1)])
+        return closest_between(inputs, offset, self._limited_rows, bounds)
 
     @own_error_state
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:

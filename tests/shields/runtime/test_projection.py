@@ -260,3 +260,22 @@ def test_out_of_reach_is_none():
     assert closest_on_line(0.0, 1.0, -5.0, 25.0, 1.0, 1.0) is None  # beyond the limit
     assert closest_on_line(0.0, 0.0, 0.0, 25.0, 1.0, 1.0) is None  # the input moves nothing
     assert closest_on_line(0.3, 0.0, 0.0, 0.5, 1.0, 1.0) == 0.3
+
+
+def test_closest_points_of_one_input_are_the_same_in_numbers_as_in_arrays():
+    """Bit for bit, also of rows that no input moves, limits that leave nothing, and NaN."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(2000):
+        rows = rng.integers(1, 6)
+        effect = rng.standard_normal(rows) * rng.choice(
+            [0.0, 5e-324, 1e-3, 1.0, 1e3], rows, p=[0.1, 0.05, 0.25, 0.3, 0.3]
+        )
+        offset, limits = 0.5 * rng.standard_normal(rows), rng.uniform(-0.1, 2.0, rows)
+        limits[rng.random(rows) < 0.02], offset[rng.random(rows) < 0.02] = np.nan, np.nan
+        effect, offset, limits = np.append(effect, 1.0), np.append(offset, 0.1), np.append(limits, 1.5)  # of the input
+        wanted = rng.uniform(-1.5, 1.5)
+        many = projection.closest_between(np.array([[wanted]]), offset[:, None], effect[:, None], limits[:, None])
+        alone = projection.closest_in_interval(wanted, offset.tolist(), effect.tolist(), limits.tolist())
+        np.testing.assert_array_equal(alone, many.item())
+        found.append(alone == wanted)
+    assert 200 < sum(found) < 1800
