@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -118,7 +119,7 @@ class BallDisturbance(Disturbance):
         count = None if nominal_next.ndim == 1 else nominal_next.shape[1]
         d = np.zeros(nominal_next.shape)
         if plant.gamma > 0.0:
-            d = np.sqrt(plant.gamma) * Ellipsoid(np.eye(plant.n)).sample(rng, count).T
+            d = np.sqrt(plant.gamma) * _unit_ball(plant.n).sample(rng, count).T
         bound = _declared(plant)
         return d if bound is None else d + bound.sample(rng, count).T
 
@@ -202,7 +203,7 @@ class SinusoidDisturbance(Disturbance):
         object.__setattr__(self, "period", as_number(self.period, "period", low=0.0, low_open=True))
 
     def begin(self, rng, plant, size=None):  # noqa: D102
-        axes = np.sqrt(plant.gamma) * Ellipsoid(np.eye(plant.n)).sample_boundary(rng, size)
+        axes = np.sqrt(plant.gamma) * _unit_ball(plant.n).sample_boundary(rng, size)
         bound = _declared(plant)
         if bound is not None:
             axes = axes + bound.sample_boundary(rng, size)
@@ -211,6 +212,11 @@ class SinusoidDisturbance(Disturbance):
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         axis, phase = memory[:-1], memory[-1]
         return axis * np.sin(2.0 * np.pi * step / self.period + phase)
+
+
+@cache
+def _unit_ball(dim: int) -> Ellipsoid:
+    return Ellipsoid(np.eye(dim))
 
 
 def _declared(plant: LinearPlant) -> Ellipsoid | None:
