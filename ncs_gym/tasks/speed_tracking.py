@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class SpeedTracking(Task):
         return self.fastest * rng.random((2,) if size is None else (2, size))
 
     def advance(self, rng, plant, task_state, u):  # noqa: D102
-        speed, target = task_state
+        speed, target = _entries(task_state)
         # One draw decides whether the target changes, and where to: below p, chance / p is uniform.
         chance, p = rng.random(task_state.shape[1:] or None), self.change_probability
         drawn = chance * (self.fastest / p if p > 0.0 else 0.0)
@@ -71,7 +71,7 @@ class SpeedTracking(Task):
         return np.array([self.fastest + horizon * plant.dt * plant.largest_input[self.input_index]])
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
-        speed, target = task_state
+        speed, target = _entries(task_state)
         error, effort = abs(target - speed), u[self.input_index]
         return -self.error_weight * np.minimum(error / 5.0, 5.0) - self.input_weight * effort * effort
 
@@ -79,3 +79,8 @@ class SpeedTracking(Task):
         if self.input_index >= plant.m:
             return f"input_index must be < {plant.m}, got {self.input_index}"
         return ""
+
+
+def _entries(task_state: np.ndarray) -> Any:
+    """Returns speed and target: numbers of one vehicle, which are added in a third of the time, arrays (N,) of many."""
+    return task_state.tolist() if task_state.ndim == 1 else task_state
