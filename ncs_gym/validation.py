@@ -181,7 +181,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 def frozen(array: np.ndarray) -> np.ndarray:
     """Returns the array itself, which nobody may write to any more."""
-    array.flags.writeable = False
+    array.setflags(write=False)
     return array
 
 

@@ -328,9 +328,10 @@ class ArrivalHistories:
 
     def predicted(self, statistics: int, steps: int) -> int:
         """Returns the number of what some steps without a sample make of statistics, by their number."""
-        with self._lock:
-            for _ in range(steps):
-                statistics = self.table.after_step(statistics)
+        if steps:
+            with self._lock:
+                for _ in range(steps):
+                    statistics = self.table.after_step(statistics)
         return statistics
 
     def predicted_many(self, statistics: np.ndarray, steps: int) -> np.ndarray:

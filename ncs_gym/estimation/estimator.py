@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -199,7 +200,7 @@ class Estimator(CopiedWhole):
         return self._histories.table
 
     def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.
+        """Returns estimate, (n,), and error shape, (n, n), after the next steps, given their inputs, (m,); read-only.
 
         It is what `advance` makes of the present estimate with these inputs and without packets: the error then lies in
         that ellipsoid, whatever packets arrive later.
@@ -211,7 +212,7 @@ class Estimator(CopiedWhole):
         """Returns what `predicted` does, the number of the error shape in `table` in place of the shape itself."""
         mean = self.mean
         for u in inputs:
-            mean = self._predicted(mean, u)
+            mean = frozen(self._predicted(mean, u))
         histories = self._histories
         return mean, histories.predicted(histories.present.item(self._history), len(inputs))
 
@@ -223,7 +224,7 @@ class Estimator(CopiedWhole):
         after = self._histories.after_arrival(history, age)
         if after == history:
             return history
-        if not np.isfinite(packet.measurement).all():
+        if not all(map(isfinite, packet.measurement.tolist())):
             self.alarm = self.damaged = True  # no sensor within the assumptions sends this
             return history
         self._samples[age] = packet.measurement
