@@ -452,17 +452,13 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         constraints = Constraints(values, worst, cost, self._violations)
         estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         estimate, number = estimator.numbered(self._pending)
-        applied, committed, table = inputs.applied.copy(), inputs.committed.copy(), estimator.table
-        for array in (estimate, applied, committed):
-            array.setflags(write=False)
+        (applied, committed, missing), table = inputs, estimator.table
         age, damaged = estimator.age, estimator.damaged
-        self._known = Known(
-            estimate, table.shape(number), age, alarm, damaged, applied, committed, table=table, number=number
-        )
+        self._known = Known(estimate, table.shape(number), age, alarm, damaged, applied, committed, table, number)
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
-        happened = estimator.mean, self._state, inputs.missing, arrived
+        happened = estimator.mean, self._state, missing, arrived
         told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant, read)
         return loop_info(self._known, *happened, self._contract, *told)
 

@@ -10,6 +10,9 @@ from ncs_gym.estimation.arrival_histories import ErrorTable
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.requests import Requested
 
+# What is a number in the info of one environment, and of many an array that the environments go on using.
+SHARED = "measurement_age", "assumption_violated", "downlink_broken", "requested", "request_forced", "packets"
+
 
 class Known(NamedTuple):
     """What is known where decisions are made, of now; of N environments, arrays whose last axis is the environment.
@@ -83,12 +86,7 @@ def loop_info(
         actions: Those that stand for the inputs applied and committed, fresh arrays of shape (m,) or (N, m).
     """
     values, worst, cost, violations = constraints
-    many, oldest = state.ndim > 1, np.inf if contract is None else contract.max_age
-
-    def own(value: Any) -> Any:
-        return np.array(value) if many else value
-
-    return {
+    info = {
         "state": state.copy().T,
         "estimate": known.estimate.copy().T,
         "estimation_error": (mean - state).T,
@@ -100,15 +98,19 @@ def loop_info(
         "constraint_values": values.T,
         "worst_constraint_values": worst.copy().T,
         "cost": cost,
-        "measurement_age": own(known.age),
+        "measurement_age": known.age,
         "packet_arrived": arrived,
-        "assumption_violated": own(known.alarm),
+        "assumption_violated": known.alarm,
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
-        "contract_broken": known.age > oldest,
-        "downlink_broken": own(missing),
-        "requested": own(sampled.requested),
-        "request_forced": own(sampled.forced),
-        "packets": own(sampled.packets),
-        **({key: value.copy() for key, value in network.items()} if many else network),
+        "contract_broken": known.age > (np.inf if contract is None else contract.max_age),
+        "downlink_broken": missing,
+        "requested": sampled.requested,
+        "request_forced": sampled.forced,
+        "packets": sampled.packets,
+        **network,
     }
+    if state.ndim > 1:
+        for key in (*SHARED, *network):
+            info[key] = info[key].copy()
+    return info

@@ -164,7 +164,7 @@ class Observer:
         Raises:
             ValueError: If the task has another number of entries than it has bounds.
         """
-        entries = np.concatenate([known.estimate, own, *(self._observed(known, name) for name in self._observe)])
+        entries = np.concatenate([known.estimate, own, *[self._observed(known, name) for name in self._observe]])
         if len(entries) != len(self._low):
             bounds = len(self._low) - len(entries) + len(own)
             raise ValueError(

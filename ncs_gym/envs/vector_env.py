@@ -221,7 +221,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         u = read_actions(self._plant, actions, self.num_envs)[1]
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
-        some_done = bool(self._done.any())
+        some_done = np.count_nonzero(self._done) > 0
         if some_done and self._autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent, self._ended = False, None
@@ -232,7 +232,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         restarted = self._done.copy() if some_done else None
         if restarted is not None:  # NEXT_STEP: the last step ended these episodes
             self._begin(restarted, None)
-            applied, committed = (np.where(restarted, 0.0, each) for each in (applied, committed))
+            applied, committed = (frozen(np.where(restarted, 0.0, each)) for each in (applied, committed))
             reward[restarted], arrived[restarted] = 0.0, False
             self._worst[:, restarted] = self._plant.values_at_start(self._state[:, restarted])
             inputs = Inputs(applied, committed, missing & ~restarted)
@@ -332,7 +332,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self.ticks += 1
         sends, samples = self._channel_state.send(rng, self.steps, requested), None
         self._packets = self._packets + sends
-        if sends.any():
+        if np.count_nonzero(sends):
             samples = self._channel_state.channel.quantize(self._process.measure(rng, self._state))
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
                 damaged = np.asarray(~np.isfinite(samples).all(axis=0))
@@ -341,7 +341,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
                 estimator.alarm |= estimator.damaged
                 samples[:, damaged] = 0.0  # times a gain of zero it is to be nothing
         arrivals = self._channel_state.arrivals()
-        estimator.advance(u.copy(), samples, arrivals)
+        estimator.advance(u, samples, arrivals)
         arrived = np.zeros(self.num_envs, np.bool_)
         for _, arrives in arrivals:
             arrived |= arrives
@@ -439,17 +439,16 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         table = self._estimator.histories.table
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        age, damaged, applied, committed = (
-            each.copy() for each in (self._estimator.age, self._estimator.damaged, inputs.applied, inputs.committed)
-        )
+        age, damaged = self._estimator.age.copy(), self._estimator.damaged.copy()
+        applied, committed, missing = inputs
         shapes = table.shapes.take(numbers, axis=0)
-        for array in (estimates, shapes, age, alarm, damaged, applied, committed, numbers):
+        for array in (estimates, shapes, age, alarm, damaged, numbers):
             array.setflags(write=False)
-        self._known = Known(estimates, shapes, age, alarm, damaged, applied, committed, table=table, number=numbers)
+        self._known = Known(estimates, shapes, age, alarm, damaged, applied, committed, table, numbers)
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
-        happened = self._estimator.mean, self._state, inputs.missing, arrived
+        happened = self._estimator.mean, self._state, missing, arrived
         sampled = Requested(asked, forced, self._packets)
         told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant)
         return loop_info(self._known, *happened, self._contract, *told)

@@ -17,7 +17,7 @@ import numpy as np
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
-from ncs_gym.validation import CopiedWhole, as_count, as_flag, as_numbers, read_only, shown, warn_caller
+from ncs_gym.validation import CopiedWhole, as_count, as_flag, as_numbers, frozen, read_only, shown, warn_caller
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
@@ -397,7 +397,7 @@ class AppliedInputs:
 
 
 class Inputs(NamedTuple):
-    """The inputs of one step; of many environments, arrays whose last axis is the environment.
+    """The inputs of one step, read-only; of many environments, arrays whose last axis is the environment.
 
     Attributes:
         applied: What the actuator applies now, shape (m,) or (m, N) [physical units].
@@ -412,9 +412,8 @@ class Inputs(NamedTuple):
 
 def no_inputs(inputs: int, size: int | None = None) -> Inputs:
     """Returns the inputs at a reset: zeros, shape (m,), or (m, N) for a size."""
-    if size is None:
-        return Inputs(np.zeros(inputs), np.zeros(inputs), False)
-    return Inputs(np.zeros((inputs, size)), np.zeros((inputs, size)), np.zeros(size, np.bool_))
+    nothing = read_only(np.zeros(inputs if size is None else (inputs, size)))
+    return Inputs(nothing, nothing, False if size is None else np.zeros(size, np.bool_))
 
 
 class DownlinkState:
@@ -444,14 +443,15 @@ class DownlinkState:
             self.committed.start()
 
     def exchange(self, rng: np.random.Generator, step: int, u: np.ndarray) -> Inputs:
-        """Takes the input decided at a step, shape (m,), and returns what is applied then."""
+        """Takes the input decided at a step, shape (m,), which nobody writes to then, and returns what is applied."""
+        frozen(u)
         if self._channel is None:
             return Inputs(u, u, False)
         self.committed.commit(u)
         arrived: list[Command] = self.in_flight.carry(rng, step, self.committed.command(step, self._episode))
         self._actuator.receive(arrived)
         self.committed.pop()
-        return Inputs(self._actuator.apply(step), u, self._actuator.missing)
+        return Inputs(frozen(self._actuator.apply(step)), u, self._actuator.missing)
 
 
 class VectorDownlinkState:
@@ -493,7 +493,8 @@ class VectorDownlinkState:
         self.committed.start(chosen)
 
     def exchange(self, rng: np.random.Generator, steps: np.ndarray, u: np.ndarray) -> Inputs:
-        """Takes the inputs decided at steps (N,) of the episodes, shape (m, N), and returns what is applied then."""
+        """Does what `DownlinkState` does, at steps (N,) of the episodes, with inputs of shape (m, N)."""
+        frozen(u)
         if self._channel is None:
             return Inputs(u, u, self._on_time)
         scheduled = self.committed.due(u)
@@ -501,4 +502,4 @@ class VectorDownlinkState:
         for age, arrives in self._channel_state.arrivals():
             self._newest = np.where(arrives, np.maximum(self._newest, steps - age), self._newest)
         missing = (self._newest < steps - self._input_delay) & (steps >= self._input_delay)
-        return Inputs(np.where(missing, 0.0, scheduled), u, missing)
+        return Inputs(frozen(np.where(missing, 0.0, scheduled)), u, missing)
