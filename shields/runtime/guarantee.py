@@ -235,7 +235,7 @@ class GuaranteeMonitor:
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
         if alarm is not False or damaged is not False:
             broken = _first(_first(broken, damaged, NOT_FINITE), alarm, ALARM)
-        if not np.logical_and.reduce(within, axis=None):
+        if np.count_nonzero(within) < within.size:  # quicker than all()
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
             broken = _first(_first(broken, _not(usable), UNUSABLE), _not(near), FAR_OUT)

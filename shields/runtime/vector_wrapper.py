@@ -167,7 +167,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
-        if np.count_nonzero(restarted):
+        some_restarted = np.count_nonzero(restarted) > 0
+        if some_restarted:
             self._look_at({*self._inner.episode_channels})
         known = self._inner.known
         self._report = self._observed(known)
@@ -178,7 +179,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         added, charged, self._stored = {}, decided.intervened, decided.plan.copy()
         if len(self._stored):  # what is stored was certified for the states that follow
             self._stored[..., ~(moved_once & same_input & on_time)] = np.nan
-        if np.count_nonzero(restarted):
+        if some_restarted:
             charged = charged & ~restarted
             if (ended := self._inner.ended) is not None:  # SAME_STEP: the step ended episodes before it began the next
                 final = info.get("final_info", {})
@@ -189,12 +190,13 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
             self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
             decided.margin[restarted] = self._idle_margins(np.flatnonzero(restarted))
+            self._proved = np.where(restarted, 0, self._proved)
         self._clock = now
         if self.penalty:
             rewards = rewards - self.penalty * charged
         decided = decided._replace(plan=self._stored)
         own = self._info(decided, proposed, self._state, self._interventions, self._report.age)
-        self._proved = np.where(restarted, 0, self._proved) + own["shield_guaranteed"]
+        self._proved = self._proved + own["shield_guaranteed"]
         info = info | added | own | {"episode_guaranteed": self._proved / (now.steps + 1)}
         self._lost.tell()
         return observation, rewards, terminated, truncated, info
