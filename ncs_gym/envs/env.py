@@ -336,11 +336,12 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         worst = self._plant.worst_constraint_values(before, u, self._state)
         info = self._info(inputs, worst, arrived=bool(packets), read=read)
         terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
-        self._consistent, self._over = True, terminated or self._process.truncated
+        truncated = self._process.truncated
+        self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
             sent = sent_at(self.steps, self._channel_state, packets)
             self.renderer.record(info, self._task_state, sent)
-        return self._observation(), reward, terminated, self._process.truncated, info
+        return self._observation(), reward, terminated, truncated, info
 
     def request(self, asked: bool = True) -> None:
         """Asks for a sample in the next step, where the channel takes samples on request (docs/requests.md).

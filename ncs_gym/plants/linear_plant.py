@@ -729,7 +729,6 @@ class LinearPlant(ReadOnlyArrays):
         low, high = self.mixed_ends if values.ndim == 1 else self.mixed_ends[:, :, None]
         return np.maximum(values - high, low - values)
 
-    @again_if_interrupted
     def values_at_start(self, state: np.ndarray) -> np.ndarray:
         """Returns `worst_constraint_values` where no step has been: those of a state at which the operating input acts.
 
@@ -745,7 +744,6 @@ class LinearPlant(ReadOnlyArrays):
         rows = self.grid_rows
         return None if rows is None else between_samples.GridValues(rows, (self.box, self.box_ends), self.A, self.B)
 
-    @again_if_interrupted
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
         """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
 
