@@ -52,7 +52,7 @@ class MonitorState(NamedTuple):
         inside: Whether x in S is proved, up to what broke; in mode "lookahead" also if x is proved in the box and the
             inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
-        wait: Number of steps until x in S is proved at present, if all that follows is (`steps_until_proved`). Behind a
+        wait: Number of steps until x in S is proved at present, if all that follows is (`longer_wait`). Behind a
             downlink `inside` is about the time at which the next input takes effect. 0 where neither that nor ways
             between samples count.
     """
@@ -131,7 +131,7 @@ class GuaranteeMonitor:
         """
         broken = _first(unmoved * 0, _not(unmoved), OTHER_STEPS)
         state = self._observe(self._within_limits(broken, report), known_inside, report, 0)
-        return state if is_first else state._replace(wait=steps_until_proved(state.wait, not self._within_step, 0))
+        return state if is_first else state._replace(wait=longer_wait(state.wait, not self._within_step, 0))
 
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
@@ -144,9 +144,9 @@ class GuaranteeMonitor:
             seen = self._observe(self._within_limits(broken, report), inside, report, 0)
             broken = seen.broken
             if self._within_step:  # what is not proved of x_j is not of the way to x_{j+1}
-                wait = steps_until_proved(wait, inside & seen.inside, ahead + 1)
+                wait = longer_wait(wait, inside & seen.inside, ahead + 1)
             else:
-                wait = steps_until_proved(wait, seen.inside, ahead)
+                wait = longer_wait(wait, seen.inside, ahead)
         return state._replace(broken=broken, wait=wait)
 
     def advance(
@@ -244,11 +244,11 @@ class GuaranteeMonitor:
             if self._is_local:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
         if self._input_delay or self._within_step:
-            wait = steps_until_proved(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
+            wait = longer_wait(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
         return MonitorState(broken, inside, errors.certified, wait)
 
 
-def steps_until_proved(wait: Any, proved: Any, ahead: int) -> Any:
+def longer_wait(wait: Any, proved: Any, ahead: int) -> Any:
     """Returns after how many steps x is proved at present: at least `wait`, of single loops or arrays of many.
 
     At step k that takes x_k .. x_{k+c} and the ways that lead to them (docs/shield_proof.md, "Who proves what"). Where

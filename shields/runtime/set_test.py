@@ -144,18 +144,18 @@ class SetTest:
         if self.cone:
             weighting, radius = ball(center, self.D, symmetric, spread, self.pushed, self.rounding)
             own = _eigh(self.root @ symmetric @ self.root.T)[0][:, -1] + own_rounding
-            error_reach = np.sqrt(np.maximum(own, 0.0))[None]
+            own = np.sqrt(np.maximum(own, 0.0))[None]
         else:
             weighting, radius = np.empty((len(shapes), 0, 0)), row_limits.min(axis=0)
-            error_reach = supports(self.root, symmetric, own_rounding[:, None]).T
-        usable &= np.isfinite(radius) & np.isfinite(row_limits).all(axis=0) & np.isfinite(error_reach).all(axis=0)
+            own = supports(self.root, symmetric, own_rounding[:, None]).T
+        usable &= np.isfinite(radius) & np.isfinite(row_limits).all(axis=0) & np.isfinite(own).all(axis=0)
         unusable = np.where(usable, 0.0, np.nan)
         return PredictedErrors(
             weighting=np.ascontiguousarray(np.where(usable[:, None, None], weighting, 0.0).transpose(1, 2, 0)),
             row_limits=np.ascontiguousarray(row_limits + unusable),
             radius=radius + unusable,
             half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
-            error_reach=np.ascontiguousarray(error_reach + unusable),
+            own=np.ascontiguousarray(own + unusable),
             certified=inside & usable,
             shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
         )
@@ -230,11 +230,11 @@ class SetTest:
         """
         values = self.root.dot(estimates)
         if self.cone:
-            left = 1.0 - (norms(values) + errors.error_reach[0])
+            left = 1.0 - (norms(values) + errors.own[0])
         else:
             of_one = (len(values), *[1] * (values.ndim - 1))
             middle, half = self.middle[: len(values)].reshape(of_one), self.half[: len(values)].reshape(of_one)
-            left = (half - (np.abs(values - middle) + errors.error_reach)).min(axis=0)
+            left = (half - (np.abs(values - middle) + errors.own)).min(axis=0)
         return left >= margin + self.rounding * self.own_columns.dot(np.abs(estimates))
 
     @own_error_state
@@ -359,7 +359,7 @@ class PredictedErrors(NamedTuple):
     """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
 
     The norm of S is weighted, rows are judged one by one; what a test does not need has no entries. Radius,
-    half_widths, error_reach and row_limits are NaN for an unusable shape.
+    half_widths, own and row_limits are NaN for an unusable shape.
 
     Attributes:
         weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
@@ -367,7 +367,7 @@ class PredictedErrors(NamedTuple):
             depend on the estimate, for rows g, shape (r, k).
         radius: 1 - h less that rounding; without a cone the least row limit, shape (k,).
         half_widths: Largest error of each state, shape (n, k).
-        error_reach: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope
+        own: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope
             sqrt(g Sigma_k g'), shape (r, k).
         certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
         shape: Sigma_k itself, shape (n, n, k); the filter keeps it in mode "lookahead" alone, else (0, n, k).
@@ -377,7 +377,7 @@ class PredictedErrors(NamedTuple):
     row_limits: np.ndarray
     radius: Any
     half_widths: np.ndarray
-    error_reach: np.ndarray
+    own: np.ndarray
     certified: Any
     shape: np.ndarray
 

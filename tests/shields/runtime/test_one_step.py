@@ -220,7 +220,7 @@ def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
     errors = test.predicted(np.array([good, *bad, good]), certificate.error_shapes)
     np.testing.assert_array_equal(np.isfinite(errors.radius), [True, *[False] * 5, True])
     np.testing.assert_array_equal(errors.certified, [True, *[False] * 5, True])
-    assert np.isnan(errors.error_reach[0, 1:-1]).all()
+    assert np.isnan(errors.own[0, 1:-1]).all()
     assert np.isnan(errors.half_widths[:, 1:-1]).all()
     alone = test.predicted(good[None], certificate.error_shapes)
     for array, one in zip(errors, alone, strict=True):
