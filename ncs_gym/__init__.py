@@ -8,9 +8,9 @@ from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.installation import warn_of_overwritten_packages
+from ncs_gym.network.actuator import Actuator, Command, Echo
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
-from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
