@@ -17,7 +17,7 @@ from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.certificate_text import counted, labeled
 from shields.polytope import Polytope
-from shields.runtime.set_test import rows_within_step
+from shields.runtime.rows_within_step import rows_within_step
 from shields.synthesis.faces import Extremes, Faces
 from shields.verification import ACTION_ROUNDING, require_valid
 

@@ -21,7 +21,7 @@ from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
 from ncs_gym.plants.lqr import lqr_gain
-from shields.runtime.set_test import rows_within_step
+from shields.runtime.rows_within_step import rows_within_step
 
 # Its types are not declared.
 _clarabel: Any = clarabel

@@ -15,8 +15,9 @@ from ncs_gym.validation import AroundEnvironment
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
+from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.set_test import certificate_test, rows_within_step
+from shields.runtime.set_test import certificate_test
 from shields.verification import require_valid
 
 # Margins that filters and governors are given, of the safe set and the box, in percent.

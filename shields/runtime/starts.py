@@ -16,8 +16,9 @@ from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
+from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
-from shields.runtime.set_test import PredictedErrors, rows_within_step
+from shields.runtime.set_test import PredictedErrors
 from shields.verification.rational_matrix import (
     is_positive_semidefinite,
     multiply,

@@ -16,7 +16,8 @@ from shields import Certificate, Infeasible, SafeLoop, SafetyFilter, synthesize,
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
-from shields.runtime.set_test import ellipsoid_test, rows_within_step
+from shields.runtime.rows_within_step import rows_within_step
+from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
 from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought

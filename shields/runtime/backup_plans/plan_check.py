@@ -12,16 +12,8 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import own_error_state, read_only
-from shields.runtime.set_test import (
-    SMALLEST_RADIUS,
-    RowsWithinStep,
-    SetTest,
-    ball,
-    closed,
-    judged_shapes,
-    rows_within_step,
-    supports,
-)
+from shields.runtime.rows_within_step import RowsWithinStep, closed, rows_within_step, supports
+from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, judged_shapes
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
