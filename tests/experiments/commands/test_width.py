@@ -130,7 +130,7 @@ class Shown:
         return printed("channel", self.folder / "packets.csv", "--env", "ncs_gym/CartPole-v0")
 
     def requirements(self):
-        asked = ("--send-periods", 1, 2, "--losses", *range(20), "--input-delays", 0, 1, "--jobs", 1)
+        asked = ("--send-periods", 1, 2, "--losses", *range(12), "--input-delays", 0, 1, "--jobs", 1)
         return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r")
 
     def attack(self):

@@ -115,17 +115,14 @@ def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, c
             assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
 
 
-@pytest.mark.cases(len(CASES))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [name for name in CASES if name not in WITH_REMAINDER])
-def test_the_box_is_kept_for_the_promised_steps_whatever_the_network_does(name):
-    counts, closest = Counter(), 0.0
-    for seed in range(2):
-        outcome = attacked(name, SILENCE, LOOP, seed, seed, has_outages=True)
-        assert not {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0 and claim != AGE}
-        closest, counts = max(closest, outcome.largest[KEPT]), counts + outcome.counts
-    assert counts["kept"] > 0.1 * counts["steps"]
-    assert case(name).contract is None or counts["kept though not guaranteed"] > 0
-    assert closest > 0.3
+def test_the_box_is_kept_for_the_promised_steps_whatever_the_network_does(name, seed):
+    outcome = attacked(name, SILENCE, LOOP, seed, seed, has_outages=True)
+    assert not {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0 and claim != AGE}
+    assert outcome.counts["kept"] > 0.1 * outcome.counts["steps"]
+    assert case(name).contract is None or outcome.counts["kept though not guaranteed"] > 0
+    assert outcome.largest[KEPT] > 0.3
     assert outcome.largest[FALL] == 1.0
 
 
