@@ -9,6 +9,8 @@ TORCH_INDEX ?=
 # Instructions of processors that numpy chooses when it starts.
 WIDE := AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3
 PACKAGES := ncs_gym shields agents experiments
+# Modules are compiled once, not in every process that tests start.
+export PYTHONDONTWRITEBYTECODE :=
 INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
 AUDIT_INSTALLED := $(VENV)/.installed-audit

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,7 @@ def nav_files(entry):
     return [file for each in (entry.values() if isinstance(entry, dict) else entry) for file in nav_files(each)]
 
 
+@cache
 def exceptions():
     """Module and name of every exception class that the packages define."""
     found = []
