@@ -25,6 +25,7 @@ from experiments.settings import (
 from experiments.settings.certificates import AttackSettings, LoopSettings
 from experiments.study.study import quoted
 from ncs_gym import Channel, ChannelContract
+from tests.certificates import feasible_bounds_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
@@ -208,7 +209,8 @@ def test_calls_are_refused(call, words):
 
 @pytest.mark.parametrize(("line", "words"), USAGE)
 def test_usage_errors_are_the_parsers(line, words):
-    run = ncs(*line.split(), COLUMNS="200")
+    with feasible_bounds_not_sought():
+        run = ncs(*line.split(), COLUMNS="200")
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
     assert words in " ".join(run.stderr.replace("│", " ").split())

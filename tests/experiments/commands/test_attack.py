@@ -285,7 +285,7 @@ def test_a_smoke_run_attacks_the_environments_own_channels_unless_others_are_ask
 
 
 def test_a_smoke_run_says_what_it_is(tmp_path, small, capsys, without_workers):
-    attack(settings(tmp_path, smoke=True))
+    attack(settings(tmp_path, smoke=True, envs=250))
     assert "attacks too little to show anything else" in " ".join(capsys.readouterr().out.split())
     assert document(tmp_path)["total"]["steps"] <= 1e5
 

@@ -68,7 +68,7 @@ def safety(page):
     return {row[0]: row[1:] for row in Reader(page).tables["Violations and interventions of each arm"]}
 
 
-@pytest.mark.parametrize("report", [partial(comparison, figures={"a": ("A. B.", PNG)}), swept], ids=["compared", "swept"])
+@pytest.mark.parametrize("report", [partial(comparison, figures={"a": ("A. B.", PNG)}), swept])
 def test_page_is_well_formed_and_needs_nothing_from_elsewhere(report):
     page = report(*ALL_ARMS)
     reader = Reader(page)
