@@ -153,7 +153,7 @@ def test_recordings_of_an_earlier_run_begin_no_episode_with_nobody(greetings_onl
         for data in next(of_each):
             line.repeat(data, line.at_controller)
 
-    assert line.run(5 * A_WHILE, repeat) == []
+    assert line.run(2 * A_WHILE, repeat) == []
 
 
 @pytest.mark.parametrize("present", ["sensor", "actuator"])
@@ -165,7 +165,7 @@ def test_recorded_greeting_of_the_other_node_begins_no_episode_and_the_plant_doe
     line.clock.start(line.now)
     getattr(line, f"add_{present}")()
     line.steps.clear()
-    assert line.run(5 * A_WHILE, lambda: line.repeat(greeting, line.at_controller)) == []
+    assert line.run(2 * A_WHILE, lambda: line.repeat(greeting, line.at_controller)) == []
     assert line.clock.step_at(line.now) < 0 or line.clock.episode == 0 or getattr(line, present).episode == 0
     assert all(step is None or step < 0 for step in line.steps)
 

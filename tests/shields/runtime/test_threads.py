@@ -207,7 +207,7 @@ def test_graphs_are_made_and_forgotten_by_threads_without_a_failure():
     plant = truck_trailer(mass=4000.0)
 
     def ask(number: int) -> list[int]:
-        asked = np.random.default_rng(number).integers(0, 2 * MAX_GRAPHS, 150)
+        asked = np.random.default_rng(number).integers(0, 2 * MAX_GRAPHS, 40)
         return [arrival_histories(plant, Channel(delay=int(d)), None).buffer - int(d) for d in asked]
 
     assert not np.any(at_once(ask))

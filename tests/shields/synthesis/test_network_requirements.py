@@ -93,7 +93,8 @@ def test_bits_are_enough_for_every_level_of_the_quantizer():
     assert exact.bits_per_second == pytest.approx(64 / 0.01)
 
 
-def test_cheapest_network_keeps_the_share_and_no_cheaper_one_does(found):
+def test_cheapest_network_keeps_the_share_and_no_cheaper_one_does():
+    found = requirements(servo(), send_periods=[1, 2], losses=[0, 1])
     cheapest = found.cheapest(0.9)
     assert cheapest is not None
     assert cheapest.share >= 0.9 * found.largest_share
