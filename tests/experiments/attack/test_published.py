@@ -11,26 +11,18 @@ from experiments.published.largest_share import largest_share
 from experiments.settings import AttackSettings
 from ncs_gym import LinearPlant
 from tests.certificates import certificate_of
-from tests.shields.polytope import test_mixed_limits, test_two_ends
+from tests.shields.polytope.limits import CONTRACT, PLANTS
 
 
-@pytest.mark.parametrize(
-    ("plant", "contract"),
-    [
-        (test_two_ends.ANGLE, test_two_ends.CONTRACT),
-        (test_mixed_limits.PLANTS["rates"], test_mixed_limits.CONTRACT),
-        (test_mixed_limits.PLANTS["coupled"], test_mixed_limits.CONTRACT),
-    ],
-    ids=["two ends", "rates", "both together"],
-)
-def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(plant, contract, tmp_path):
-    certificate = certificate_of(plant, contract, "polytope")
+@pytest.mark.parametrize("name", ["angle", "rates", "coupled"])
+def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name, tmp_path):
+    plant, certificate = PLANTS[name], certificate_of(PLANTS[name], CONTRACT, "polytope")
     counts = attack(plant, certificate, 50_000)
     assert counts.steps >= 50_000
     assert counts.exits == counts.violations == counts.unproved == counts.outside_starts == 0
     assert counts.interventions > 1_000
     plant.save(tmp_path / "plant.json")
-    settings = AttackSettings(plant=tmp_path / "plant.json", max_age=contract.max_age, envs=100, unshielded=True)
+    settings = AttackSettings(plant=tmp_path / "plant.json", max_age=CONTRACT.max_age, envs=100, unshielded=True)
     alone = MonteCarloBatch(settings, next(iter(cases_of(settings))), 0, certificate).execute(lambda count: None)
     assert alone.violations > 1_000
 

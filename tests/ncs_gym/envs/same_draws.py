@@ -157,7 +157,7 @@ def holding_gain(plant: LinearPlant) -> np.ndarray:
         return np.zeros((plant.m, plant.n))
     scale = np.diag(plant.half_widths)
     inverse = np.linalg.inv(scale)
-    return regulator_gain(inverse @ plant.A @ scale, inverse @ plant.B * plant.u_max, 1, 1) @ inverse
+    return regulator_gain(inverse @ plant.A @ scale, inverse @ plant.B * plant.input_half, 1, 1) @ inverse
 
 
 class LoopBeside:

@@ -1,74 +1,33 @@
-"""Limits of states and inputs together: rates, coupled inputs, outputs with feedthrough; proofs, attacks, decisions."""
+"""Limits of states and inputs together: rates, coupled inputs, outputs with feedthrough."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, LinearPlant, contract_of
-from shields import Infeasible, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize, verify
+from ncs_gym import Channel, Ellipsoid, LinearPlant, contract_of
+from shields import Infeasible, SafeLoop, SafetyShield, VectorSafetyShield, synthesize, verify
 from tests.certificates import certificate_of, feasible_bounds_not_sought
 from tests.second_verifier.verify import verify_again
-
-QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
-MODEL = ([[0.0, 1.0], [-0.5, -1.0]], [[0.0], [1.0]], np.eye(2), 0)
-ONE_INPUT = {"state_limits": ([-0.5, -0.5], [0.8, 0.6]), "input_limits": (-2.0, 1.0), "disturbance_bound": 0.003}
-TWO_INPUTS = {
-    "A": [[0.9, 0.1], [0.0, 0.95]],
-    "B": [[0.1, 0.02], [0.05, 0.2]],
-    "dt": 0.5,
-    "state_limits": ([0.0, 0.0], [10.0, 8.0]),
-    "input_limits": ([0.0, -1.0], [8.0, 4.0]),
-    "operating_state": [4.0, 4.0],
-    "operating_input": [3.0, 1.0],
-    "disturbance_bound": 0.02,
-} | QUIET
-PLANTS = {
-    "rates": LinearPlant.from_statespace(MODEL, 0.1, du_max=0.3, **ONE_INPUT, **QUIET),
-    "rates of a late input": LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, du_max=0.3, **ONE_INPUT, **QUIET),
-    # What passengers feel: the second row of the model itself, from -.6 to .4.
-    "feedthrough": LinearPlant.from_statespace(
-        MODEL, 0.1, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
-    ),
-    "coupled": LinearPlant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS),
-}
-CHANNEL = Channel(loss=0.3, max_consecutive_losses=1, send_period=2)
-CONTRACT = contract_of(CHANNEL)
-MODES = ["project", "switch", "boundary", "lookahead"]
+from tests.shields.polytope.limits import (
+    CHANNEL,
+    CONTRACT,
+    MIXED,
+    MODEL,
+    ONE_INPUT,
+    PLANTS,
+    QUIET,
+    TWO_INPUTS,
+    certificate,
+    mixed_values,
+)
 
 
-def certificate(name):
-    return certificate_of(PLANTS[name], CONTRACT, "polytope")
-
-
-def mixed_values(plant, states, inputs):
-    """How far the limits are passed, by the plant's rows alone: shape (count, q)."""
-    values = np.hstack([states, inputs]) @ plant.mixed_rows.T
-    low, high = plant.mixed_ends
-    return np.maximum(low - values, values - high)
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_both_engines_prove_it_with_the_same_margins(name):
-    plant, found = PLANTS[name], certificate(name)
-    ours, other = verify(found, plant), verify_again(found, plant)
-    assert ours.valid
-    assert other.valid
-    margins = {condition.name: condition.margin for condition in other.conditions}
-    shared = [condition for condition in ours.conditions if condition.name.startswith("(PM)")]
-    assert len(shared) == len(plant.mixed_rows) > 0
-    for condition in shared:
-        assert condition.margin == pytest.approx(margins[condition.name], rel=1e-9, abs=1e-12)
-    assert found.polytope is not None
-    assert not found.keeps_ellipsoid
-
-
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", MIXED)
 def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
     plant, found = PLANTS[name], certificate(name)
     P, K, n = found.polytope, found.K, plant.n
@@ -83,33 +42,6 @@ def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
             best = linprog(-sign * f, A_ub=A_ub, b_ub=b_ub, bounds=(None, None))
             assert best.status == 0
             assert -best.fun + sign * constant + reach <= end + 1e-9
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", PLANTS)
-def test_no_limit_is_passed_while_guaranteed(name, mode):
-    plant, found, count = PLANTS[name], certificate(name), 30
-    P, rng = found.polytope, np.random.default_rng(1)
-    names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "max_episode_steps": 70}
-    for disturbance in (AdversarialDisturbance(), AdversarialDisturbance(rows=P.rows), "sphere"):
-        env = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=count, disturbance=disturbance, noise="extreme", **names)
-        shield = VectorSafetyShield(env, found, mode)
-        starts = P.center + 0.9 * (P.sample_boundary(rng, count) - P.center)
-        _, info = shield.reset(seed=3, options={"state": starts})
-        assert info["shield_guaranteed"].all()
-        closest, intervened = -np.inf, 0
-        for k in range(60):
-            states = info["state"]
-            ends = np.sign(rng.uniform(-1.0, 1.0, (count, plant.m)))
-            actions = [ends, np.ones_like(ends), -np.ones_like(ends)][k // 20]
-            _, _, _, _, info = shield.step(actions.astype(np.float32))
-            assert info["shield_guaranteed"].all(), info["shield_reason"]
-            assert not info["cost"].any()
-            passed = mixed_values(plant, states, info["input"])
-            np.testing.assert_allclose(info["worst_constraint_values"][:, len(plant.box) :], passed, atol=1e-12)
-            closest, intervened = max(closest, passed.max()), intervened + info["shield_intervened"].sum()
-        assert (-0.05 if mode in ("project", "lookahead") else -0.5) < closest <= 0.0  # the limit is what binds
-        assert intervened > 0
 
 
 @pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
@@ -150,38 +82,7 @@ def test_unshielded_steps_beyond_a_limit_are_counted(name):
     assert counted > 5
 
 
-@pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
-def test_decision_is_that_of_a_conic_solver(name):
-    plant, found = PLANTS[name], certificate(name)
-    shield, P, rng = SafetyFilter(found, plant), found.polytope, np.random.default_rng(0)
-    shape, reasons = 0.5 * found.error_shapes[0], []
-    reach = Ellipsoid(shape).support(P.rows @ plant.A) + plant.disturbance.support(P.rows)
-    own = Ellipsoid(shape).support(plant.mixed_rows[:, : plant.n])
-    rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), plant.mixed_rows])
-    low = np.concatenate([P.low + reach, plant.mixed_ends[0] + own])
-    high = np.concatenate([P.high - reach, plant.mixed_ends[1] - own])
-    for _ in range(60):
-        estimate = P.center + (P.sample_boundary(rng, 1)[0] - P.center) * rng.uniform(0.3, 1.0)
-        proposed = rng.uniform(*plant.input_ends)
-        decision = shield.decide(estimate, shape, proposed)
-        values = rows @ np.concatenate([estimate, proposed])
-        left = min((values - low).min(), (high - values).min())
-        if abs(left) > 1e-7:
-            assert (decision.reason == "safe") == (left > 0.0)
-        reasons.append(decision.reason)
-        if decision.reason != "projected":
-            continue
-        u = cp.Variable(plant.m)
-        c = rows[:, : plant.n] @ estimate + rows[:, plant.n :] @ u
-        finite = np.isfinite(high), np.isfinite(low)
-        kept = [c[finite[0]] <= high[finite[0]], c[finite[1]] >= low[finite[1]]]
-        limits = [u <= plant.input_high, u >= plant.input_low]
-        cp.Problem(cp.Minimize(cp.sum_squares(u - proposed)), kept + limits).solve(solver=cp.CLARABEL)
-        np.testing.assert_allclose(decision.input, u.value, atol=1e-5 * plant.input_half.max())
-    assert {"safe", "projected"} <= set(reasons)
-
-
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", MIXED)
 def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name):
     plant, found = PLANTS[name], certificate(name)
     closer = replace(plant, mixed_ends=0.3 * plant.mixed_ends)
@@ -285,7 +186,7 @@ def test_loop_without_gymnasium_knows_the_limit():
 
 
 def test_file_and_fingerprint_hold_the_limits(tmp_path):
-    for name, plant in PLANTS.items():
+    for name, plant in MIXED.items():
         plant.save(tmp_path / "plant.json")
         again = LinearPlant.load(tmp_path / "plant.json")
         assert again.fingerprint == plant.fingerprint, name

@@ -1,14 +1,12 @@
-"""Limits with two ends: certificates around a resting point, decisions by a conic solver, and attacks in every mode."""
+"""Limits with two ends: certificates around a resting point, what changes of them are refused, and what plants say."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import replace
 from fractions import Fraction
-from functools import cache
 from unittest import mock
 
-import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ import pytest
 from experiments.published.plants import channel_of, contract_of_plant, plant_of, published
 from ncs_gym import (
     AdversarialDisturbance,
-    Channel,
     ChannelContract,
     Ellipsoid,
     LinearPlant,
@@ -24,78 +21,19 @@ from ncs_gym import (
     contract_of,
 )
 from shields import (
-    Certificate,
     CertificateError,
     Infeasible,
-    SafeLoop,
-    SafetyFilter,
-    SafetyShield,
     VectorSafetyShield,
     synthesize,
     verify,
 )
 from tests.certificates import certificate_of
 from tests.second_verifier.verify import verify_again
+from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
 from tests.verdicts import broken
 
-QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
-# A safety filter's angle, -30 to 45 degrees (AMPyC); two tanks with two valves; a hill that only goes up.
-ANGLE = LinearPlant(
-    A=[[1.0, 0.1], [-0.045, 0.9]],
-    B=[[0.0], [0.1]],
-    dt=0.1,
-    state_limits=([-0.52, -0.52], [0.79, 0.52]),
-    input_limits=(-2.0, 1.0),
-    disturbance_bound=[0.002, 0.004],
-    **QUIET,
-)
-TANKS = LinearPlant.from_statespace(
-    ([[-0.1, 0.05], [0.0, -0.2]], [[0.1, 0.02], [0.03, 0.2]], np.eye(2), 0),
-    1.0,
-    state_limits=([0.0, 0.0], [16.0, 8.0]),
-    input_limits=([0.0, 0.0], [10.0, 8.0]),
-    output_limits=[([1.0, 1.0], -np.inf, 23.0)],
-    operating_state=[12.4, 5.0],
-    operating_input=[7.0, 3.0],
-    disturbance_bound=0.1,
-    **QUIET,
-)
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", MovedOperatingPointWarning)
-    HILL = LinearPlant.from_statespace(
-        ([[-0.01]], [[1.32]], [[1.0]], 0),
-        0.1,
-        state_limits=(0.0, 40.0),
-        input_limits=(0.0, 1.0),
-        operating_state=20.0,
-        operating_input=0.17,
-        disturbance_bound=([[1.0]], [-0.06], [0.0]),
-        **QUIET,
-    )
-PLANTS = {"angle": ANGLE, "tanks": TANKS, "hill": HILL}
-CHANNEL = Channel(loss=0.3, max_consecutive_losses=1, send_period=2)
-CONTRACT = contract_of(CHANNEL)
 
-
-@cache
-def certificate(name: str) -> Certificate:
-    return certificate_of(PLANTS[name], CONTRACT, "polytope")
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_both_engines_accept_it_with_the_same_margins(name):
-    plant, found = PLANTS[name], certificate(name)
-    ours, other = verify(found, plant), verify_again(found, plant)
-    assert ours.valid
-    assert other.valid
-    margins = {condition.name: condition.margin for condition in other.conditions}
-    shared = [condition for condition in ours.conditions if condition.name.startswith(("(P)", "(PU)", "(L)"))]
-    assert len(shared) >= 3
-    for condition in shared:
-        assert condition.margin == pytest.approx(margins[condition.name], rel=1e-6, abs=1e-12)
-
-
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", ASYMMETRIC)
 def test_polytope_has_the_plants_ends_and_its_rest_is_an_equilibrium(name):
     plant, found = PLANTS[name], certificate(name)
     P, k = found.polytope, len(plant.box)
@@ -106,15 +44,6 @@ def test_polytope_has_the_plants_ends_and_its_rest_is_an_equilibrium(name):
     assert (plant.constraint_values(x) < 0.0).all()
     assert ((plant.input_low < u) & (u < plant.input_high)).all()
     np.testing.assert_array_equal(P.center, x)
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_file_keeps_it(name, tmp_path):
-    certificate(name).save(tmp_path / "c.json")
-    again = Certificate.load(tmp_path / "c.json")
-    assert again == certificate(name)
-    assert verify(again, PLANTS[name]).valid
-    assert "Infinity" not in (tmp_path / "c.json").read_text()
 
 
 def test_plant_in_deviations_from_another_point_has_the_same_polytope():
@@ -149,7 +78,7 @@ def test_limit_with_one_end_alone_is_kept():
     assert ((reached > found.polytope.high[1:]) | (reached < found.polytope.low[1:])).any()
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", ASYMMETRIC)
 def test_share_of_the_box_is_that_of_random_points(name):
     plant, found = PLANTS[name], certificate(name)
     if "polytope_share_of_box" not in found.provenance:  # limits of sums: a box that is no product
@@ -161,99 +90,6 @@ def test_share_of_the_box_is_that_of_random_points(name):
     inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
     assert found.provenance["polytope_share_of_box"] == pytest.approx(inside.mean(), abs=0.02)
     assert inside.mean() > 0.5
-
-
-def situations(shield, count, seed=0):
-    rng = np.random.default_rng(seed)
-    P, plant = shield.certificate.polytope, shield.plant
-    estimates = P.center + (P.sample_boundary(rng, count) - P.center) * rng.uniform(0.3, 1.1, (count, 1))
-    return estimates, 0.5 * shield.certificate.error_shapes[0], rng.uniform(*plant.input_ends, (count, plant.m))
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
-    plant, found = PLANTS[name], certificate(name)
-    shield = SafetyFilter(found, plant)
-    P, reasons = found.polytope, []
-    estimates, shape, proposals = situations(shield, 80)
-    reach = Ellipsoid(shape).support(P.rows @ plant.A) + plant.disturbance.support(P.rows)
-    low, high = P.low + reach, P.high - reach
-    for estimate, proposed in zip(estimates, proposals, strict=True):
-        decision = shield.decide(estimate, shape, proposed)
-        values = P.rows @ (plant.A @ estimate + plant.B @ proposed)
-        left = min((values - low).min(), (high - values).min())
-        if abs(left) > 1e-7:
-            assert (decision.reason == "safe") == (left > 0.0)
-        assert ((plant.input_low <= decision.input) & (decision.input <= plant.input_high)).all()
-        reasons.append(decision.reason)
-        if decision.reason == "safe":
-            continue
-        u = cp.Variable(plant.m)
-        c = P.rows @ (plant.A @ estimate) + P.rows @ plant.B @ u
-        rows = [c[np.isfinite(high)] <= high[np.isfinite(high)], c[np.isfinite(low)] >= low[np.isfinite(low)]]
-        problem = cp.Problem(
-            cp.Minimize(cp.sum_squares(u - proposed)), [*rows, u <= plant.input_high, u >= plant.input_low]
-        )
-        problem.solve(solver=cp.CLARABEL)
-        if problem.status == cp.OPTIMAL and decision.reason == "projected":
-            np.testing.assert_allclose(decision.input, u.value, atol=1e-5 * plant.input_half.max())
-        elif problem.status == cp.INFEASIBLE:
-            assert decision.reason == "fallback"
-            wanted = found.resting_input + found.K @ (estimate - found.resting_state)
-            clipped = np.clip(wanted, plant.input_low, plant.input_high)
-            np.testing.assert_allclose(decision.input, clipped, atol=1e-6 * plant.input_half.max())
-    assert "safe" in reasons
-    assert ("fallback" if name == "hill" else "projected") in reasons  # a step moves little of the speed on a hill
-
-
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
-@pytest.mark.parametrize("name", PLANTS)
-def test_no_end_is_passed_while_guaranteed(name, mode):
-    plant, found, count = PLANTS[name], certificate(name), 40
-    P, rng = found.polytope, np.random.default_rng(1)
-    names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "max_episode_steps": 70}
-    for disturbance in (AdversarialDisturbance(), AdversarialDisturbance(rows=P.rows), "sphere"):
-        env = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=count, disturbance=disturbance, noise="extreme", **names)
-        shield = VectorSafetyShield(env, found, mode)
-        starts = P.center + 0.9 * (P.sample_boundary(rng, count) - P.center)
-        _, info = shield.reset(seed=3, options={"state": starts})
-        assert info["shield_guaranteed"].all()
-        intervened = 0
-        for k in range(60):
-            ends = np.sign(rng.uniform(-1.0, 1.0, (count, plant.m)))
-            actions = [ends, np.ones_like(ends), -np.ones_like(ends)][k // 20]
-            _, _, _, _, info = shield.step(actions.astype(np.float32))
-            assert info["shield_guaranteed"].all(), info["shield_reason"]
-            assert not info["cost"].any()
-            values = info["state"] @ P.rows.T
-            if mode != "lookahead":
-                assert ((P.low <= values) & (values <= P.high)).all()
-            assert ((plant.input_low <= info["input"]) & (info["input"] <= plant.input_high)).all()
-            intervened += info["shield_intervened"].sum()
-        assert intervened > 0
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_loop_and_scalar_and_vector_shields_decide_the_same(name):
-    plant, found = PLANTS[name], certificate(name)
-    settings = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT}
-    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", **settings), found)
-    _, info = env.reset(seed=5)
-    filters = SafetyFilter(found, plant)
-    for k in range(40):
-        action = np.full(plant.m, 1.0 if k % 20 < 10 else -1.0, np.float32)
-        estimate, shape = info["estimate"], info["error_shape"]
-        _, _, _, _, info = env.step(action)
-        proposed = plant.input_high if action[0] > 0.0 else plant.input_low
-        np.testing.assert_allclose(info["input_proposed"], proposed, rtol=1e-12)
-        alone = filters.decide(estimate, shape, info["input_proposed"])
-        many = filters.decide_many(estimate[None], shape, info["input_proposed"][None])
-        np.testing.assert_array_equal(info["input"], alone.input)
-        np.testing.assert_array_equal(many.input[0], alone.input)
-    loop = SafeLoop(found, plant, CHANNEL)
-    loop.start(found.resting_state)
-    decision = loop.decide(2.0 * plant.input_high)
-    assert (decision.input <= plant.input_high).all()
 
 
 def changed(found, **fields):
@@ -287,7 +123,7 @@ def mutants(name):
     yield "center", replace(found, resting_state=shifted, polytope=replace(P, center=shifted))
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", ASYMMETRIC)
 def test_changed_certificate_is_refused_by_both_engines(name):
     plant, count, refused = PLANTS[name], 0, 0
     for what, each in mutants(name):
@@ -477,7 +313,7 @@ def test_ellipsoid_is_not_kept_by_an_input_that_rests_elsewhere_even_where_that_
         assert not verify_again(forged, plant).valid
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", ASYMMETRIC)
 def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
     """A plan ends in the polytope if it passes the box's own ends in these rows: closer ones would not be tested."""
     plant, P = PLANTS[name], certificate(name).polytope

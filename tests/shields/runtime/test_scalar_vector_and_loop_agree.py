@@ -26,6 +26,7 @@ from tests.certificates import certificate_of
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant
 from tests.shields.attacks.cases import RANDOM
+from tests.shields.polytope.limits import CHANNEL, CONTRACT, TANKS
 
 TRUCK, CART, REACTOR = truck_trailer(mass=4000.0), cart_pole(), batch_reactor()
 BOUNDS = {"box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "sensor_bound": 0.001, "initial_bound": 0.001}
@@ -98,6 +99,12 @@ FEATURES = {
     ),
     "limits of rates and of both together": Feature(
         RATES, {"channel": SPARSE, "disturbance": "adversarial"}, MODES, safe_set="polytope"
+    ),
+    "limits with two ends": Feature(
+        TANKS,
+        {"channel": CHANNEL, "contract": CONTRACT, "disturbance": "adversarial"},
+        ("project", "switch", "boundary", "monitor"),
+        safe_set="polytope",
     ),
     "some outputs": Feature(
         RANDOM["n=3 m=2 p=1"], {"channel": Channel(0.3, 0.01, delay=1, jitter=2)}, ("project", "switch", "boundary")
