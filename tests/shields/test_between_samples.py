@@ -22,6 +22,7 @@ from shields.runtime.starts import starts_known
 from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
 from tests.second_verifier.verify import verify_again
+from tests.shields.runtime.batches import decided_alike
 from tests.verdicts import verified
 
 IDS = {"TruckTrailerCruise": 8, "BatchReactor": 4}
@@ -99,14 +100,8 @@ def test_single_decisions_are_those_of_many(mode, kind):
     loop = found("TruckTrailerCruise", 8)
     plant, certificate = loop[0], loop[kind]
     shield, rng = SafetyFilter(certificate, plant, mode=mode), np.random.default_rng(0)
-    shape = certificate.error_shapes[0]
-    x = rng.uniform(-2.0, 2.0, (2, 300))
-    u = rng.uniform(-4.0, 4.0, (1, 300))
-    many = shield.decide_columns(x, shield.errors_of_many(shape[None]).of(np.zeros(300, np.int64)), u)
-    for k in range(300):
-        one = shield.decide(x[:, k].copy(), shape, u[:, k].copy())
-        np.testing.assert_allclose(one.input, many.input[:, k], atol=1e-6)
-        assert (one.passed, one.intervened) == (many.passed[k], many.intervened[k])
+    shapes = np.tile(certificate.error_shapes[0], (300, 1, 1))
+    decided_alike(shield, rng.uniform(-2.0, 2.0, (300, 2)), shapes, rng.uniform(-4.0, 4.0, (300, 1)))
 
 
 def test_unshielded_cruise_leaves_its_box_between_two_samples_inside_it():

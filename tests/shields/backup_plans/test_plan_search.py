@@ -13,9 +13,9 @@ from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
 from shields.runtime.backup_plans import plan_search
 from shields.runtime.backup_plans.plan_search import closed_loop
-from shields.runtime.decisions import REASONS
 from tests.shields.attacks.cases import case
 from tests.shields.attacks.worlds import BOX, through_loop
+from tests.shields.runtime.batches import decided_alike
 
 NAMES = ["cruise", "cart-pole", "batch reactor", "n=4 m=3 p=2"]
 
@@ -240,22 +240,13 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
     shield, rng, count = shield_of(name), np.random.default_rng(5), 60
     plant = shield.plant
     estimates, shapes, proposed = situations(shield, rng, count)
-    stored = np.full((shield.horizon, plant.m, count), np.nan)
-    for e in range(0, count, 2):
+    stored = np.full((count, shield.horizon, plant.m), np.nan)
+    for plan in stored[::2]:
         length = int(rng.integers(1, shield.horizon))
-        stored[:length, :, e] = plant.u_max * rng.uniform(-1, 1, (length, plant.m)).astype(np.float32)
+        plan[:length] = plant.u_max * rng.uniform(-1, 1, (length, plant.m)).astype(np.float32)
     estimates[::9] *= 3.0
-    many = shield.decide_columns(estimates.T, shield.errors_of_many(shapes), proposed.T, stored)
-    for e in range(count):
-        plan = stored[..., e]
-        one = shield.decide(estimates[e], shapes[e], proposed[e], plan[~np.isnan(plan[:, 0])])
-        assert REASONS[many.reason[e]] == one.reason
-        assert bool(many.intervened[e]) == one.intervened
-        assert bool(many.stored[e]) == one.stored
-        np.testing.assert_allclose(many.input[:, e], one.input, rtol=1e-5, atol=1e-6)
-        kept = many.plan[..., e]
-        assert np.count_nonzero(~np.isnan(kept[:, 0])) == len(one.plan)
-    assert {"planned", "stored"} <= {REASONS[code] for code in many.reason}
+    many = decided_alike(shield, estimates, shapes, proposed, stored)
+    assert {"planned", "stored"} <= set(many.reason)
 
 
 @pytest.mark.parametrize("name", NAMES)

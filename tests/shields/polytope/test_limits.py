@@ -76,6 +76,7 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     assert ("fallback" if name == "hill" else "projected") in reasons  # a step moves little of the speed on a hill
 
 
+@pytest.mark.cases(14)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
 @pytest.mark.parametrize("name", PLANTS)
 def test_no_limit_is_passed_while_guaranteed(name, mode):
