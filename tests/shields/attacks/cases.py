@@ -188,6 +188,8 @@ CASES = {
     "cart-pole of 2 %, with remainder": lambda: unstable(
         varying_cart_pole(), 3, safe_set="polytope", horizon=6, process=FamilyProcess()
     ),
+    "cruise, polytope": lambda: stable(TRUCKS["4000 kg"], safe_set="polytope", horizon=3),
+    "cart-pole, polytope, both ways": lambda: two_ways(cart_pole(), safe_set="polytope", horizon=12),
 }
 
 
