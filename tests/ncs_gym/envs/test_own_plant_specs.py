@@ -27,7 +27,6 @@ from ncs_gym import (
     SinusoidDisturbance,
     SphereDisturbance,
     TraceChannel,
-    register_plant,
     truck_trailer,
 )
 from ncs_gym.processes import CartPoleProcess, nonlinear_cart_pole
@@ -76,14 +75,6 @@ def own_plant():
     )
 
 
-@pytest.fixture
-def registered(monkeypatch):
-    """Registers plants for the time of a test."""
-    monkeypatch.setattr("gymnasium.envs.registration.registry", before := dict(gym.registry))
-    monkeypatch.setattr("gymnasium.registry", before)
-    return register_plant
-
-
 def assert_moves_alike(one, other):
     for env in (one, other):
         env.reset(seed=3)
@@ -108,17 +99,17 @@ def test_spec_of_a_plant_of_ones_own_makes_the_same_environment_again(settings):
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_spec_of_a_registered_plant_is_json(settings, registered):
-    registered("Plants/Own-v0", own_plant(), max_episode_steps=20, **settings)
+def test_spec_of_a_registered_plant_is_json(settings, register):
+    register("Plants/Own-v0", own_plant(), max_episode_steps=20, **settings)
     spec = gym.spec("Plants/Own-v0")
     for twin in (EnvSpec.from_json(spec.to_json()), pickle.loads(pickle.dumps(spec)), copy.deepcopy(spec)):
         assert twin == spec
         assert_moves_alike(gym.make("Plants/Own-v0"), gym.make(twin))
 
 
-def test_spec_of_a_vector_environment_is_json(registered):
+def test_spec_of_a_vector_environment_is_json(register):
     channels = [Channel(loss=0.1), Channel(loss=BURSTS, delay=1)]
-    registered("Plants/Own-v0", own_plant())
+    register("Plants/Own-v0", own_plant())
     for made in (
         gym.make_vec(LINEAR, num_envs=2, plant=own_plant(), channel=channels),
         gym.make_vec("Plants/Own-v0", num_envs=2),
@@ -171,8 +162,8 @@ def test_environments_of_one_document_share_the_plant():
     assert gym.make(EnvSpec.from_json(text)).unwrapped.plant is gym.make(EnvSpec.from_json(text)).unwrapped.plant
 
 
-def test_shielded_and_randomized_environment_is_made_again_from_its_spec(registered):
-    registered("Plants/Own-v0", own_plant(), max_episode_steps=20)
+def test_shielded_and_randomized_environment_is_made_again_from_its_spec(register):
+    register("Plants/Own-v0", own_plant(), max_episode_steps=20)
     channels = [Channel(loss=0.2), TraceChannel(trace=(0, -1))]
     certificate = certificate_of(own_plant())
     made = SafetyShield(RandomChannel(gym.make("Plants/Own-v0"), channel=channels), certificate)
@@ -181,10 +172,10 @@ def test_shielded_and_randomized_environment_is_made_again_from_its_spec(registe
     assert_moves_alike(made, again)
 
 
-def test_relative_path_of_a_plant_and_a_path_object_are_json(registered, tmp_path, monkeypatch):
+def test_relative_path_of_a_plant_and_a_path_object_are_json(register, tmp_path, monkeypatch):
     own_plant().save(tmp_path / "plant.json")
     monkeypatch.chdir(tmp_path)
-    registered("Plants/Own-v0", "plant.json")
+    register("Plants/Own-v0", "plant.json")
     for spec in (gym.spec("Plants/Own-v0"), gym.make(LINEAR, plant=tmp_path / "plant.json").spec):
         made = gym.make(EnvSpec.from_json(spec.to_json()))
         assert made.unwrapped.plant.fingerprint == own_plant().fingerprint

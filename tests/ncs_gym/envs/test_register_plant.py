@@ -14,21 +14,12 @@ from ncs_gym import (
     NCSVectorEnv,
     Regulation,
     SpeedTracking,
-    register_plant,
     truck_trailer,
 )
 from ncs_gym.registration import registered_ids
 
 TRUCK = "ncs_gym/TruckTrailer-v0"
 BURSTS = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5)
-
-
-@pytest.fixture
-def register(monkeypatch):
-    """Registers plants for the time of a test."""
-    monkeypatch.setattr("gymnasium.envs.registration.registry", before := dict(gym.registry))
-    monkeypatch.setattr("gymnasium.registry", before)
-    return register_plant
 
 
 def episode_length(env):
