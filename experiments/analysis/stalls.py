@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from ncs_gym.network.channel import in_steps
 from ncs_gym.network.contract import MAX_AGE
+from shields import Silence
 
 # The record is cut into so many parts, into twice as many, and so on, to see how unevenly stalls are spread.
 _FEWEST_PARTS, _MOST_PARTS = 4, 4096
@@ -92,6 +94,25 @@ def how_often(row: dict[str, Any]) -> str:
     times = "once" if row["times"] == 1 else f"{row['times']:,} times"
     halves = " and ".join(map(rate_text, row["halves"]))
     return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}], {halves} in its halves"
+
+
+def oldest_in_silence(silence: Silence, input_delay: int) -> int:
+    """Returns how old the newest sample may become for the box to be kept from any belief [steps].
+
+    Args:
+        silence: Of the certificate.
+        input_delay: What a downlink takes of its contract's age [steps].
+    """
+    return silence.max_age - input_delay + silence.anywhere
+
+
+def silences_text(oldest: int, row: dict[str, Any]) -> str:
+    """Returns how often the box may be left behind a shield, given `oldest_in_silence` and the row of that age."""
+    return (
+        f"From any belief that the contract allows the box is kept until the newest sample is {in_steps(oldest)} old, "
+        f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "
+        "between, the box is left no more often."
+    )
 
 
 def rate_text(rate: float) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import shields
-from experiments.analysis.stalls import broken_contracts, how_often
+from experiments.analysis.stalls import broken_contracts, how_often, oldest_in_silence, silences_text
 from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.heatmaps import requirements_map
@@ -94,7 +94,7 @@ def requirements(settings: RequirementsSettings) -> None:
         print(table.text, end="\n\n")
     sentences = [
         *map(_boundary_text, found.largest_ages),
-        *(() if log is None else _log_texts(log, found, today)),
+        *(() if log is None else _log_texts(log, found, today, plant)),
         _today_text(found, today),
         _requests_text(found, settings),
     ]
@@ -347,7 +347,7 @@ def _boundary_text(largest: LargestAge) -> str:
     return f"{text}{beyond}."
 
 
-def _log_texts(log: PacketLog, found: Requirements, today: Network | None) -> Iterator[str]:
+def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant: LinearPlant) -> Iterator[str]:
     """Yields how often a record would have broken the contract of today, and the widest ones that are certified."""
     asked = [("The widest contract with a certificate", each.network, each.certified) for each in found.largest_ages]
     if today is not None and today.contract is not None:
@@ -357,6 +357,16 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None) -> It
             dt, oldest = network.sampling_period, int(age) - network.input_delay
             (row,) = (each for each in broken_contracts(log.ages(dt), dt, (oldest,)) if each["max_age"] == oldest)
             yield f"{which}, {_steps(oldest)} of {dt:g} s, the record breaks {how_often(row)}."
+    index = None if today is None else _index_of(found, today)
+    certificate = None if index is None else found.points[index].certificate
+    if (
+        today is not None
+        and certificate is not None
+        and (silence := shields.silence_of(certificate, plant)) is not None
+    ):
+        age, dt = oldest_in_silence(silence, today.input_delay), today.sampling_period
+        (row,) = (each for each in broken_contracts(log.ages(dt), dt, (age,)) if each["max_age"] == age)
+        yield f"Today: {silences_text(age, row)}"
 
 
 def _shown_age(age: float) -> str:

@@ -91,6 +91,9 @@ def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_pat
         assert f"In the record it was older {times}" in said
     (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{0.02 * k},{0.02 * k}\n" for k in range(500)))
     kept = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+    assert "is 5 steps old, in every mode that protects; the record exceeds that at no time" in " ".join(
+        kept.stdout.split()
+    )
     assert "was broken at no time; a record of this length excludes more than" in " ".join(kept.stdout.split())
 
 
@@ -107,7 +110,10 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_pat
         shown = [line.removeprefix("    ") for line in block.splitlines()]
         shown = shown[: next(n for n, line in enumerate(shown) if "in 0.169 % of steps" in line) + 1]
         assert [line for line in shown if line and line != "..." and line not in found.stdout.splitlines()] == []
-        assert (promised.rstrip() in page) == (name == "contracts.md")
+        kept = "    From any belief" + found.stdout.partition("From any belief")[2].replace("\n", "\n    ")
+        assert ([promised.rstrip() in page, kept.partition("If a shield")[0].rstrip() in page]) == (
+            [name == "contracts.md"] * 2
+        )
 
 
 def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
