@@ -106,10 +106,10 @@ def oldest_in_silence(silence: Silence, input_delay: int) -> int:
     return silence.max_age - input_delay + silence.anywhere
 
 
-def silences_text(oldest: int, row: dict[str, Any]) -> str:
+def silences_text(oldest: int, row: dict[str, Any], contract: str = "the contract") -> str:
     """Returns how often the box may be left behind a shield, given `oldest_in_silence` and the row of that age."""
     return (
-        f"From any belief that the contract allows the box is kept until the newest sample is {in_steps(oldest)} old, "
+        f"From any belief that {contract} allows the box is kept until the newest sample is {in_steps(oldest)} old, "
         f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "
         "between, the box is left no more often."
     )

@@ -366,7 +366,7 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant
     ):
         age, dt = oldest_in_silence(silence, today.input_delay), today.sampling_period
         (row,) = (each for each in broken_contracts(log.ages(dt), dt, (age,)) if each["max_age"] == age)
-        yield f"Today: {silences_text(age, row)}"
+        yield silences_text(age, row, "today's contract")
 
 
 def _shown_age(age: float) -> str:
