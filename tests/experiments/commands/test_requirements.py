@@ -64,6 +64,19 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     assert "no names" in refused.stderr
 
 
+def test_requirements_say_how_often_the_box_can_be_left_over_a_record_today(tmp_path, without_workers):
+    # Samples at every step of .05 s; three silences of 2 steps, which the contract does not allow, and one of 3.
+    sent = np.cumsum([0.0] + [0.05] * 50 + [0.2, *[0.05] * 20] * 3 + [0.25] + [0.05] * 50)
+    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each:.2f},{each:.2f}\n" for each in sent))
+    asked = ("--losses", 2, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
+    found = ncs("requirements", "--env", "ncs_gym/Pendulum-v0", *asked)
+    assert found.returncode == 0, found.stderr
+    said = " ".join(found.stdout.split())
+    assert "Today's contract, 2 steps of 0.05 s, the record breaks 4 times" in said
+    assert "today's contract allows the box is kept until the newest sample is 3 steps old" in said
+    assert "that protects; the record exceeds that once" in said
+
+
 def test_channel_prints_the_contract_that_was_kept(tmp_path):
     rng = np.random.default_rng(0)
     lines = [f"{0.02 * i},{'' if rng.random() < 0.2 else 0.02 * i + 0.01}" for i in range(500)]
