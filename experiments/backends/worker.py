@@ -47,16 +47,27 @@ def initialize_worker() -> None:
 
 @contextmanager
 def signals_blocked() -> Iterator[None]:
-    """Has Ctrl-C and SIGTERM wait: a process that is started is not interrupted before `initialize_worker`."""
+    """Has Ctrl-C and SIGTERM wait: a process that is started is not interrupted before `initialize_worker`.
+
+    The process inherits that they are blocked. Here another thread may get one, whose handler then runs in the main
+    thread: the handlers wait as well.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     resource_tracker.ensure_running()  # which is started with the first process, and unblocks signals then
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    numbers, came = (signal.SIGINT, signal.SIGTERM), list[int]()
+    before, handlers = signal.pthread_sigmask(signal.SIG_BLOCK, numbers), {}
+    if threading.current_thread() is threading.main_thread():
+        handlers = {number: signal.signal(number, lambda each, frame: came.append(each)) for number in numbers}
     try:
         yield
     finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number in came:
+            signal.raise_signal(number)
 
 
 def work(parent: Connection, told: Connection, log_folder: Path | None) -> None:

@@ -76,6 +76,27 @@ def sent_twice(moment, number, *arguments):
     return ended(process)
 
 
+def test_signal_that_another_thread_gets_waits_until_a_process_has_started():
+    """Its handler runs in the main thread, which had blocked it."""
+    program = """
+import signal, threading
+from experiments.backends.worker import signals_blocked
+
+signal.signal(signal.SIGTERM, lambda number, frame: print("handled", flush=True))
+other = threading.Thread(target=threading.Event().wait, daemon=True)
+other.start()
+with signals_blocked():
+    signal.pthread_kill(other.ident, signal.SIGTERM)
+    for _ in range(100_000):
+        pass
+    print("started", flush=True)
+print("after", flush=True)
+"""
+    process = started(program)
+    said, errors = process.communicate(timeout=PATIENCE)
+    assert (said.split(), errors) == (["started", "handled", "after"], "")
+
+
 QUICK = [MOMENTS[i] for i in (1, 7)]
 SLOW = [pytest.param(each, marks=() if each in QUICK else pytest.mark.slow) for each in MOMENTS]
 
