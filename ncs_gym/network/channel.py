@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import inf
 from typing import Any, NamedTuple
 
@@ -125,11 +125,16 @@ class Channel:
 
     @property
     def mean_loss(self) -> float:
-        """Long-run share of samples that are lost, leaving out what `max_consecutive_losses` saves."""
-        if not isinstance(self.loss, GilbertElliott):
-            return self.loss
-        bad = self.loss.stationary_bad
-        return (1.0 - bad) * self.loss.loss_good + bad * self.loss.loss_bad
+        """Long-run share of samples that are lost, one every `send_period` steps."""
+        bursts = (
+            self.loss
+            if isinstance(self.loss, GilbertElliott)
+            else GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=self.loss)
+        )
+        if self.max_consecutive_losses is None:
+            bad = bursts.stationary_bad
+            return (1.0 - bad) * bursts.loss_good + bad * bursts.loss_bad
+        return _mean_loss(bursts, self.send_period, self.max_consecutive_losses)
 
     @property
     def longest_delay(self) -> int:
@@ -181,6 +186,25 @@ def widest(channels: Sequence[Channel]) -> Channel:
 
     coarsest = max(channel.quantization_step for channel in channels)
     return replace(max(channels, key=oldest), quantization_step=coarsest)
+
+
+@lru_cache
+def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
+    """Returns the long-run share of packets that are lost, of one every so many steps and at most `most` in a row.
+
+    It is that of a cycle from one arrival to the next. With M the chain from one packet to the next and N its part with
+    a loss, a cycle that begins in the states a has on average a (1 + N + .. + N^most) 1 packets, one of which arrives.
+    """
+    good, bad = bursts.p_good_to_bad, bursts.p_bad_to_good
+    M = np.linalg.matrix_power(np.array([[1.0 - good, good], [bad, 1.0 - bad]]), period)
+    N = M * [bursts.loss_good, bursts.loss_bad]
+    stacked = np.linalg.matrix_power(np.block([[N, np.eye(2)], [np.zeros((2, 2)), np.eye(2)]]), most)
+    last, before = stacked[:2, :2], stacked[:2, 2:]  # N^most, and the sum of the powers below it
+    cycle = before @ (M - N) + last @ M
+    leaves, comes_back = cycle[0, 1], cycle[1, 0]
+    at_arrivals = bursts.stationary_bad if leaves + comes_back == 0.0 else leaves / (leaves + comes_back)
+    packets = np.array([1.0 - at_arrivals, at_arrivals]) @ (before + last) @ np.ones(2)
+    return float(1.0 - 1.0 / packets)
 
 
 def in_steps(number: int) -> str:
@@ -244,6 +268,11 @@ class TraceChannel(Channel):
     def __getstate__(self) -> dict[str, Any]:
         # What is computed once is left out: a copy's array would not be read-only.
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}
+
+    @property
+    def mean_loss(self) -> float:
+        """Share of the trace that is lost."""
+        return self.trace.count(-1) / len(self.trace)
 
     @cached_property
     def delays(self) -> np.ndarray:

@@ -15,7 +15,7 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
-from ncs_gym.validation import as_count, as_flag, shown
+from ncs_gym.validation import as_count, as_flag, as_numbers, shown
 
 LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
 # What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
@@ -169,3 +169,17 @@ def _require_downlink(declared: Channel | None, channel: Channel) -> None:
     if declared is None:
         raise ValueError("the environment has an ideal downlink: make it with downlink=Channel(...)")
     downlink_protocol(channel, None)
+
+
+def require_action(actions: spaces.Space, given: Any) -> None:
+    """Raises ValueError unless what is sent is an action: an environment would refuse it only when it acts, or never.
+
+    Values beyond the limits of a box are the environment's to judge.
+    """
+    if isinstance(actions, spaces.Box):
+        numbers = as_numbers(given)
+        is_one = numbers is not None and numbers.shape == actions.shape and not np.isnan(numbers).any()
+    else:
+        is_one = actions.contains(given)
+    if not is_one:
+        raise ValueError(f"an action of {shown(actions)} is sent to the actuator, got {shown(given)}")

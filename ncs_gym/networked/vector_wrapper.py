@@ -16,7 +16,7 @@ from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import NetworkSettings, Predictor
+from ncs_gym.networked.settings import NetworkSettings, Predictor, require_action
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
 from ncs_gym.validation import AroundEnvironment, require_batched_infos
 
@@ -174,6 +174,7 @@ class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
         restarted = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, np.bool_)
         self._applied = actions
         if self._actuator is not None:
+            require_action(self.action_space, actions)
             self._applied, self._action_age = self._actuator.exchange(rng, self._steps, actions)
         if self._keeps_actions:
             self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)

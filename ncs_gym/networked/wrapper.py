@@ -17,7 +17,7 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import NetworkSettings, Predictor
+from ncs_gym.networked.settings import NetworkSettings, Predictor, require_action
 from ncs_gym.validation import AroundEnvironment, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
@@ -179,6 +179,7 @@ class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
         rng, settings, step = self.np_random, self._settings, self._step
         applied, decided_at = action, step
         if self._actuator is not None:
+            require_action(self.action_space, action)
             applied, decided_at = self._actuator.exchange(rng, step, _kept(action))
         if self._keeps_actions:
             self._decided.append(_kept(action))

@@ -2,7 +2,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, GilbertElliott
+from ncs_gym.network import packet_loss_and_delay
 from ncs_gym.network.packet_loss_and_delay import ChannelState
+
+BURSTS = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.2)
 
 
 def transmit(channel: Channel, steps: int, seed: int = 0, value: float = 0.0) -> dict[int, list[int]]:
@@ -53,6 +56,22 @@ def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     starts = np.flatnonzero(np.diff(lost.astype(int)) == 1)
     bursts = ends[-len(starts) :][: len(starts)] - starts[: len(ends)] if ends[0] > starts[0] else ends[1:] - starts
     assert np.mean(bursts) == pytest.approx(5.0, rel=0.1)  # 1 / p_bad_to_good
+
+
+@pytest.mark.parametrize("most", [None, 0, 1, 3, 40])
+@pytest.mark.parametrize(
+    ("loss", "period"),
+    [(0.6, 1), (1.0, 1), (0.9, 2), (BURSTS, 1), (BURSTS, 3), (GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.0), 1)],
+)
+def test_mean_loss_is_the_share_that_is_lost_in_the_long_run(loss, period, most):
+    channel, rng = Channel(loss=loss, send_period=period, max_consecutive_losses=most), np.random.default_rng(0)
+    size, steps = 2000, 600
+    state, sent, lost = packet_loss_and_delay.first_loss_state(channel, rng, size), 0, 0
+    for k in range(steps):
+        state, delays = packet_loss_and_delay.transmit(channel, rng, state, np.full(size, k % period == 0))
+        if k % period == 0 and k >= steps // 2:
+            sent, lost = sent + size, lost + np.count_nonzero(delays < 0)
+    assert channel.mean_loss == pytest.approx(lost / sent, abs=0.01)
 
 
 def test_gilbert_elliott_starts_from_its_stationary_distribution():

@@ -12,11 +12,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import DelayObservation, TimeLimit
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from ncs_gym import Channel, GilbertElliott, Networked, RandomChannel, RequestActions, TraceChannel
+from ncs_gym import Channel, GilbertElliott, Networked, RandomChannel, RequestActions, TraceChannel, VectorNetworked
 from tests.ncs_gym.networked.environments import Counter
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 LATE = Channel(loss=0.3, delay=1, jitter=2)
+NEUTRAL = {"Pendulum-v1": np.zeros(1, np.float32), "CartPole-v1": 0}
 EVERYTHING = {
     "channel": Channel(loss=BURSTS, delay=1, jitter=2, send_period=2),
     "downlink": LATE,
@@ -355,3 +356,31 @@ def test_networks_that_do_not_fit_are_one_sentence():
         Networked(Counter()).request()
     with pytest.raises(ValueError, match="a function for fill is for one channel"):
         Networked(Counter("dict"), {"count": Channel()}, fill=lambda *given: None)
+
+
+@pytest.mark.parametrize(
+    ("inner", "action"),
+    [
+        ("Pendulum-v1", [np.nan]),
+        ("Pendulum-v1", [0.1, 0.2]),
+        ("Pendulum-v1", None),
+        ("Pendulum-v1", "x"),
+        ("CartPole-v1", 7),
+        ("CartPole-v1", 0.5),
+        ("CartPole-v1", np.array([1])),
+    ],
+)
+def test_what_is_no_action_is_refused_where_it_is_sent_and_nothing_moves(inner, action):
+    env, twin = (Networked(gym.make(inner), downlink=Channel(delay=2), neutral=NEUTRAL[inner]) for _ in "ab")
+    env.reset(seed=0)
+    twin.reset(seed=0)
+    with pytest.raises(ValueError, match="is sent to the actuator, got"):
+        env.step(action)
+    for _ in range(4):
+        one, other = (each.step(NEUTRAL[inner]) for each in (env, twin))
+        np.testing.assert_array_equal(one[0], other[0])
+    many = VectorNetworked(gym.make_vec(inner, num_envs=2), downlink=Channel(delay=2), neutral=NEUTRAL[inner])
+    many.reset(seed=0)
+    wrong = np.array([NEUTRAL[inner]] * 3) if action is None else [action, action]
+    with pytest.raises(ValueError, match="is sent to the actuator, got"):
+        many.step(wrong)
