@@ -19,7 +19,7 @@ from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
 from experiments.settings import EvaluateSettings
 from experiments.settings.arguments import id_alone, require_horizon
-from experiments.terminal import wrapped
+from experiments.terminal import say, wrapped
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
 
@@ -42,6 +42,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     loop = with_channel(LoopConfig(env=agent.env, kwargs=kwargs), settings.channel)
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
+    if settings.shield == "as-trained" and folder.is_file():
+        say(f"{folder.name} does not say whether the agent was trained behind a shield: none is used; give --shield")
     require_horizon(settings, mode)
     least, horizon = settings.least_safe_steps, settings.horizon
     if mode == "lookahead" and horizon is None and least < (agent.horizon or 0):

@@ -352,6 +352,8 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant
     asked = [("The widest contract with a certificate", each.network, each.certified) for each in found.largest_ages]
     if today is not None and today.contract is not None:
         asked.insert(0, ("Today's contract", today, today.contract.max_age))
+    if any(each.certified == inf for each in found.largest_ages):
+        yield "A certificate that needs no samples at all keeps whatever the record lost."
     for which, network, age in asked:
         if age is not None and age != inf:
             dt, oldest = network.sampling_period, int(age) - network.input_delay

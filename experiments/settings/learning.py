@@ -257,8 +257,8 @@ class EvaluateSettings:
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
         vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, of which numbers alone
             are read; "none" if the agent saw observations as they are and a file of that kind lies beside it.
-        shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
-            nothing and counts what it would have done.
+        shield: Mode of the shield, by default that of the agent's training, which a zip does not tell: none then;
+            "none" for no shield; "monitor" changes nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
         least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; without
             --horizon plans become long enough for them.

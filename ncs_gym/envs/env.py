@@ -356,6 +356,15 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         require_on_request(self._requests).ask(asked)
 
     @property
+    def state(self) -> np.ndarray:
+        """The true state, shape (n,), a copy; only `reset(options={"state": x})` sets it."""
+        return self._state.copy()
+
+    @state.setter
+    def state(self, value: Any) -> None:
+        raise AttributeError('the state is set at the start of an episode: env.reset(options={"state": x})')
+
+    @property
     def outstanding(self) -> int:
         """Number of samples requested that are newer than the newest one used (docs/requests.md).
 

@@ -146,6 +146,15 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._ended: tuple[np.ndarray, Known] | None = None
 
     @property
+    def state(self) -> np.ndarray:
+        """The true states, shape (N, n), a copy; only `reset(options={"state": x})` sets them."""
+        return self._state.T.copy()
+
+    @state.setter
+    def state(self, value: Any) -> None:
+        raise AttributeError('the state is set at the start of an episode: env.reset(options={"state": x})')
+
+    @property
     def episode_channels(self) -> tuple[Channel, ...]:
         """The channels of the present episodes."""
         return tuple(self._uplinks.now)

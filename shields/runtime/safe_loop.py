@@ -238,7 +238,8 @@ class SafeLoop(CopiedWhole):
 
         Behind a downlink it is that of the step at which the input decided next takes effect.
 
-        At step 0 it is the first estimate: packets from before the first step are of no use.
+        At step 0 it is the first estimate: packets from before the first step are of no use, nor is a later sample of
+        step 0, which a known first estimate stands for. Nothing compares the two.
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode

@@ -161,6 +161,18 @@ def test_setting_of_an_environment_is_read_and_setting_it_says_how_to_make_anoth
         one.initial_set = None
 
 
+@pytest.mark.parametrize("make", [lambda: gym.make(ID), lambda: gym.make_vec(ID, num_envs=2)], ids=["one", "many"])
+def test_the_state_is_read_and_whoever_sets_it_is_told_how(make):
+    env = make()
+    _, info = env.reset(seed=0)
+    inner, before = env.unwrapped, info["state"].copy()
+    np.testing.assert_array_equal(inner.state, before)
+    inner.state[:] = 7.0  # a copy
+    with pytest.raises(AttributeError, match=r'env\.reset\(options=\{"state": x\}\)'):
+        inner.state = before + 1.0
+    np.testing.assert_array_equal(inner.state, before)
+
+
 def test_settings_of_an_estimator_and_those_behind_wrappers_cannot_be_changed():
     estimator, env = Estimator(truck_trailer(), Channel()), gym.make(ID)
     for name in ("plant", "channel", "buffer", "error_set"):

@@ -64,6 +64,16 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     assert "no names" in refused.stderr
 
 
+def test_requirements_say_that_a_record_does_not_count_where_no_sample_is_needed(tmp_path, without_workers):
+    (tmp_path / "packets.csv").write_text(
+        "sent,received\n" + "".join(f"{0.1 * k:.1f},{0.1 * k:.1f}\n" for k in range(99))
+    )
+    asked = ("--losses", 0, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
+    found = ncs("requirements", "--env", "ncs_gym/TruckTrailer-v0", *asked)
+    assert found.returncode == 0, found.stderr
+    assert "certificate that needs no samples at all keeps whatever the record lost" in " ".join(found.stdout.split())
+
+
 def test_requirements_say_how_often_the_box_can_be_left_over_a_record_today(tmp_path, without_workers):
     # Samples at every step of .05 s; three silences of 2 steps, which the contract does not allow, and one of 3.
     sent = np.cumsum([0.0] + [0.05] * 50 + [0.2, *[0.05] * 20] * 3 + [0.25] + [0.05] * 50)
