@@ -20,6 +20,7 @@ from shields.polytope import Polytope
 from shields.runtime.rows_within_step import rows_within_step
 from shields.synthesis.faces import Extremes, Faces
 from shields.verification import ACTION_ROUNDING, require_valid
+from shields.verification.polytope_conditions import faces_of
 
 # More steps are not looked at.
 MOST_STEPS = 200
@@ -75,9 +76,9 @@ class Silence:
             return f"{counted(number, 'step')}{seconds}{most} old"
 
         kept = (
-            f"the box is kept until the newest sample is {until(self.anywhere)}, from any belief that the contract "
-            f"allows and whatever the agent does; with the fallback input from half of the safe set until it is "
-            f"{until(self.at_half)}, from rest until {until(self.at_rest)}"
+            f"if no sample comes, late ones included, the box is kept until the newest is {until(self.anywhere)}, from "
+            "any belief that the contract allows and whatever the agent does; with the fallback input from half of the "
+            f"safe set until it is {until(self.at_half)}, from rest until {until(self.at_rest)}"
         )
         ways = [way.rarely for way in self.ways_back]
         outages = _listed([str(way.outage) for way in self.ways_back])
@@ -143,7 +144,7 @@ class _Fallbacks:
         self._on_state, self._on_input = rows[:, :n], rows[:, n:]
         self._on_estimate = self._on_state + self._on_input @ rest.gain
         self._powers, self._loops = _powers(plant.A), _powers(plant.A + plant.B @ rest.gain)
-        self._plant, self._set = plant, _Supports(certificate)
+        self._plant, self._set = plant, _Supports(certificate, plant)
         self._rounded = float(ACTION_ROUNDING) * plant.largest_input
         self._error = certificate.Sigma
         self._known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
@@ -209,23 +210,27 @@ def _powers(matrix: np.ndarray) -> np.ndarray:
 
 
 class _Supports:
-    """The least and the largest values of rows in S, around the resting point."""
+    """Bounds of the values of rows in S, around the resting point, which do not depend on units."""
 
-    def __init__(self, certificate: Certificate) -> None:
+    def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
         kept, self._center = certificate.safe_set, certificate.resting_state
-        self._ellipsoid = certificate.ellipsoid
-        self._polytope = None
+        self._ellipsoid, self._polytope = certificate.ellipsoid, None
         if isinstance(kept, Polytope):
-            shift = kept.rows @ self._center
-            self._polytope = Extremes(Faces(kept.rows, kept.low - shift, kept.high - shift))
+            faces, shift = faces_of(kept, len(plant.box)), kept.rows @ self._center
+            assert faces is not None  # it was verified
+            self._units = (1.0 + 1e-9) * np.array([float(each) for each in faces.widths])  # |y_i| is at most as large
+            self._polytope = Extremes(Faces(kept.rows * self._units, kept.low - shift, kept.high - shift))
 
     def of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns them for rows, shape (q, n): two arrays of shape (q,)."""
         if self._polytope is None:
             reach, shift = _support(rows, self._ellipsoid.shape_matrix), rows @ self._center
             return -reach - shift, reach - shift
-        extremes = np.array([self._polytope.of(row) for row in rows])
-        return extremes[:, 0], extremes[:, 1]
+        rows, reach = rows * self._units, np.ones(rows.shape[1])
+        sizes = np.abs(rows).max(axis=1)
+        bounds = [self._polytope.bounds(row / (size or 1.0), reach) for row, size in zip(rows, sizes, strict=True)]
+        least, largest = np.array(bounds).T * sizes
+        return least, largest
 
 
 def _support(rows: np.ndarray, shape: np.ndarray) -> np.ndarray:

@@ -111,7 +111,7 @@ def silences_text(oldest: int, row: dict[str, Any], contract: str = "the contrac
     return (
         f"From any belief that {contract} allows the box is kept until the newest sample is {in_steps(oldest)} old, "
         f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "
-        "between, the box is left no more often."
+        "between and no late sample comes meanwhile, the box is left no more often."
     )
 
 

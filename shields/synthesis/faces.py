@@ -110,6 +110,29 @@ class Extremes:
         largest = self._largest(row)
         return -largest if self._faces.are_symmetric else -self._largest(-row), largest
 
+    def bounds(self, row: np.ndarray, reach: np.ndarray) -> tuple[float, float]:
+        """Returns bounds of row z, shape (n,), that hold whatever the solver says, up to rounding.
+
+        For any multipliers l, row z = l G z + (row - l G) z.
+
+        Args:
+            row: Its numbers should be about 1, since the solver's tolerances are absolute.
+            reach: Bounds of |z|, shape (n,).
+        """
+        above = self._bound(row, reach)
+        return -above if self._faces.are_symmetric else -self._bound(-row, reach), above
+
+    def _bound(self, row: np.ndarray, reach: np.ndarray) -> float:
+        self._largest(row)
+        found = np.array(self._solver.getSolution().row_dual)
+        some = found if found.shape == self._faces.low.shape and np.isfinite(found).all() else 0.0 * self._faces.low
+        return min(self._bound_by(row, reach, each) for each in (some, -some, np.zeros(len(self._faces.rows))))
+
+    def _bound_by(self, row: np.ndarray, reach: np.ndarray, multipliers: np.ndarray) -> float:
+        ends = np.where(multipliers > 0.0, self._faces.high, self._faces.low)
+        used = multipliers != 0.0
+        return float(multipliers[used] @ ends[used] + np.abs(row - multipliers @ self._faces.rows) @ reach)
+
     def _largest(self, row: np.ndarray) -> float:
         _check(row)
         solver = self._solver

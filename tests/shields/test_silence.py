@@ -8,9 +8,10 @@ import pytest
 from scipy.optimize import linprog
 
 import shields
-from ncs_gym import ChannelContract, NCSVectorEnv, TraceChannel
+from ncs_gym import ChannelContract, LinearPlant, NCSVectorEnv, TraceChannel
 from shields import CertificateError, VectorSafetyShield, certificate_for
 from shields.silence import MOST_STEPS
+from shields.synthesis.faces import Extremes, Faces
 from tests.certificates import certificate_of
 from tests.plants import named, small
 
@@ -180,6 +181,38 @@ def test_limits_within_a_step_only_shorten_it():
     longer = shields.silence_of(at_samples, replace(plant, between_samples=None))
     assert 1 <= found.anywhere <= longer.anywhere
     assert 1 <= found.at_rest <= longer.at_rest
+
+
+def test_the_numbers_do_not_depend_on_units():
+    """Where inputs are small numbers, the tolerances of a linear program are not."""
+
+    def steps(unit):
+        bounds = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.003)
+        given = {"A": [[1.02, 0.05], [0.0, 0.9]], "B": np.array([[0.1], [0.2]]) / unit, "box": np.eye(2), "dt": 0.1}
+        wide, narrow = (LinearPlant(**given, **bounds, u_max=each * unit) for each in (2.0, 1.7))
+        certificate = certificate_of(wide, ChannelContract(3), "polytope")
+        found = shields.silence_of(replace(certificate, fingerprint=narrow.fingerprint), narrow)
+        return found.anywhere, found.at_half, found.at_rest
+
+    assert steps(1e-11) == steps(1.0)
+    assert steps(1.0)[0] > 3
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-12, 1e12])
+def test_bounds_of_rows_hold_whatever_the_solver_says(size):
+    """Also where its tolerances are far too coarse, and close to the best ones where they are not."""
+    angles = np.linspace(0.0, np.pi, 7, endpoint=False)
+    faces = Faces(np.stack([np.cos(angles), np.sin(angles)], axis=1), np.full(7, -1.0), np.full(7, 1.0))
+    extremes, reach = Extremes(faces), np.full(2, 1.1)
+    for row in size * np.random.default_rng(0).standard_normal((40, 2)):
+        best = -linprog(
+            -row / size, A_ub=np.concatenate([faces.rows, -faces.rows]), b_ub=np.ones(14), bounds=(None, None)
+        ).fun
+        least, largest = extremes.bounds(row, reach)
+        assert largest >= best * size * (1.0 - 1e-12)
+        assert least == -largest
+        if size == 1.0:
+            assert largest <= best + 1e-9
 
 
 def test_without_a_contract_there_is_nothing_to_exceed():
