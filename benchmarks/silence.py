@@ -189,9 +189,9 @@ def main() -> None:
         warnings.simplefilter("ignore", category)
     if options.attack:
         print(f"{'':20} {'steps':>9} {'silent and promised':>20} {'broken promises':>16}")
-        for name, least in ATTACKED.items():
+        for name in options.ids or ATTACKED:
             steps = options.envs * options.steps
-            broken, kept = broken_promises(f"ncs_gym/{name}-v0", options.envs, options.steps, least)
+            broken, kept = broken_promises(f"ncs_gym/{name}-v0", options.envs, options.steps, ATTACKED[name])
             print(f"{name:20} {steps:9,} {kept:20,} {broken:16}", flush=True)
         return None
     print(f"{'':20} {'contract':>8} {'safe':>5} {'':>8} {'overridden [%]':>13} {'left at an age of':>18}")
