@@ -26,8 +26,8 @@ from shields.verification.polytope_conditions import faces_of
 MOST_STEPS = 200
 # Lengths of outages after which a way back is computed, in contracts, and the longest way that is looked for.
 OUTAGES, LONGEST_WAY = (2, 10, 100), 10_000
-# What limits must be kept by, in units of half their range: far more than the rounding of float64, and the tolerance of
-# the solver that finds supports of polytopes.
+# What limits must be kept by, in units of the distance of their nearer end from the resting point: far more than the
+# rounding of float64.
 MARGIN = 1e-8
 
 

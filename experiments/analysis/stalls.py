@@ -10,7 +10,6 @@ from scipy.stats import chi2
 
 from ncs_gym.network.channel import in_steps
 from ncs_gym.network.contract import MAX_AGE
-from shields import Silence
 
 # The record is cut into so many parts, into twice as many, and so on, to see how unevenly stalls are spread.
 _FEWEST_PARTS, _MOST_PARTS = 4, 4096
@@ -96,18 +95,8 @@ def how_often(row: dict[str, Any]) -> str:
     return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}], {halves} in its halves"
 
 
-def oldest_in_silence(silence: Silence, input_delay: int) -> int:
-    """Returns how old the newest sample may become for the box to be kept from any belief [steps].
-
-    Args:
-        silence: Of the certificate.
-        input_delay: What a downlink takes of its contract's age [steps].
-    """
-    return silence.max_age - input_delay + silence.anywhere
-
-
 def silences_text(oldest: int, row: dict[str, Any], contract: str = "the contract") -> str:
-    """Returns how often the box may be left behind a shield, given `oldest_in_silence` and the row of that age."""
+    """Returns how often the box may be left behind a shield, given the oldest age and its row."""
     return (
         f"From any belief that {contract} allows the box is kept until the newest sample is {in_steps(oldest)} old, "
         f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "

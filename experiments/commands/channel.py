@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis.stalls import broken_contracts, how_often, oldest_in_silence, rate_text, silences_text
+from experiments.analysis.stalls import broken_contracts, how_often, rate_text, silences_text
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
@@ -29,27 +29,26 @@ def channel(settings: ChannelSettings) -> None:
     log = PacketLog.load(settings.file, settings.ping_period, step)
     dt = settings.sampling_period or (log.period if env is None else env.plant.dt)
     contract = None if env is None else env.contract
-    silence = None if env is None else _silence(env)
+    oldest = None if env is None else _oldest(env)
     asked = () if contract is None else (contract.max_age, contract.max_age + settings.least_safe_steps)
-    asked += () if silence is None else (silence,)
+    asked += () if oldest is None else (oldest,)
     found = _numbers(log, dt, asked)
     print(_text(log, found))
     if env is not None:
         print(wrapped(_compared(contract, found)))
-    if silence is not None:
-        print(wrapped(silences_text(silence, _row(found, silence))))
+    if oldest is not None:
+        print(wrapped(silences_text(oldest, _row(found, oldest))))
     if settings.least_safe_steps and contract is not None:
         print(wrapped(_beyond(contract, settings.least_safe_steps, found)))
     if settings.out is not None:
         write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
 
 
-def _silence(env: NCSEnv) -> int | None:
-    """Returns what `oldest_in_silence` says of the certificate of the package; None if it has none, or no contract."""
+def _oldest(env: NCSEnv) -> int | None:
+    """Returns until which age the certificate of the package keeps the box; None if there is none, or no contract."""
     certificate = certificate_of_package(env.plant, env.certificate_contract)
     silence = None if certificate is None else silence_of(certificate, env.plant)
-    protocol = env.downlink_protocol
-    return None if silence is None else oldest_in_silence(silence, 0 if protocol is None else protocol.input_delay)
+    return None if silence is None or env.contract is None else env.contract.max_age + silence.anywhere
 
 
 def _numbers(log: PacketLog, dt: float, asked: tuple[int, ...]) -> dict[str, Any]:

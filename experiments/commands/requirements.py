@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import shields
-from experiments.analysis.stalls import broken_contracts, how_often, oldest_in_silence, silences_text
+from experiments.analysis.stalls import broken_contracts, how_often, silences_text
 from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.heatmaps import requirements_map
@@ -366,7 +366,7 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant
         and certificate is not None
         and (silence := shields.silence_of(certificate, plant)) is not None
     ):
-        age, dt = oldest_in_silence(silence, today.input_delay), today.sampling_period
+        age, dt = silence.max_age - today.input_delay + silence.anywhere, today.sampling_period
         (row,) = (each for each in broken_contracts(log.ages(dt), dt, (age,)) if each["max_age"] == age)
         yield silences_text(age, row, "today's contract")
 
