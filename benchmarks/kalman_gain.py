@@ -42,7 +42,7 @@ def count_gains(env: NCSEnv, histories: ArrivalHistories) -> Counter[str]:
 
 def kind_of(gain: np.ndarray, statistics: ErrorStatistics, recursion: ErrorRecursion, sensor: np.ndarray) -> str:
     """Returns which of the gains one is, by computing the others anew."""
-    covariance, shape, age = statistics
+    covariance, shape, age, _ = statistics
     if np.allclose(gain, kalman_gain(recursion.plant, covariance, sensor), rtol=1e-9, atol=1e-12):
         return "Kalman"
     if np.array_equal(gain, recursion.sets.gain(shape)):

@@ -12,7 +12,6 @@ import numpy as np
 
 from ncs_gym import LinearPlant, certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
-from ncs_gym.uncertainty.shape_matrices import is_inside
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.certificate_text import counted, labeled
@@ -243,14 +242,14 @@ def way_back(recursion: ErrorRecursion, outage: int, gap: int) -> int | None:
 
     Samples came so rarely before the outage, too.
     """
-    known, certified = recursion.first, recursion.error_set.shape_at(0)
+    known = recursion.first
     for number, steps in enumerate([gap] * 5 + [outage] + [gap] * (LONGEST_WAY // gap)):
         for _ in range(steps):
             known = recursion.predicted(known)
         updated = recursion.updated(known)
         assert updated is not None  # under a contract every sample is used
         known = updated[1]
-        if number >= 5 and is_inside(known.shape, certified):
+        if number >= 5 and known.certified:
             return (number - 5) * gap
     return None
 

@@ -49,7 +49,7 @@ _HASH_SIZE = 16
 _BY_NUMBER_LAST = "gains", "quick_tests"
 _BY_NUMBER = (
     *("_gains", "_by_columns", "_quick_tests", "_covariances", "_shapes"),
-    *("_after_step", "_after_update", "_recurs", "_ages"),
+    *("_after_step", "_after_update", "_certified", "_recurs", "_ages"),
 )
 # Those of a graph, whose last axis is the history.
 _BY_HISTORY = (
@@ -87,6 +87,7 @@ class ErrorTable:
         self._gains, self._by_columns = np.zeros((size, n * p)), np.zeros(size, np.bool_)
         self._quick_tests = np.zeros((size, p, p))
         self._covariances, self._shapes = np.zeros((2, size, n, n))
+        self._certified = np.zeros(size, np.bool_)
         self._recurs = np.zeros(size, np.bool_)  # whether statistics were met more than once
         self._after_update[self._add(recursion.first)] = NO_SAMPLE  # which no other statistics are equal to
 
@@ -97,12 +98,21 @@ class ErrorTable:
     def bytes_each(self) -> int:
         """What the statistics of one number take, about."""
         n, p = self.recursion.plant.n, self.recursion.plant.p
-        return _BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 2
+        return _BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 3
 
     @property
     def shapes(self) -> np.ndarray:
         """The error shapes Sigma_k by number, shape (count, n, n), read-only: many estimators share them."""
         return frozen(self._shapes[: self._count])
+
+    @property
+    def certified(self) -> np.ndarray:
+        """`ErrorStatistics.certified` by number, shape (count,), read-only."""
+        return frozen(self._certified[: self._count])
+
+    def is_certified(self, number: int) -> bool:
+        """Returns `ErrorStatistics.certified` of a number."""
+        return self._certified.item(number)
 
     def shape(self, number: int) -> np.ndarray:
         """Returns an error shape Sigma_k, shape (n, n), read-only."""
@@ -114,12 +124,13 @@ class ErrorTable:
         They are copies: on some processors the last bit of a sum depends on where in memory its terms lie.
         """
         covariance, shape = self._covariances[number].copy(), self._shapes[number].copy()
-        return ErrorStatistics(frozen(covariance), frozen(shape), self._ages.item(number))
+        return ErrorStatistics(frozen(covariance), frozen(shape), self._ages.item(number), self._certified.item(number))
 
     def number_of(self, statistics: ErrorStatistics) -> int:
         """Returns the number of statistics, a new one if they have not occurred."""
         age = min(statistics.age, self.oldest)
-        whole = b"".join((statistics.covariance.tobytes(), statistics.shape.tobytes(), age.to_bytes(4, "little")))
+        small = age.to_bytes(4, "little") + bytes([statistics.certified])
+        whole = b"".join((statistics.covariance.tobytes(), statistics.shape.tobytes(), small))
         key = blake2b(whole, digest_size=_HASH_SIZE).digest()
         number = self._numbers.get(key)
         if number is None:
@@ -208,7 +219,7 @@ class ErrorTable:
                 setattr(self, name, _with_room(getattr(self, name), number))
             for name in _BY_NUMBER:  # the last one tells how much
                 setattr(self, name, _with_room(getattr(self, name), number, axis=0))
-        self._covariances[number], self._shapes[number], self._ages[number] = statistics
+        self._covariances[number], self._shapes[number], self._ages[number], self._certified[number] = statistics
         self._after_step[number] = self._after_update[number] = UNKNOWN
         self._gains[number], self._by_columns[number], self._recurs[number] = 0.0, False, False
         self.gains[..., number] = 0.0
@@ -303,7 +314,8 @@ class ArrivalHistories:
     def after_arrival(self, history: int, age: int) -> int:
         """Returns the number of the history with one more sample, of some age; the same where it is of no use.
 
-        Samples older than the buffer, from before the first step or received before are of no use.
+        Samples older than the buffer, from before the first step or received before are of no use. Nor is one that is
+        older than the update that brought the error back into its certified set: a replay could take it out again.
         """
         if not 0 <= age <= self.buffer:
             return history
@@ -312,7 +324,8 @@ class ArrivalHistories:
             with self._lock:
                 present, priors, held, replay_from = self._history(history)
                 after = history
-                if priors[age] != UNKNOWN and not held[age]:
+                is_known = priors[age] != UNKNOWN and not held[age]
+                if is_known and self.table.is_certified(priors[age]) >= self.table.is_certified(present):
                     held = (*held[:age], True, *held[age + 1 :])
                     after = self._number_of(present, priors, held, max(replay_from, age))
                 self.arrival[age, history] = after

@@ -121,7 +121,7 @@ class Estimator(CopiedWhole):
         """
         shape = self._error_set.shape_at(0)
         assert shape is not None
-        first = ErrorStatistics(self._plant.kalman_covariances[2], shape, 0)
+        first = ErrorStatistics(self._plant.kalman_covariances[2], shape, 0, True)
         coarsens = self._usual.coarsens
         self._histories = histories_of(self._plant, self._channel, self._error_set, coarsens, first=first)
         self._begin(mean, self.step - len(inputs))
@@ -149,7 +149,7 @@ class Estimator(CopiedWhole):
     def estimate(self) -> Estimate:
         """What is known about the state now."""
         histories = self._histories
-        covariance, shape, _ = histories.table.statistics(histories.present.item(self._history))
+        covariance, shape, *_ = histories.table.statistics(histories.present.item(self._history))
         return Estimate(self.mean.copy(), covariance.copy(), shape.copy(), self.step - self.age)
 
     def as_filterpy(self) -> Any:

@@ -49,11 +49,14 @@ class ErrorStatistics(NamedTuple):
             for safety.
         shape: Sigma_k, shape (n, n): the error x_hat - x lies in E(Sigma_k).
         age: Steps since the newest sample used was taken; the first estimate counts as a sample at step 0.
+        certified: Whether E(Sigma_k) lies in the certified set of its age, and will for as long as the contract is
+            kept: an update, or the first estimate, brought it into that of age 0, and from there (C1) and (C2) lead on.
     """
 
     covariance: np.ndarray
     shape: np.ndarray
     age: int
+    certified: bool
 
 
 class ErrorRecursion:
@@ -87,8 +90,10 @@ class ErrorRecursion:
         self._quantization_step = quantization_step
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
+        self._oldest = 0 if error_set.ages is None else len(error_set.ages.shapes) - 1
         if first is None:
-            first = ErrorStatistics(plant.kalman_covariances[2], plant.initial_error.shape_matrix, 0)
+            shape = plant.initial_error.shape_matrix
+            first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shape_at(0)))
         self.first = first
         # Next to that of others, the deviation of a state that nothing disturbs would become smaller for ever, and all
         # would where nothing disturbs any: covariances would not recur. Deviations are no smaller than this share of
@@ -105,12 +110,17 @@ class ErrorRecursion:
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""
-        covariance, shape, age = statistics
+        covariance, shape, age, certified = statistics
         # The covariance of an unstable plant grows without end in an outage; it picks gains and may stop growing.
         grown = predicted_covariance(covariance, self.plant.A, self.Q)
         if np.vdot(self.plant.weight, grown) < LARGEST_COVARIANCE:
             covariance = grown
-        return ErrorStatistics(self._rounded(covariance), self.sets.predicted(shape, age), age + 1)
+        predicted = self.sets.predicted(shape, age)
+        if self.error_set.ages is not None:
+            certified = certified and age < self._oldest  # by (C1)
+        elif not certified:  # whatever lies inside stays there, by (E1)
+            certified = is_inside(predicted, self.error_set.Sigma)
+        return ErrorStatistics(self._rounded(covariance), predicted, age + 1, certified)
 
     def updated(self, statistics: ErrorStatistics) -> tuple[np.ndarray, ErrorStatistics] | None:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
@@ -120,23 +130,23 @@ class ErrorRecursion:
         contract there is none, and None says that the sample must not be used. After an outage no ellipsoid lies inside
         at first, and the gain is chosen for the way back.
         """
-        covariance, shape, age = statistics
+        covariance, shape, age, _ = statistics
         newest, ages = self.error_set.shape_at(0), self.error_set.ages
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
         if kalman is not None and is_inside(updated := self.sets.updated(shape, kalman[0]), newest):
-            return kalman[0], ErrorStatistics(covariance, updated, 0)
+            return kalman[0], ErrorStatistics(covariance, updated, 0, True)
         gain = self.sets.gain(shape)
         updated = self.sets.updated(shape, gain)
         if not is_inside(updated, newest):
             if ages is None:
                 return None
-            certified = self.error_set.shape_at(age)
-            if certified is not None and is_inside(shape, certified):
-                gain, updated = ages.gains[age - 1], newest  # by (C2)
+            last = min(age, self._oldest)  # whatever lies in a set is led back by its gain
+            if is_inside(shape, ages.shapes[last]):
+                gain, updated = ages.gains[last - 1], newest  # by (C2)
             else:
                 gain, updated = self.sets.on_the_way_back(shape)
-        return gain, ErrorStatistics(covariance, updated, 0)
+        return gain, ErrorStatistics(covariance, updated, 0, is_inside(updated, newest))
 
     def prefers(self, replayed: ErrorStatistics, present: ErrorStatistics) -> bool:
         """Returns whether a replayed history is better than the present one.

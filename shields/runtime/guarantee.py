@@ -52,6 +52,7 @@ class MonitorState(NamedTuple):
         inside: Whether x in S is proved, up to what broke; in mode "lookahead" also if x is proved in the box and the
             inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
+        stays: Whether it is known to stay there while the contract is kept.
         wait: Number of steps until x in S is proved at present, if all that follows is (`longer_wait`). Behind a
             downlink `inside` is about the time at which the next input takes effect. 0 where neither that nor ways
             between samples count.
@@ -60,6 +61,7 @@ class MonitorState(NamedTuple):
     broken: Any
     inside: Any
     certified: Any
+    stays: Any
     wait: Any = 0
 
 
@@ -72,6 +74,8 @@ class LoopObservation(NamedTuple):
         alarm: Whether the innovation monitor raised an alarm.
         age: Steps since the newest sample used was taken, which is asked for only to explain a large error.
         damaged: Whether that alarm is about a sample that was no finite numbers.
+        stays: Whether an error in a certified set is known to stay there while the contract is kept, which its shape
+            alone does not say (`ErrorStatistics.certified`).
     """
 
     estimate: np.ndarray
@@ -79,6 +83,7 @@ class LoopObservation(NamedTuple):
     alarm: Any
     age: Any = 0
     damaged: Any = False
+    stays: Any = True
 
 
 class GuaranteeMonitor:
@@ -195,9 +200,10 @@ class GuaranteeMonitor:
             reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
         if self._input_delay or self._within_step:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
-        if state.certified is True or _all(state.certified):
+        lasts = state.certified & state.stays
+        if lasts is True or _all(lasts):
             return reason
-        is_large = _not(state.certified)
+        is_large = _not(lasts)
         reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
         return _first(reason, is_large, LARGE_ERROR)
 
@@ -229,7 +235,7 @@ class GuaranteeMonitor:
         self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True
     ) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves: not what was on the way."""
-        estimate, errors, alarm, _, damaged = report
+        estimate, errors, alarm, _, damaged, stays = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
@@ -245,7 +251,7 @@ class GuaranteeMonitor:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
         if self._input_delay or self._within_step:
             wait = longer_wait(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
-        return MonitorState(broken, inside, errors.certified, wait)
+        return MonitorState(broken, inside, errors.certified, stays, wait)
 
 
 def longer_wait(wait: Any, proved: Any, ahead: int) -> Any:

@@ -507,7 +507,8 @@ class SafeLoop(CopiedWhole):
         estimator = self._estimator
         estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
         errors = self._monitored.errors.one(estimator.table, number)
-        return LoopObservation(estimate, errors, estimator.alarm, estimator.age, estimator.damaged)
+        stays = estimator.table.is_certified(number)
+        return LoopObservation(estimate, errors, estimator.alarm, estimator.age, estimator.damaged, stays)
 
     @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:

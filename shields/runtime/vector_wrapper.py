@@ -90,7 +90,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         self._schedule = (
             None if inner.downlink_protocol is None else CommittedInputs(self._input_delay, (inner.plant.m, count))
         )
-        self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
+        broken, wait = np.full(count, CODES[OTHER_STEPS]), np.zeros(count, np.int64)
+        self._state = MonitorState(broken, nothing, nothing, nothing, wait)
         self._interventions, self._proved = np.zeros((2, count), np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
         self._stored = np.full((self._filter.horizon or 0, inner.plant.m, count), np.nan)
@@ -203,7 +204,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
 
     def _observed(self, known: Known) -> LoopObservation:
         errors = self._errors.many(known.table, known.number)
-        return LoopObservation(np.ascontiguousarray(known.estimate), errors, known.alarm, known.age, known.damaged)
+        seen = np.ascontiguousarray(known.estimate), errors, known.alarm, known.age, known.damaged
+        return LoopObservation(*seen, known.table.certified.take(known.number))
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
@@ -256,8 +258,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         done = np.flatnonzero(is_done)
         errors = self._errors.many(known.table, known.number[done])
         known = known._replace(applied=known.applied[:, done], committed=known.committed[:, done])
-        alarms = known.alarm[done], known.age[done], known.damaged[done]
-        report = LoopObservation(known.estimate[:, done], errors, *alarms)
+        seen = known.estimate[:, done], errors, known.alarm[done], known.age[done], known.damaged[done]
+        report = LoopObservation(*seen, known.table.certified[known.number[done]])
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
         same_input, on_time = _as_decided(known, decided.input, None if due is None else due[:, done])

@@ -54,6 +54,8 @@ class PlainEstimator:
         for stamp, measurement, _ in packets:
             if stamp not in self.priors or stamp in self.samples:
                 continue
+            if self.statistics.certified and not self.priors[stamp].statistics.certified:
+                continue
             if np.isfinite(measurement).all():
                 self.samples[stamp] = measurement
                 new.append(stamp)

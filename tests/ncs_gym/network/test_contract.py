@@ -219,7 +219,7 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
     monkeypatch.setattr(recursion, "_kalman_update", lambda covariance: None)
 
     def updated(shape, age):
-        return recursion.updated(ErrorStatistics(np.eye(4), shape, age))
+        return recursion.updated(ErrorStatistics(np.eye(4), shape, age, True))
 
     oldest = contract.max_age + 1
     for age in (1, oldest):
@@ -228,7 +228,12 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
         np.testing.assert_array_equal(inside.shape, sets.ages.shapes[0])
         _, outside = updated(1.1 * sets.ages.shapes[age], age)
         assert not is_inside(outside.shape, sets.ages.shapes[0])
-    _, late = updated(sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
+    gain, late = updated(sets.ages.shapes[oldest], oldest + 9)  # the last set counts, whatever the age
+    np.testing.assert_array_equal(gain, sets.ages.gains[-1])
+    assert late.certified
+    np.testing.assert_array_equal(late.shape, sets.ages.shapes[0])
+    _, late = updated(1.1 * sets.ages.shapes[oldest], oldest + 9)
+    assert not late.certified
     assert not is_inside(late.shape, sets.ages.shapes[0])
 
 

@@ -25,6 +25,7 @@ from tests.shields.attacks.worlds import (
     ERROR,
     FALL,
     KEPT,
+    LASTS,
     SAFE_SET,
     SILENCE,
     through_estimators,
@@ -43,7 +44,7 @@ SIZES = {
 }
 # How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
 # than the safe set.
-CLOSE = {SAFE_SET: 0.9, BOX: 0.4, KEPT: 0.0, FALL: 0.0, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0}
+CLOSE = {SAFE_SET: 0.9, BOX: 0.4, KEPT: 0.0, FALL: 0.0, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0, LASTS: 0.0}
 SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 0.8}
 WITH_REMAINDER = [name for name in CASES if name.endswith("with remainder")]
 
@@ -113,6 +114,19 @@ def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, c
             certified = error_set.shape_at(age)
             running = np.frombuffer(shape).reshape(certified.shape)
             assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
+
+
+@pytest.mark.cases(8)
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("cart-pole, position and angle", 100), ("batch reactor", 60)]
+    + [pytest.param(name, 400, marks=pytest.mark.slow) for name in CASES if case(name).contract],
+)
+def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract_is_kept(name, size):
+    outcome, _, _ = through_estimators(case(name), 0, size, size, 7, has_outages=True)
+    assert outcome.largest[ERROR] <= 1.0
+    assert outcome.largest[LASTS] == 1.0  # some are lost, none of them while the contract is kept
+    assert min(outcome.counts["lost"], outcome.counts["certified again"]) > 0
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])

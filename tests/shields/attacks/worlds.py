@@ -16,7 +16,7 @@ from tests.ncs_gym.envs.same_draws import holding_gain
 from tests.shields.attacks.adversary import Adversary, Between, Traffic, boundary, box_of, farthest, gauges, region_of
 from tests.shields.attacks.cases import Case, box_ellipsoid
 
-SAFE_SET, BOX, KEPT, FALL, ALL_TIMES, ERROR, AGE = (
+SAFE_SET, BOX, KEPT, FALL, ALL_TIMES, ERROR, AGE, LASTS = (
     "in the safe set",
     "in the box",
     "in the box for so many steps",
@@ -24,6 +24,7 @@ SAFE_SET, BOX, KEPT, FALL, ALL_TIMES, ERROR, AGE = (
     "in the box at all times",
     "error in its ellipsoid",
     "age within the contract",
+    "the guarantee lasts while the contract is kept",
 )
 # Episodes are begun anew after so many steps, in the middle of plans; in vectors after so many.
 EPISODE, VECTOR_EPISODE = 60, 20
@@ -63,7 +64,10 @@ class Watch:
         self.safe, self.box = region_of(case.certificate.safe_set), box_of(case.plant)
         counts = case.plant.between_samples is not None if case.at_all_times is None else case.at_all_times
         self.between = Between(case.plant) if counts else None
+        promised = case.certificate.contract
+        self.oldest = np.inf if promised is None else promised.max_age - delay
         self.states: np.ndarray | None = None
+        self.ages = np.zeros(1, np.int64)
         self.held, self.left = np.zeros(1, np.bool_), np.zeros(1, np.int64)
         # Estimates, shapes and where an episode goes on, of the steps until they belong to the present.
         self.expected: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
@@ -89,6 +93,8 @@ class Watch:
         lost = goes_on & self.held & ~held
         if lost.any():
             outcome.lost |= set(np.atleast_1d(reasons)[lost])
+        outcome.see(LASTS, 1.0 + (np.maximum(ages, self.ages) <= self.oldest), lost)
+        self.ages = ages
         out = self.box.gauges(states)
         outcome.see(BOX, out, held)
         outcome.see(KEPT, out, goes_on & (self.left > 0))
@@ -330,7 +336,9 @@ def through_loop(
     return watch.outcome
 
 
-def through_estimators(case: Case, network: int, count: int, steps: int, seed: int, *, rough: float = 1.0) -> Any:
+def through_estimators(
+    case: Case, network: int, count: int, steps: int, seed: int, *, rough: float = 1.0, has_outages: bool = False
+) -> Any:
     """Attacks many estimators alone; returns the outcome, and the error shapes that occurred, each with its age."""
     rng, plant = np.random.default_rng(seed), case.plant
     channel = Channel(jitter=6 if case.contract is None else case.contract.max_age + 1,
@@ -342,7 +350,7 @@ def through_estimators(case: Case, network: int, count: int, steps: int, seed: i
     N = rough**2 * plant.sensor_error_with(channel.quantization_step).shape_matrix
     error = farthest(plant.initial_error.shape_matrix, adversary.axes)
     many.begin(np.ones(count, np.bool_), error)
-    x, samples, seen = np.zeros((plant.n, count)), [], set()
+    x, samples, seen, outage = np.zeros((plant.n, count)), [], set(), np.zeros(count, np.int64)
     gain = plant.u_max[:, None] * holding_gain(plant)
     for step in range(1, steps + 1):
         shapes = many.histories.table.shapes.take(many.statistics, axis=0)
@@ -352,7 +360,19 @@ def through_estimators(case: Case, network: int, count: int, steps: int, seed: i
         x = nominal + adversary.disturbances(nominal, plant.disturbance.shape_matrix)
         y = plant.H @ x + adversary.noise(N)
         samples = [y, *samples[: traffic.oldest]]
-        many.advance(u, y, traffic.arrivals(rng, step))
+        certified, arrivals = many.histories.table.certified.take(many.statistics), traffic.arrivals(rng, step)
+        if has_outages:
+            begins = (outage == 0) & (rng.random(count) < 0.03)
+            outage = np.where(begins, rng.integers(1, 12 * traffic.oldest, count), np.maximum(outage - 1, 0))
+            arrivals = [(age, arrives & (outage == 0)) for age, arrives in arrivals]
+        ages = many.age.copy()
+        many.advance(u, y, arrivals)
+        if case.contract is not None:
+            certified_now = many.histories.table.certified.take(many.statistics)
+            lost = certified & ~certified_now
+            outcome.see(LASTS, 1.0 + (np.maximum(ages, many.age) <= case.contract.max_age), lost)
+            outcome.counts["lost"] += np.count_nonzero(lost)
+            outcome.counts["certified again"] += np.count_nonzero(certified_now & ~certified)
         shapes = many.histories.table.shapes.take(many.statistics, axis=0)
         outcome.see(ERROR, gauges(shapes, many.mean - x), ~many.alarm)
         if case.contract is not None:

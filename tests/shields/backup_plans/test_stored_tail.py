@@ -105,9 +105,13 @@ def test_a_tail_that_ends_in_silence_ends_in_the_safe_set_and_the_fallback_prove
 
 def forged(known):
     shapes = FORGED * known.table.shapes
-    return known._replace(
-        error_shape=FORGED * known.error_shape, table=SimpleNamespace(shapes=shapes, shape=shapes.__getitem__)
+    table = SimpleNamespace(
+        shapes=shapes,
+        shape=shapes.__getitem__,
+        certified=known.table.certified,
+        is_certified=known.table.is_certified,
     )
+    return known._replace(error_shape=FORGED * known.error_shape, table=table)
 
 
 class DoubtfulEnv(NCSEnv):

@@ -1,11 +1,13 @@
 """What is proved, step by step: against a plain reference, for one loop and for many."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
+from ncs_gym import Channel, Packet
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
-from shields import Decision, SafetyFilter
+from shields import Decision, SafeLoop, SafetyFilter, certificate_for
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
@@ -144,3 +146,24 @@ def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(watched, cha
     state = monitor.advance(state, passed, True, True, report())
     assert reason(state) == proof.UNUSABLE
     assert reason(monitor.start(True, True, report())) == ""
+
+
+@pytest.mark.parametrize("gaps", [(2, 4, 1, 1), (1, 1, 4, 1)])
+def test_a_guarantee_that_returned_lasts_while_the_contract_is_kept(gaps):
+    # Two steps after a sample the error lies in the certified set of three steps, one step later in none.
+    env = gym.make("ncs_gym/BatchReactor-v0").unwrapped
+    plant, contract = env.plant, env.certificate_contract
+    channel = Channel(quantization_step=contract.quantization_step)
+    loop = SafeLoop(certificate_for(plant, contract), plant, channel, mode="switch", on_unproved="ignore")
+    loop.start(np.zeros(plant.n), initial_set=np.zeros(plant.n))
+    times = np.cumsum([*[1] * 6, 6, *gaps, *[2] * 20]).tolist()
+    x, held, returned = np.zeros(plant.n), True, 0
+    for step in range(1, times[-1] + 1):
+        x = plant.A @ x + plant.B @ loop.decide(np.zeros(plant.m)).input
+        before = loop.measurement_age
+        loop.receive([Packet(step, plant.H @ x, loop.episode)] if step in times else [])
+        assert loop.guaranteed or not held or max(loop.measurement_age, before) > contract.max_age
+        returned += loop.guaranteed and not held
+        held = loop.guaranteed
+    assert held
+    assert returned == 1

@@ -1,5 +1,6 @@
 import pickle
 import warnings
+from functools import partial
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -356,7 +357,10 @@ def test_error_shape_that_is_none_proves_nothing(certificate, forge):
 
 def forging(forge):
     """Makes a table of error shapes one that holds other shapes."""
-    return lambda table: SimpleNamespace(shapes=table.shapes, shape=lambda number: forge(table.shape(number)))
+    forged = lambda table, number: forge(table.shape(number))  # noqa: E731
+    return lambda table: SimpleNamespace(
+        shapes=table.shapes, shape=partial(forged, table), is_certified=table.is_certified
+    )
 
 
 class Knows(gym.Wrapper):
