@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cache
 
 from agents.loop import LoopConfig, ShieldSettings
@@ -133,7 +134,8 @@ def _parsed(name: str, mode: str) -> Arm:
     if kind == _PENALIZED and colon and _is_weight(weight):
         kind += _RESIDUAL if name.endswith(_RESIDUAL) else ""
         return replace(known[kind], name=name, violation_weight=float(weight))
-    hint = " (several are separated by spaces)" if "," in name else ""
+    near = get_close_matches(name, known, 1)
+    hint = " (several are separated by spaces)" if "," in name else f" (did you mean {near[0]!r}?)" if near else ""
     raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
 
 

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,8 @@ def registered_env(env_id: str) -> NCSEnv:
         if name not in gym.registry:
             raise ValueError(f"module {module!r} registers no environment {name!r}")
     elif name not in registered_ids() and name not in needing_extras():
-        if f"ncs_gym/{name}" in registered_ids():
-            raise ValueError(f"unknown environment {env_id!r}; did you mean 'ncs_gym/{name}'?")
+        if near := get_close_matches(f"ncs_gym/{name.removeprefix('ncs_gym/')}", registered_ids(), 1, 0.95):
+            raise ValueError(f"unknown environment {env_id!r}; did you mean {near[0]!r}?")
         raise ValueError(
             f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "
             "module that registers one of your own"

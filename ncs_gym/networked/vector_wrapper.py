@@ -18,7 +18,7 @@ from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor, require_action
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
-from ncs_gym.validation import AroundEnvironment, require_batched_infos
+from ncs_gym.validation import AroundEnvironment, require_batched_infos, shown
 
 
 class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
@@ -64,7 +64,9 @@ class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
     ) -> None:
         given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "late": late, "idle": idle}
         given |= {"neutral": neutral, "pending": pending, "delay_reward": delay_reward}
-        if not isinstance(env.unwrapped, VectorEnv) or isinstance(env.unwrapped, NCSVectorEnv):
+        if not isinstance(env, VectorEnv):
+            raise ValueError(f"VectorNetworked takes vector environments, as gym.make_vec returns, got {shown(env)}")
+        if isinstance(env.unwrapped, NCSVectorEnv):
             raise ValueError("expected a vector environment without a network of its own: an NCSVectorEnv has one")
         self._settings = settings = NetworkSettings(env.single_observation_space, env.single_action_space, given)
         if settings.channels[0].on_request:

@@ -18,7 +18,7 @@ from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.settings import NetworkSettings, Predictor, require_action
-from ncs_gym.validation import AroundEnvironment, warn_caller
+from ncs_gym.validation import AroundEnvironment, shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
 PATIENCE = 10
@@ -108,6 +108,8 @@ class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     ) -> None:
         given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "late": late, "idle": idle}
         given |= {"neutral": neutral, "pending": pending, "delay_reward": delay_reward}
+        if not isinstance(env, gym.Env):
+            raise ValueError(f"Networked takes an environment, as gym.make returns it, got {shown(env)}")
         if isinstance(env.unwrapped, NCSEnv):
             raise ValueError("an NCSEnv has its own network: give gym.make(id, channel=..., downlink=...)")
         self._settings = settings = NetworkSettings(env.observation_space, env.action_space, given)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -388,7 +389,10 @@ def _require_limits(arguments: dict[str, Any]) -> None:
     needed = ("box", "state_limits", "output_limits"), ("u_max", "input_limits", "input_ends")
     missing = [names[:2] for names in needed if all(arguments.get(name) is None for name in names)]
     if missing:
-        raise TypeError(f"LinearPlant needs limits: give {', and '.join(' or '.join(names) for names in missing)}")
+        wanted = ", and ".join(" or ".join(names) for names in missing)
+        near = [name for name in arguments if any(get_close_matches(name, names, 1, 0.8) for names in missing)]
+        given = f" (it has no argument {', '.join(near)})" if near else ""
+        raise TypeError(f"LinearPlant needs limits: give {wanted}{given}")
 
 
 def _input_fields(given: dict[str, Any], center: np.ndarray) -> dict[str, Any]:

@@ -394,6 +394,11 @@ PLANTS = [
         TypeError,
         "needs limits: give box or state_limits, and u_max or input_limits",
     ),
+    (
+        partial(LinearPlant, A=A, B=B, dt=0.1, box=[1.0, 1.0], umax=1.0),
+        TypeError,
+        r"needs limits: give u_max or input_limits \(it has no argument umax\)",
+    ),
     *(
         (make, r"C= is not an argument: pass box=.* \|c_j x\| <= 1 .* H=.* output matrix")
         for make in (

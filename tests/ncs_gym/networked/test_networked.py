@@ -342,6 +342,8 @@ def test_wrong_settings_are_one_sentence(settings, sentence):
 
 
 def test_networks_that_do_not_fit_are_one_sentence():
+    with pytest.raises(ValueError, match=r"takes an environment, as gym.make returns it, got 'Pendulum-v1'"):
+        Networked("Pendulum-v1")
     with pytest.raises(ValueError, match="an NCSEnv has its own network"):
         Networked(gym.make("ncs_gym/TruckTrailer-v0"))
     with pytest.raises(ValueError, match="has no floats to quantize"):

@@ -128,5 +128,7 @@ def test_many_large_observations_are_what_they_were():
 def test_what_vector_environments_cannot_have_is_one_sentence():
     with pytest.raises(ValueError, match="samples on request are for single environments"):
         VectorNetworked(SyncVectorEnv([Counter]), Channel(on_request=True))
+    with pytest.raises(ValueError, match=r"takes vector environments, as gym.make_vec returns, got <"):
+        VectorNetworked(gym.make("Pendulum-v1"))
     with pytest.raises(ValueError, match="an NCSVectorEnv has one"):
         VectorNetworked(gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2))
