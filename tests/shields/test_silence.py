@@ -1,6 +1,7 @@
 """What is said in advance of a contract that is exceeded, by simulation and linear programs of its own."""
 
 from dataclasses import replace
+from functools import cache
 
 import gymnasium as gym
 import numpy as np
@@ -19,29 +20,32 @@ CASES = ("CartPole", "CSTR", "Convoy", "Pendulum", "drifts")
 HEARD, SILENT = 24, 80
 
 
+@cache
 def registered(name):
-    """A registered plant and its certificate, or one whose set leaves more than a step beyond the contract."""
+    """A registered plant, its certificate and its silence, or those of one whose set leaves more than a step."""
     if name == "drifts":
         plant = small([[1.02, 0.05], [0.0, 0.9]])
-        return plant, certificate_of(plant, ChannelContract(6), "polytope")
-    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    return env.plant, certificate_for(env.plant, env.certificate_contract)
+        certificate = certificate_of(plant, ChannelContract(6), "polytope")
+    else:
+        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+        plant, certificate = env.plant, certificate_for(env.plant, env.certificate_contract)
+    return plant, certificate, shields.silence_of(certificate, plant)
 
 
 def simulated(plant, certificate, age, steps, start, error, disturbances, from_estimate):
-    """States and fallback inputs, `age` steps after the oldest sample; the disturbances begin there."""
-    rest, K = certificate.resting_state, certificate.K
+    """Last states and fallback inputs of q simulations, (n, q) and (m, q), begun `age` steps after the oldest sample.
+
+    Starts, errors and each of the disturbances, which begin at that sample, are (n, q).
+    """
+    rest, K = certificate.resting_state[:, None], certificate.K
     for w in disturbances[:age]:
         error = plant.A @ error - w
     x_hat = start if from_estimate else start + error
-    x, states, inputs = x_hat - error, [], []
-    for j in range(steps + 1):
-        u = certificate.resting_input + K @ (x_hat - rest)
-        states.append(x)
-        inputs.append(u)
-        if j < steps:
-            x, x_hat = plant.A @ x + plant.B @ u + disturbances[age + j], plant.A @ x_hat + plant.B @ u
-    return np.array(states), np.array(inputs)
+    x = x_hat - error
+    for w in disturbances[age : age + steps]:
+        u = certificate.resting_input[:, None] + K @ (x_hat - rest)
+        x, x_hat = plant.A @ x + plant.B @ u + w, plant.A @ x_hat + plant.B @ u
+    return x, certificate.resting_input[:, None] + K @ (x_hat - rest)
 
 
 def extremes(plant, certificate, age, steps, share=None):
@@ -49,22 +53,18 @@ def extremes(plant, certificate, age, steps, share=None):
 
     The map from start, error and disturbances is taken from simulations, the extremes from its linear parts.
     """
-    n = plant.n
-    sizes = [n, n, *[n] * (age + steps)]
-
-    def values(z):
-        start, error, *disturbances = np.split(z, np.cumsum(sizes)[:-1])
-        given = start, error, np.array(disturbances).reshape(-1, n), share is not None
-        states, inputs = simulated(plant, certificate, age, steps, *given)
-        return np.concatenate([plant.box @ states[-1], inputs[-1]])
-
-    constant = values(np.zeros(sum(sizes)))
-    linear = np.array([values(unit) - constant for unit in np.eye(sum(sizes))]).T
+    count = 2 + age + steps
+    cases = np.hstack([np.zeros((count * plant.n, 1)), np.eye(count * plant.n)])
+    start, error, *disturbances = np.split(cases, count)
+    x, u = simulated(plant, certificate, age, steps, start, error, disturbances, share is not None)
+    values = np.concatenate([plant.box @ x, u])
+    constant = values[:, 0]
+    linear = values[:, 1:] - constant[:, None]
     P, rest = certificate.polytope, certificate.resting_state
     roots = [certificate.Sigma] + [plant.disturbance.shape_matrix] * (age + steps)
     least, largest = [], []
     for row, offset in zip(linear, constant, strict=True):
-        of_start, *others = np.split(row, np.cumsum(sizes)[:-1])
+        of_start, *others = np.split(row, count)
         reach = sum(np.sqrt(max(g @ shape @ g, 0.0)) for g, shape in zip(others, roots, strict=True))
         ends = []
         for sign in (-1.0, 1.0):
@@ -91,8 +91,7 @@ def exceeds_limits(plant, values):
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_numbers_are_those_of_the_worst_start_error_and_disturbances(name):
-    plant, certificate = registered(name)
-    found = shields.silence_of(certificate, plant)
+    plant, certificate, found = registered(name)
     assert found.max_age == certificate.contract.max_age
     assert 1 <= found.anywhere <= found.at_half < found.at_rest < MOST_STEPS
     cases = [(found.at_half, 0, 0.5), (found.at_rest, 0, 0.0)]
@@ -114,8 +113,8 @@ def test_the_numbers_are_those_of_the_worst_start_error_and_disturbances(name):
 
 def test_box_is_kept_in_silence_under_the_worst_disturbances():
     """From estimates in half of the set at the oldest age, with the fallback input; later it is left."""
-    plant, certificate = registered("CartPole")
-    found, h = shields.silence_of(certificate, plant), certificate.contract.max_age
+    plant, certificate, found = registered("CartPole")
+    h = certificate.contract.max_age
     trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * SILENT
     channel = TraceChannel(trace=tuple(trace), quantization_step=certificate.contract.quantization_step)
     env = gym.make_vec(
@@ -142,8 +141,8 @@ def test_box_is_kept_in_silence_under_the_worst_disturbances():
 
 
 def test_box_is_kept_in_silence_whatever_an_agent_does():
-    plant, certificate = registered("drifts")
-    found, h = shields.silence_of(certificate, plant), certificate.contract.max_age
+    plant, certificate, found = registered("drifts")
+    h = certificate.contract.max_age
     assert found.anywhere > 10
     assert shields.silence_of(certificate.without_polytope(), plant).anywhere >= found.anywhere
     trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * 200
@@ -163,8 +162,7 @@ def test_box_is_kept_in_silence_whatever_an_agent_does():
 
 
 def test_it_is_said_in_words_that_fit_a_terminal():
-    plant, certificate = registered("drifts")
-    found = shields.silence_of(certificate, plant)
+    found = registered("drifts")[2]
     text = " ".join(str(found).split())
     assert f"is {6 + found.anywhere} steps ({0.1 * (6 + found.anywhere):.3g} s) old" in text
     assert "after 12, 60 and 600 steps" in text
@@ -194,8 +192,9 @@ def test_the_numbers_do_not_depend_on_units():
         found = shields.silence_of(replace(certificate, fingerprint=narrow.fingerprint), narrow)
         return found.anywhere, found.at_half, found.at_rest
 
-    assert steps(1e-11) == steps(1.0)
-    assert steps(1.0)[0] > 3
+    usual = steps(1.0)
+    assert steps(1e-11) == usual
+    assert usual[0] > 3
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-12, 1e12])
@@ -216,8 +215,7 @@ def test_bounds_of_rows_hold_whatever_the_solver_says(size):
 
 
 def test_without_a_contract_there_is_nothing_to_exceed():
-    plant, certificate = registered("TruckTrailerCruise")
-    assert shields.silence_of(certificate, plant) is None
+    assert registered("TruckTrailerCruise")[2] is None
 
 
 def test_certificates_of_other_plants_are_refused():
