@@ -65,11 +65,11 @@ class SafetyCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         if self.num_timesteps - self._last.steps >= self._interval:
-            self._add_point()
+            self.add_point()
 
     def _on_training_end(self) -> None:
         if self._last.steps < self.num_timesteps:
-            self._add_point()
+            self.add_point()
 
     @property
     def so_far(self) -> list[TrainingPoint]:
@@ -86,7 +86,8 @@ class SafetyCallback(BaseCallback):
         mean = float(np.mean(returns)) if returns else float("nan")
         return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions)
 
-    def _add_point(self) -> None:
+    def add_point(self) -> None:
+        """Adds a point to the curve, of what happened since the last one."""
         last = self._last
         taken = max(self.num_timesteps - last.steps, 1)
         self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)

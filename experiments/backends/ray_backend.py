@@ -36,9 +36,9 @@ def joined_cluster(settings: BackendSettings) -> Iterator[RayCluster]:
     Raises:
         ClusterError: If the cluster cannot be reached, is too small, or has other versions.
     """
-    with _connected(settings.ray_address):
+    with connected(settings.ray_address):
         _require_large_node(settings)
-        cluster = RayCluster(_remote(portable_task(), settings))
+        cluster = RayCluster(as_remote(portable_task(), settings))
         try:
             yield cluster
         finally:
@@ -94,7 +94,7 @@ class RayCluster:
 
 
 @contextmanager
-def _connected(address: str) -> Iterator[None]:
+def connected(address: str) -> Iterator[None]:
     """Joins a cluster, or starts one that ends with this process, and leaves it as it was."""
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address == OWN_CLUSTER:
@@ -116,7 +116,7 @@ def _connected(address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def _remote(function: Callable[..., Any], settings: BackendSettings) -> Any:
+def as_remote(function: Callable[..., Any], settings: BackendSettings) -> Any:
     """Returns a function that Ray calls on a node with free resources; again if its worker dies, not if it raises."""
     return ray.remote(function).options(
         num_cpus=settings.cpus_per_run, num_gpus=settings.gpus_per_run, max_retries=RETRIES, retry_exceptions=False
@@ -131,7 +131,7 @@ def _require_large_node(settings: BackendSettings) -> None:
         return
     if settings.ray_wait:
         say(f"no node is large enough yet; waiting up to {settings.ray_wait:g} s for one")
-        request = _remote(lambda: None, settings).remote()  # a cluster grows by unmet demand
+        request = as_remote(lambda: None, settings).remote()  # a cluster grows by unmet demand
         if ray.wait([request], timeout=settings.ray_wait)[0]:
             return
         ray.cancel(request, force=True)

@@ -26,10 +26,11 @@ def audit(settings: AuditSettings) -> None:
     document = json.dumps([asdict(claim) for claim in claims], indent=1)
     if settings.out is not None:
         write_atomically(settings.out, document + "\n")
-    print(document if settings.json else _text(claims, terminal_width()))
+    print(document if settings.json else text_of(claims, terminal_width()))
 
 
-def _text(claims: Sequence[Claim], width: int) -> str:
+def text_of(claims: Sequence[Claim], width: int) -> str:
+    """Returns the claims as a terminal of some width shows them."""
     blocks = []
     for number, claim in enumerate(claims, 1):
         lines = [_wrapped(f"{number:2d}.", f"{claim.verdict.upper()}: {claim.claim}", width, indent=4)]

@@ -73,7 +73,7 @@ def loop(settings: LoopSettings) -> None:
                     time.sleep(_PERIOD / 4)
                 raise ChildProcessError("a process of the loop ended by itself; its message is above")
         else:
-            with _view(settings, env) as show:
+            with LiveView(settings, env) as show:
                 alone = lambda: not all(each.is_alive() for each in processes)  # noqa: E731
                 was_told = run_controller_node(network_loop, show, alone)
             if not was_told and alone():
@@ -87,14 +87,14 @@ def loop(settings: LoopSettings) -> None:
             process.kill()
     summary = summary_of(settings.out)
     write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
-    print(_text(summary))
+    print(text_of(summary))
     if refused := {
         reason: summary[_BY_REASON + words] for reason, words in REFUSED.items() if _BY_REASON + words in summary
     }:
         print(wrapped(f"Of the datagrams refused: {suspects_text(refused, settings)}."))
 
 
-def _text(summary: dict[str, Any]) -> str:
+def text_of(summary: dict[str, Any]) -> str:
     """Returns a summary as a table, and below it a sentence for each reason why steps were not proved."""
     reasons = {name: count for name, count in summary.items() if name.startswith(_NOT_PROVED)}
     numbers = {name: value for name, value in summary.items() if name not in reasons}
@@ -150,7 +150,7 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     return NetworkLoop(settings=settings, uplink=uplink, downlink=downlink, secret=key, max_age=max_age)
 
 
-class _view:
+class LiveView:
     """Shows the loop while it runs: a table with rich if it is installed, else a line per second; or nothing."""
 
     def __init__(self, settings: LoopSettings, env: NCSEnv) -> None:

@@ -15,11 +15,12 @@ def reproduce(settings: ReproduceSettings) -> None:
             simulations = [simulate(design, settings, bar) for design in designs()]
         outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
         write_results(settings.out, outcomes, figures=reproduction_figures(simulations))
-        print(_table(outcomes))
+        print(table_of(outcomes))
         print(f"files: {settings.out}")
 
 
-def _table(outcomes: dict[str, dict[str, float | None]]) -> str:
+def table_of(outcomes: dict[str, dict[str, float | None]]) -> str:
+    """Returns what happened in each simulation as a table."""
     rows = [
         ("steps outside the safe set", "{outside_set:,} of {steps:,}"),
         ("steps outside the safe box", "{outside_box:,} of {steps:,}"),

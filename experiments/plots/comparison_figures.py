@@ -276,7 +276,7 @@ def _draw_events(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
 def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> CaptionedFigure:
     """Returns two states of the first evaluation episode of each run, a panel per arm, with safe box and safe set."""
     states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
-    plane = _plane(certificate, states)
+    plane = plane_of(certificate, states)
     box = projected_box(plant.box_rows, plane)
     outlines = {"safe set": (_outline(certificate, plane), "-"), "safe box": (box, "--")}
     prefix = "" if plant.n == 2 else "projection of the "
@@ -316,7 +316,7 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
         return figure
 
 
-def _plane(certificate: Certificate, states: np.ndarray) -> tuple[int, int]:
+def plane_of(certificate: Certificate, states: np.ndarray) -> tuple[int, int]:
     """Returns the two states that are farthest from the middle of the safe set, in units of its extent; ascending."""
     safe_set, axes = certificate.safe_set, np.eye(states.shape[1])
     high, low = safe_set.support(axes), -safe_set.support(-axes)

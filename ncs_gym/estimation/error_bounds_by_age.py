@@ -92,7 +92,7 @@ class ErrorSetsByAge(ReadOnlyArrays):
             congruence_sum(
                 (kept[j], self.shapes[j + 1], INFLATION / self.multipliers[j]),
                 (self.gains[j], self.noise, INFLATION / (1.0 - self.multipliers[j])),
-                (identity, self._rounding_of_update(plant, j), 1.0),
+                (identity, self.rounding_of_update(plant, j), 1.0),
             )
             for j in range(len(self.gains))
         ]
@@ -102,7 +102,7 @@ class ErrorSetsByAge(ReadOnlyArrays):
             "(C2)": [(self.shapes[0], *inner) for inner in updated],
         }
 
-    def _rounding_of_update(self, plant: LinearPlant, j: int) -> np.ndarray:
+    def rounding_of_update(self, plant: LinearPlant, j: int) -> np.ndarray:
         """Returns F for an update with T_{j+1}, shape (n, n): at least the plant's `estimate_rounding`.
 
         With x_hat up to SIMULATED_REACH half-widths out, and a residual that an error in E(Sigma_{j+1}) and noise in

@@ -143,12 +143,12 @@ class Ellipsoid(ReadOnlyArrays):
         values, vectors = np.linalg.eigh(self.factor.T @ weight @ self.factor)
         axes = self.factor @ vectors
         slopes = np.einsum("ij,kj->ik", axes.T @ weight, np.atleast_2d(centers))
-        points = np.einsum("ij,jk->ki", axes, _farthest_coordinates(slopes, values))
+        points = np.einsum("ij,jk->ki", axes, farthest_coordinates(slopes, values))
         return points[0] if np.ndim(centers) == 1 else points
 
 
 @own_error_state  # a slope of zero on the longest axis ends in 0/0, centers far away in infinity
-def _farthest_coordinates(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
+def farthest_coordinates(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns the s, |s| <= 1, that maximize s' diag(values) s + 2 slope's, in columns, shape (n, count).
 
     Args:

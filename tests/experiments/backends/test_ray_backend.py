@@ -139,7 +139,7 @@ def local(tmp_path_factory):
 def own_ray():
     """A Ray of the tests' own process."""
     handler = signal.getsignal(signal.SIGTERM)
-    with ray_backend._connected("local"):
+    with ray_backend.connected("local"):
         assert signal.getsignal(signal.SIGTERM) is handler
         yield
 
@@ -262,7 +262,7 @@ def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
             file.write("call\n")
         raise KeyError("mine")
 
-    error = failure_of(ray_backend._remote(fail, ONE_CORE))
+    error = failure_of(ray_backend.as_remote(fail, ONE_CORE))
     assert isinstance(error, RunError)
     assert str(error).startswith("run its-name: KeyError: 'mine' (NCS_DEBUG=1")
     assert Path(calls).read_text() == "call\n"
@@ -276,14 +276,14 @@ def test_worker_that_always_dies_is_given_up_and_named(own_ray, tmp_path):
             file.write("call\n")
         os._exit(1)
 
-    error = failure_of(ray_backend._remote(die, ONE_CORE))
+    error = failure_of(ray_backend.as_remote(die, ONE_CORE))
     assert isinstance(error, RunError)
     assert str(error).startswith("run its-name: its worker died, 3 retries included")
     assert Path(calls).read_text() == "call\n" * (1 + ray_backend.RETRIES)
 
 
 def test_node_with_another_source_is_refused_in_one_sentence(own_ray):
-    error = failure_of(ray_backend._remote(portable_task(), ONE_CORE), versions() | {"source": "other"}, b"")
+    error = failure_of(ray_backend.as_remote(portable_task(), ONE_CORE), versions() | {"source": "other"}, b"")
     assert isinstance(error, ClusterError)
     assert "another source of ncs-gym than the driver" in str(error)
 
@@ -304,7 +304,7 @@ def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
         finally:
             sys.path.remove(path)
 
-    error = failure_of(ray_backend._remote(bare, ONE_CORE), str(tmp_path))
+    error = failure_of(ray_backend.as_remote(bare, ONE_CORE), str(tmp_path))
     assert isinstance(error, RunError)
     assert re.match(r"run its-name: node .* cannot import ncs-gym .*: install the same on every", str(error))
 
@@ -319,7 +319,7 @@ def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
 
     import torch
 
-    found = ray.get(ray_backend._remote(threads, HALF_A_CORE).remote())
+    found = ray.get(ray_backend.as_remote(threads, HALF_A_CORE).remote())
     assert found == (os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads())
 
 

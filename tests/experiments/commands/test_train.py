@@ -60,14 +60,14 @@ def test_more_steps_go_on_from_the_agent_and_everything_else_is_refused(tmp_path
 
 
 def test_interrupted_training_goes_on_where_it_was(tmp_path, without_workers, monkeypatch):
-    folder, add_point = tmp_path / "r", SafetyCallback._add_point
+    folder, add_point = tmp_path / "r", SafetyCallback.add_point
 
     def interrupt(callback):
         add_point(callback)
         if callback.num_timesteps >= 1024:
             raise RunStopped("the user interrupted")
 
-    monkeypatch.setattr(SafetyCallback, "_add_point", interrupt)
+    monkeypatch.setattr(SafetyCallback, "add_point", interrupt)
     assert ncs("train", "--steps", 2048, *SHORT, folder).returncode == 2
     monkeypatch.undo()
     checkpoint = folder / "tensorboard" / "shielded-0" / "checkpoint"

@@ -108,13 +108,13 @@ class Shown:
             stream = io.StringIO()
             patch.setattr("sys.stdout", stream)
             patch.setenv("COLUMNS", str(WIDTH))
-            with loop._view(LoopSettings(env=CRUISE, live="yes"), env) as show:
+            with loop.LiveView(LoopSettings(env=CRUISE, live="yes"), env) as show:
                 show(row)
         summary = {
             "ms into the step, 50/99.9/100 %": "123.45 / 123.45 / 123.45",
             f"not proved, {row['reason']}": 12_345,
         }
-        return f"{stream.getvalue()}\n{loop._text(summary)}"
+        return f"{stream.getvalue()}\n{loop.text_of(summary)}"
 
     def synthesize(self):
         return printed("synthesize", "--plant", self.plant, "--max-age", 2, "--out", self.folder / "c.json")
@@ -141,17 +141,19 @@ class Shown:
 
     def audit(self):
         """`tests/experiments/commands/test_audit.py` has every claim, which takes longer."""
-        from experiments.commands.audit import _text
+        from experiments.commands.audit import text_of
         from experiments.paper.audit import audited_claims
         from experiments.paper.paper_example import PaperExample
 
         claims = audited_claims(PaperExample())
-        return _text([next(claims) for _ in range(3)], WIDTH)
+        return text_of([next(claims) for _ in range(3)], WIDTH)
 
     def reproduce(self):
         names = ("outside_set", "outside_box", "input_asked_beyond", "steps", "largest_level", "largest_input")
         names += ("largest_error", "epsilon", "largest_estimation_error")
-        return reproduce._table(dict.fromkeys(("printed", "charitable", "certified"), dict.fromkeys(names, 9_999_999)))
+        return reproduce.table_of(
+            dict.fromkeys(("printed", "charitable", "certified"), dict.fromkeys(names, 9_999_999))
+        )
 
 
 @pytest.fixture

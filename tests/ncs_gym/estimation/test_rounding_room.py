@@ -135,7 +135,7 @@ def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_infla
     sets = sets_for_age_zero(plant, 1.0, 1.0, 0.5, [[gain]], 0.5, noise=np.ones((1, 1))).ages
     ((_, inner, _),) = sets.needs(plant)["(C2)"]
     assert inner.item() == pytest.approx(2.0 * INFLATION, rel=1e-10)
-    room = sets._rounding_of_update(plant, 0)
+    room = sets.rounding_of_update(plant, 0)
     assert room >= plant.estimate_rounding if gain else room == plant.estimate_rounding
 
 
@@ -220,5 +220,5 @@ def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(
         estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 1.0)])
         sample = matched @ (estimate + error * rng.uniform(-1.0, 1.0)) + noise * rng.uniform(-1.0, 1.0) * matched[:, 0]
         moved = max(moved, rounded_away(gain, matched, estimate, sample))
-    room = sets._rounding_of_update(plant, 0).item()
+    room = sets.rounding_of_update(plant, 0).item()
     assert 0.02 < moved / (room * (INFLATION - 1.0) / 2.0) ** 0.5 < 1.0

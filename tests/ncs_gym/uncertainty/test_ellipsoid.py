@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from ncs_gym import Ellipsoid
 from ncs_gym.estimation.innovation import outside_sum
-from ncs_gym.uncertainty.ellipsoid import _farthest_coordinates, sum_gauge
+from ncs_gym.uncertainty.ellipsoid import farthest_coordinates, sum_gauge
 from ncs_gym.uncertainty.shape_matrices import is_inside, joined, outer_sum
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
@@ -292,7 +292,7 @@ def test_the_farthest_of_many_points_are_exact_at_and_near_the_hard_case(last):
     # Without the last entry, the solution at nu = max(values) is as long as `sizes`.
     slopes = np.stack([2.0 * sizes * np.sin(angles), sizes * np.cos(angles), np.full_like(sizes, last)], axis=-1)
     slopes = slopes.reshape(-1, 3)
-    points = _farthest_coordinates(slopes.T, values).T
+    points = farthest_coordinates(slopes.T, values).T
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, rtol=1e-11)
     reached = points**2 @ values + 2.0 * np.sum(points * slopes, axis=1)
     wanted = [largest_value(slope, values) for slope in slopes]
