@@ -153,8 +153,8 @@ def _arguments(env: NCSEnv, spec: Any) -> str:
 
 def _channel(env: NCSEnv) -> str:
     texts = [env.channel.description, _contract(env.contract, env.channel)]
-    downlink = getattr(env, "downlink_protocol", None)
-    if downlink is not None:
+    downlink = env.downlink_protocol
+    if downlink.channel is not None:
         texts.append(
             f"Between controller and actuator is a network as well: `{downlink.channel}`. "
             f"An action takes effect {_steps(downlink.input_delay)} later."

@@ -72,8 +72,7 @@ class AttackCase:
     @property
     def certificate_contract(self) -> ChannelContract | None:
         """Contract that the certificate rests on, which counts the steps of both channels; None for a stable plant."""
-        protocol = downlink_protocol(self.downlink, self.downlink_contract)
-        return self.contract if protocol is None else protocol.behind(self.contract)
+        return downlink_protocol(self.downlink, self.downlink_contract).behind(self.contract)
 
     @property
     def keeps_contract(self) -> bool:
@@ -124,8 +123,7 @@ def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[st
     """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
     channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
     channels |= _CHANNELS if all_channels else {}
-    protocol = env.downlink_protocol
-    downlink = (None, None) if protocol is None else (protocol.channel, protocol.contract)
+    downlink = env.downlink, env.downlink_contract
     cases = {
         kind: AttackCase(env.plant, channel, env.contract, env.process, *downlink) for kind, channel in channels.items()
     }

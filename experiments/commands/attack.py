@@ -93,8 +93,7 @@ def shortened(settings: AttackSettings) -> AttackSettings:
 def _require_claims(cases: dict[str, AttackCase]) -> None:
     """Raises unless something is claimed of every case."""
     for name, case in cases.items():
-        protocol = downlink_protocol(case.downlink, case.downlink_contract)
-        if protocol is not None and protocol.contract is None:
+        if downlink_protocol(case.downlink, case.downlink_contract).contract is None:
             raise ValueError(
                 f"{name}: nothing is claimed behind a downlink without a contract, so that there is nothing to attack; "
                 "give it max_consecutive_losses, or the environment downlink_contract=ChannelContract(c)"

@@ -157,10 +157,9 @@ def gaussian_noise_of(loop: LoopConfig, certificate: Certificate, arms: Mapping[
     """
     env = ncs_env(loop.single())
     steps = gym.spec(loop.env).max_episode_steps or 1
-    protocol = env.downlink_protocol
-    input_delay, is_promised = (0, True) if protocol is None else (protocol.input_delay, protocol.contract is not None)
-    known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, input_delay)
-    begins_inside = is_promised and all(each.in_safe_set for each in known)
+    downlink = env.downlink_protocol
+    known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, downlink.input_delay)
+    begins_inside = downlink.contract is not None and all(each.in_safe_set for each in known)
     bound = bound_violation_probability(env.plant, env.channel, steps) if begins_inside else 1.0
     claimed = {name: arm for name, arm in arms.items() if arm["shielded"] and arm["mode"] != "lookahead"}
     return gaussian_summary(bound, steps, claimed)

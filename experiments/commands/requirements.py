@@ -117,7 +117,7 @@ def _plant_and_network(settings: RequirementsSettings) -> tuple[LinearPlant, Net
         losses=channel.most_consecutive_losses,
         delay=channel.delay,
         jitter=channel.jitter,
-        input_delay=0 if env.downlink_protocol is None else env.downlink_protocol.input_delay,
+        input_delay=env.downlink_protocol.input_delay,
         quantization_step=channel.quantization_step,
     )
     return plant, network
@@ -390,7 +390,7 @@ def _requests_text(found: Requirements, settings: RequirementsSettings) -> str:
         f"Samples are on request: of those newer than the newest that arrived, {spare} may be left out under the "
         f"contract of {_steps(env.contract.max_age)}"
     )
-    delay = 0 if env.downlink_protocol is None else env.downlink_protocol.input_delay
+    delay = env.downlink_protocol.input_delay
     largest = [each.certified for each in found.largest_ages if each.certified not in (None, inf)]
     if len(largest) == 1 and (oldest := int(largest[0]) - delay) >= env.contract.max_age:
         longest = spare_samples(env.channel, ChannelContract(oldest, env.contract.quantization_step))

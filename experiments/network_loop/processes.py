@@ -109,9 +109,7 @@ class NetworkLoop:
     @property
     def protocol(self) -> DownlinkProtocol:
         """How commands are sent, and how many steps after the decision they take effect."""
-        protocol = downlink_protocol(self.promised[1], None)
-        assert protocol is not None
-        return protocol
+        return downlink_protocol(self.promised[1], None)
 
     @property
     def contract(self) -> ChannelContract | None:

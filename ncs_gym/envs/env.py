@@ -143,7 +143,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             [steps], and "error", the n half-widths of the error's ellipsoid E(Sigma_k) [units of the states].
 
     Attributes:
-        downlink_protocol: How commands are sent over the downlink, with its `input_delay`; None for an ideal downlink.
+        downlink_protocol: How commands are sent over the downlink, with its `input_delay`: 0 for an ideal one.
         certificate_contract: Contract that a certificate for this environment rests on: `contract` with c steps added.
         steps: Steps taken in this episode.
         episodes: Episodes begun.
@@ -178,7 +178,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     process: Process = setting("process", "_process_given")
     downlink: Channel | None = channel_setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract")
-    downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
+    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_protocol")
 
     @own_error_state
     def __init__(
@@ -220,7 +220,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
         self._contract, self._protocol, self._certificate_contract = contracts
         self._downlink = downlink
-        self._downlink_contract = None if self._protocol is None else self._protocol.contract
+        self._downlink_contract = None if downlink is None else self._protocol.contract
         histories = arrival_histories(plant, self._channel, self._certificate_contract)
         self._error_set = histories.recursion.error_set
         if not histories.uses_samples:

@@ -135,7 +135,7 @@ def uplinks(own: Sequence[Channel], declared: Channel) -> EpisodeChannels:
     return EpisodeChannels(own, partial(_require_like, declared))
 
 
-def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol | None) -> EpisodeChannels:
+def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol) -> EpisodeChannels:
     """Returns the channels between controllers and actuators, which keep the c steps of a protocol."""
     return EpisodeChannels(own, partial(require_fitting_downlink, protocol))
 

@@ -32,7 +32,7 @@ def channel_setting(name: str, kept_as: str | None = None) -> Any:
 
 def loop_contracts(
     plant: LinearPlant, channel: Channel, contract: Any, downlink: Any, downlink_contract: Any
-) -> tuple[ChannelContract | None, DownlinkProtocol | None, ChannelContract | None]:
+) -> tuple[ChannelContract | None, DownlinkProtocol, ChannelContract | None]:
     """Returns the contract of the uplink, the protocol of the downlink and the contract of a certificate for both.
 
     The certificate's also counts the steps between a decision and its effect.
@@ -53,7 +53,7 @@ def loop_contracts(
             f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
         )
     protocol = downlink_protocol(downlink, downlink_contract)
-    return contract, protocol, contract if protocol is None else protocol.behind(contract)
+    return contract, protocol, protocol.behind(contract)
 
 
 def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:

@@ -84,7 +84,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     error_set: ErrorSet = setting("error_set")
     downlink: Channel | None = channel_setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract", "_single.downlink_contract")
-    downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
+    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
 
@@ -133,8 +133,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
         self._requests = None
         if self._channel.on_request:
-            input_delay = 0 if self._protocol is None else self._protocol.input_delay
-            self._requests = Requests(self._channel, self._contract, input_delay, self.num_envs)
+            self._requests = Requests(self._channel, self._contract, self._protocol.input_delay, self.num_envs)
         self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
         self._state = np.zeros((self._plant.n, self.num_envs))
         self._worst = self._plant.values_at_start(self._state)

@@ -27,12 +27,12 @@ class DownlinkProtocol:
     applies exactly what was decided for t, and no acknowledgement is needed.
 
     Attributes:
-        channel: What happens to the commands.
+        channel: What happens to the commands; None for an ideal downlink, on which decisions are applied at once.
         input_delay: c, the number of steps from a decision to its effect.
         contract: What the channel guarantees, or what is assumed of it; None for nothing.
     """
 
-    channel: Channel
+    channel: Channel | None
     input_delay: int
     contract: ChannelContract | None
 
@@ -52,8 +52,11 @@ class DownlinkProtocol:
         return ChannelContract(age, contract.quantization_step)
 
 
-def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None) -> DownlinkProtocol | None:
-    """Returns the protocol for a downlink; None for an ideal one.
+IDEAL_DOWNLINK = DownlinkProtocol(None, 0, ChannelContract(0))
+
+
+def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None) -> DownlinkProtocol:
+    """Returns the protocol for a downlink.
 
     Without a contract, given or by the channel's own settings, inputs are committed ahead for the longest delay only:
     that can be simulated, but nothing is guaranteed.
@@ -69,7 +72,7 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
     if downlink is None:
         if contract is not None:
             raise ValueError("downlink_contract is about a downlink: give downlink=Channel(...), too")
-        return None
+        return IDEAL_DOWNLINK
     if not isinstance(downlink, Channel):
         raise ValueError(f"downlink must be of type Channel, got {shown(downlink)}")
     if downlink.quantization_step != 0.0:
@@ -96,14 +99,14 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
     return DownlinkProtocol(downlink, input_delay, contract)
 
 
-def require_fitting_downlink(protocol: DownlinkProtocol | None, downlink: Channel) -> None:
+def require_fitting_downlink(protocol: DownlinkProtocol, downlink: Channel) -> None:
     """Raises unless a downlink may take the place of that of a protocol, whose c stays; it may break the contract.
 
     Raises:
         ValueError: If there is no downlink to take the place of, or what is given is none, or delays commands by more
             than c steps.
     """
-    if protocol is None:
+    if protocol.channel is None:
         raise ValueError(
             "the environment has an ideal downlink, and commits no inputs ahead: make it with downlink=Channel(...)"
         )
@@ -134,7 +137,7 @@ class DownlinkState:
     """The commands of one control loop on their way, and the actuator's buffer.
 
     Args:
-        protocol: The channel, and how far ahead inputs are committed; None applies at once what is decided.
+        protocol: The channel, and how far ahead inputs are committed.
         inputs: m.
 
     Attributes:
@@ -142,9 +145,8 @@ class DownlinkState:
         in_flight: The channel and the commands on their way.
     """
 
-    def __init__(self, protocol: DownlinkProtocol | None, inputs: int) -> None:
-        input_delay = 0 if protocol is None else protocol.input_delay
-        self._channel = None if protocol is None else protocol.channel
+    def __init__(self, protocol: DownlinkProtocol, inputs: int) -> None:
+        self._channel, input_delay = protocol.channel, protocol.input_delay
         self._actuator, self.committed = Actuator(input_delay, inputs), CommittedInputs(input_delay, inputs)
         self.in_flight: ChannelState
 
@@ -174,7 +176,7 @@ class VectorDownlinkState:
     Every command holds the committed inputs of its c steps unchanged: which one is the newest is all that matters.
 
     Args:
-        protocol: The channel, and how far ahead inputs are committed; None applies at once what is decided.
+        protocol: The channel, and how far ahead inputs are committed.
         inputs: m.
         size: N.
 
@@ -182,9 +184,8 @@ class VectorDownlinkState:
         committed: The inputs decided and not yet applied.
     """
 
-    def __init__(self, protocol: DownlinkProtocol | None, inputs: int, size: int) -> None:
-        self._input_delay, self._size = 0 if protocol is None else protocol.input_delay, size
-        self._channel = None if protocol is None else protocol.channel
+    def __init__(self, protocol: DownlinkProtocol, inputs: int, size: int) -> None:
+        self._channel, self._input_delay, self._size = protocol.channel, protocol.input_delay, size
         self.committed = CommittedInputs(self._input_delay, (inputs, size))
         self._newest, self._on_time = np.full(size, NEVER, np.int64), np.zeros(size, np.bool_)
         self._channel_state: VectorChannelState

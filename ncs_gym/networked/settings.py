@@ -118,8 +118,7 @@ class NetworkSettings:
             for each, contract in zip(self.channels, uplink, strict=True)
         ]
         if self.downlink is not None:
-            protocol: Any = downlink_protocol(self.downlink, None)
-            return max(max(ages) + protocol.input_delay, 1)
+            return max(max(ages) + downlink_protocol(self.downlink, None).input_delay, 1)
         return max(*ages, 1)
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.network import DownlinkProtocol
+from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.validation import shown, warn_caller
@@ -107,14 +107,14 @@ class GuaranteeMonitor:
 
     Args:
         safety_filter: Makes the decisions.
-        downlink: How commands are sent; None for an ideal downlink.
+        downlink: How commands are sent.
     """
 
-    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol = IDEAL_DOWNLINK) -> None:
         plant, certificate = safety_filter.plant, safety_filter.certificate
-        self._input_delay = 0 if downlink is None else downlink.input_delay
+        self._input_delay = downlink.input_delay
         self._within_step = plant.grid_rows is not None or len(plant.mixed_rows) > 0
-        self._is_promised = downlink is None or downlink.contract is not None
+        self._is_promised = downlink.contract is not None
         self._test, self._least = safety_filter.test, safety_filter.least_safe_steps
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * plant.half_widths / (2.0 if self._input_delay else 1.0)

@@ -22,8 +22,7 @@ class MonitoredFilter:
 
     Args:
         safety_filter: Makes the decisions.
-        downlink: How commands are sent, and then what is observed belongs to the time at which the next input takes
-            effect; None for an ideal downlink.
+        downlink: How commands are sent. What is observed belongs to the time at which the next input takes effect.
 
     Attributes:
         filter: The same.
@@ -33,11 +32,11 @@ class MonitoredFilter:
         decided: Entries of the input decided last, [physical units].
     """
 
-    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None) -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol) -> None:
         self.filter, self.errors = safety_filter, NumberedErrors(safety_filter)
-        self.input_delay = 0 if downlink is None else downlink.input_delay
+        self.input_delay = downlink.input_delay
         self._monitor = GuaranteeMonitor(safety_filter, downlink)
-        self._schedule = None if downlink is None else CommittedInputs(self.input_delay, safety_filter.plant.m)
+        self._schedule = None if downlink.channel is None else CommittedInputs(self.input_delay, safety_filter.plant.m)
         self.report: LoopObservation
         self._state: MonitorState
         self._decision: Decision

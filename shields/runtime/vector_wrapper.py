@@ -88,7 +88,9 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         self._start_known = starts_known(self._filter, inner.single.initial_set, self._input_delay)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = (
-            None if inner.downlink_protocol is None else CommittedInputs(self._input_delay, (inner.plant.m, count))
+            None
+            if inner.downlink_protocol.channel is None
+            else CommittedInputs(self._input_delay, (inner.plant.m, count))
         )
         broken, wait = np.full(count, CODES[OTHER_STEPS]), np.zeros(count, np.int64)
         self._state = MonitorState(broken, nothing, nothing, nothing, wait)

@@ -80,7 +80,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
         self._lost = LostGuarantee(on_unproved, getattr(inner, "num_envs", 1))
         self._certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon, least)
-        self._input_delay = 0 if inner.downlink_protocol is None else inner.downlink_protocol.input_delay
+        self._input_delay = inner.downlink_protocol.input_delay
         self._channels: set[Channel] = set()
         self._made_for = self._premises(inner)
         if (promised := self._certificate.contract) is not None and inner.certificate_contract is None:

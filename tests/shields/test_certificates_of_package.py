@@ -29,10 +29,9 @@ def plant_and_contract(env_id):
     factory = ENVIRONMENTS[env_id]
     plant = factory.plant()
     contract = factory.contract or contract_of(factory.channel)
-    protocol = downlink_protocol(factory.downlink, None)
     if plant.spectral_radius < 1.0 and factory.contract is None:
         contract = None
-    return plant, contract if protocol is None else protocol.behind(contract)
+    return plant, downlink_protocol(factory.downlink, None).behind(contract)
 
 
 @pytest.fixture

@@ -204,8 +204,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         """For how many steps the box is said to be kept."""
         return column(info.get("shield_safe_steps", np.zeros(count or (), np.int64)))
 
-    protocol = env.downlink_protocol
-    watch, size = Watch(case, mode, 0 if protocol is None else protocol.input_delay), count or 1
+    watch, size = Watch(case, mode, env.downlink_protocol.input_delay), count or 1
     nature.adversary = adversary = Adversary(plant, certificate, rng, size)
     outcome, counts = watch.outcome, watch.outcome.counts
 

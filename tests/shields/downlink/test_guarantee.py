@@ -256,8 +256,8 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
         seen = LoopObservation(distance * PLANT.half_widths, errors, False)
         return EXPLANATIONS[monitor.reasons(monitor.start(True, True, seen))]
 
-    lately = shielded().unwrapped.downlink_protocol
-    assert [reason(distance, None) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
+    ideal, lately = downlink_protocol(None, None), shielded().unwrapped.downlink_protocol
+    assert [reason(distance, ideal) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
     assert [reason(distance, lately) for distance in (49.0, 51.0)] == ["", FAR_OUT]
 
 

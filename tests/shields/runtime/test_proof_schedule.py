@@ -222,7 +222,7 @@ def as_the_table_says(proofs: np.ndarray, c: int, on_grid: bool) -> np.ndarray:
 def test_flags_are_those_of_the_table_for_every_sequence_of_proofs(points, c):
     plant = swing() if points else replace(swing(), between_samples=None)
     shield = SafetyFilter(certificate_of(plant), plant, "switch")
-    protocol = downlink_protocol(Channel(delay=c), None) if c else None
+    protocol = downlink_protocol(Channel(delay=c) if c else None, None)
     monitor, steps = GuaranteeMonitor(shield, protocol), 4
     proofs = np.array(list(product((NOTHING, ESTIMATE, DECISION), repeat=steps + c))).T
     expected = as_the_table_says(proofs, c, bool(points))
