@@ -98,11 +98,9 @@ def call(function, *arguments):
 @on_x86
 @pytest.mark.parametrize(
     ("kernels", "wide"),
-    [
-        ("Prescott", False),
-        *(pytest.param(kernels, True, marks=pytest.mark.slow) for kernels in ("Haswell", "SkylakeX")),
-    ],
+    [("Prescott", False), ("Haswell", True), ("SkylakeX", True)],
 )
+@pytest.mark.slow  # what proves runs on other kernels as a whole, too: `make test-other-processor`
 def test_plants_are_the_same_numbers_under_other_kernels_and_their_certificates_verify(kernels, wide, tmp_path):
     for name in IDS:
         env = gym.make(f"ncs_gym/{name}-v0").unwrapped

@@ -14,7 +14,9 @@ from tests.certificates import certificate_of
 from tests.shields.polytope.limits import CONTRACT, PLANTS
 
 
-@pytest.mark.parametrize("name", ["angle", "rates", "coupled"])
+@pytest.mark.parametrize(
+    "name", ["rates", *(pytest.param(name, marks=pytest.mark.slow) for name in ("angle", "coupled"))]
+)
 def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name, tmp_path):
     plant, certificate = PLANTS[name], certificate_of(PLANTS[name], CONTRACT, "polytope")
     counts = attack(plant, certificate, 50_000)

@@ -143,7 +143,7 @@ def test_workers_end_when_their_parent_is_killed():
 
 
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_loop_over_a_network_ends_with_its_processes(number, tmp_path):
     command = ["loop", "--env", "ncs_gym/LaneKeeping-v0", "--steps", "1000000", "--port", "47810", "--live", "no"]
     code = (

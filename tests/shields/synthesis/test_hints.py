@@ -79,7 +79,7 @@ QUICK = {
         {"mixed_limit_1_factor"},
     ),
 }  # fmt: skip
-SLOW = {"one end": pytest.mark.slow, "angle with a rate": pytest.mark.slow}
+SLOW = {"room": pytest.mark.slow, "one end": pytest.mark.slow, "angle with a rate": pytest.mark.slow}
 LONG = {
     "sensor": (lambda: LinearPlant(**PENDULUM | {"disturbance_bound": 1e-3, "sensor_bound": 0.2}), 0),
     "age": (lambda: LinearPlant(**PENDULUM | {"disturbance_bound": 1e-3}), 25),
