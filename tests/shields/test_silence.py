@@ -111,14 +111,15 @@ def test_the_numbers_are_those_of_the_worst_start_error_and_disturbances(name):
     )
 
 
-def test_box_is_kept_in_silence_under_the_worst_disturbances():
+@pytest.mark.parametrize("name", ["CartPole", "CartPoleNonlinear", "CSTR"])
+def test_box_is_kept_in_silence_under_the_worst_disturbances(name):
     """From estimates in half of the set at the oldest age, with the fallback input; later it is left."""
-    plant, certificate, found = registered("CartPole")
+    plant, certificate, found = registered(name)
     h = certificate.contract.max_age
     trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * SILENT
     channel = TraceChannel(trace=tuple(trace), quantization_step=certificate.contract.quantization_step)
     env = gym.make_vec(
-        "ncs_gym/CartPole-v0", 64, channel=channel, disturbance="adversarial", terminate_on_violation=False
+        f"ncs_gym/{name}-v0", 64, channel=channel, disturbance="adversarial", terminate_on_violation=False
     )
     shield = VectorSafetyShield(env, certificate, mode="switch", on_unproved="ignore")
     rng = np.random.default_rng(0)
