@@ -120,7 +120,7 @@ def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, c
 @pytest.mark.parametrize(
     ("name", "size"),
     [("cart-pole, position and angle", 100), ("batch reactor", 60)]
-    + [pytest.param(name, 400, marks=pytest.mark.slow) for name in CASES if case(name).contract],
+    + [pytest.param(name, 150, marks=pytest.mark.slow) for name in CASES if case(name).contract],
 )
 def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract_is_kept(name, size):
     outcome, _, _ = through_estimators(case(name), 0, size, size, 7, has_outages=True)
