@@ -314,8 +314,8 @@ class ArrivalHistories:
     def after_arrival(self, history: int, age: int) -> int:
         """Returns the number of the history with one more sample, of some age; the same where it is of no use.
 
-        Samples older than the buffer, from before the first step or received before are of no use. Nor is one that is
-        older than the update that brought the error back into its certified set: a replay could take it out again.
+        Samples older than the buffer, from before the first step or received before are of no use. Nor is one since
+        whose step the error was not certified all the time, if it is now: a replay could take it out again.
         """
         if not 0 <= age <= self.buffer:
             return history
@@ -324,8 +324,8 @@ class ArrivalHistories:
             with self._lock:
                 present, priors, held, replay_from = self._history(history)
                 after = history
-                is_known = priors[age] != UNKNOWN and not held[age]
-                if is_known and self.table.is_certified(priors[age]) >= self.table.is_certified(present):
+                is_new, certified = priors[age] != UNKNOWN and not held[age], self.table.is_certified
+                if is_new and (not certified(present) or all(map(certified, priors[: age + 1]))):
                     held = (*held[:age], True, *held[age + 1 :])
                     after = self._number_of(present, priors, held, max(replay_from, age))
                 self.arrival[age, history] = after

@@ -141,6 +141,7 @@ class ErrorRecursion:
         if not is_inside(updated, newest):
             if ages is None:
                 return None
+            assert age > 0  # every update follows a prediction
             last = min(age, self._oldest)  # whatever lies in a set is led back by its gain
             if is_inside(shape, ages.shapes[last]):
                 gain, updated = ages.gains[last - 1], newest  # by (C2)

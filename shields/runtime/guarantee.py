@@ -83,7 +83,7 @@ class LoopObservation(NamedTuple):
     alarm: Any
     age: Any = 0
     damaged: Any = False
-    stays: Any = True
+    stays: Any = False
 
 
 class GuaranteeMonitor:

@@ -321,7 +321,7 @@ def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
     monitor = GuaranteeMonitor(safety_filter, downlink_protocol(Channel(delay=1), None))
     small = safety_filter.errors_of(plant.initial_error.shape_matrix)
     large = safety_filter.errors_of(np.diag([0.16, 9.0]))
-    seen = LoopObservation(np.zeros(2), small, False)
+    seen = LoopObservation(np.zeros(2), small, False, stays=True)
     passed = Decision(np.zeros(1), False, True, False, 1.0, "", np.empty((0, 1)))
     fallback = passed._replace(passed=False, fallback=True)
     state = monitor.cover(monitor.start(True, True, seen), [(True, seen)])

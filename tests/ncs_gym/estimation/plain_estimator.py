@@ -54,7 +54,8 @@ class PlainEstimator:
         for stamp, measurement, _ in packets:
             if stamp not in self.priors or stamp in self.samples:
                 continue
-            if self.statistics.certified and not self.priors[stamp].statistics.certified:
+            since = [self.priors[step].statistics.certified for step in range(stamp, self.step + 1)]
+            if self.statistics.certified and not all(since):
                 continue
             if np.isfinite(measurement).all():
                 self.samples[stamp] = measurement

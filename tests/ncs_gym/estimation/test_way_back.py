@@ -6,7 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, certified_error_set
+from ncs_gym import Channel, ChannelContract, Packet, certified_error_set
+from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from ncs_gym.validation import own_error_state
@@ -65,6 +66,22 @@ def test_random_unstable_plants_come_back(seed):
     plant, contract = unstable(seed)
     for contracts in (2, 100):
         assert steps_back(plant, contract, contracts * contract.max_age, contract.max_age) <= 40
+
+
+@pytest.mark.parametrize("arrivals", [{7: [4, 7], 8: [1, 8]}, {7: [4, 7], 9: [1, 9]}])
+def test_a_sample_from_before_an_outage_takes_no_error_out_of_its_set(arrivals):
+    """The error was certified at its step, too, but not all the time since."""
+    plant, contract = registered("BatchReactor")[0], ChannelContract(1)
+    error_set, channel = certified_error_set(plant, contract), Channel(jitter=10)
+    estimator, certified = Estimator(plant, channel, error_set), []
+    estimator.reset(np.zeros(plant.n))
+    for step in range(1, 10):
+        samples = [Packet(stamp, np.zeros(plant.p), estimator.episode) for stamp in arrivals.get(step, [])]
+        estimator.advance(np.zeros(plant.m), samples)
+        certified.append(estimator.table.is_certified(estimator.numbered([])[1]))
+    last = max(arrivals)
+    assert certified[:7] == [True, True, False, False, False, False, True]
+    assert certified[6:last] == [True] * (last - 6)
 
 
 def test_the_ellipsoid_of_the_way_back_holds_the_error():

@@ -253,7 +253,7 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
 
     def reason(distance, downlink):
         monitor = GuaranteeMonitor(shield, downlink)
-        seen = LoopObservation(distance * PLANT.half_widths, errors, False)
+        seen = LoopObservation(distance * PLANT.half_widths, errors, False, stays=True)
         return EXPLANATIONS[monitor.reasons(monitor.start(True, True, seen))]
 
     ideal, lately = downlink_protocol(None, None), shielded().unwrapped.downlink_protocol
@@ -268,7 +268,7 @@ def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_s
     n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
     assert UNSTABLE.certificate.contract.max_age == allowed + 2
     largest = np.linalg.eigvalsh(UNSTABLE.certificate.error_shapes).max()
-    seen = LoopObservation(np.zeros(n), shield.errors_of(1.01 * largest * np.eye(n)), False)
+    seen = LoopObservation(np.zeros(n), shield.errors_of(1.01 * largest * np.eye(n)), False, stays=True)
     state = monitor.start(True, True, seen)
     found = [EXPLANATIONS[monitor.reasons(state, age)] for age in (allowed, allowed + 1)]
     assert found == [LARGE_ERROR, OLD_SAMPLE]

@@ -84,7 +84,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
         drawn = rng.choice(6, count, p=[0.5, 0.3, 0.14, 0.02, 0.02, 0.02])
         sizes = rng.choice([0.3, 1.0, 1.5, 1e7, 1e120, np.nan], count, p=[0.3, 0.3, 0.34, 0.02, 0.02, 0.02])
         estimates = certificate.safe_set.sample_boundary(rng, count) * sizes[:, None]
-        report = LoopObservation(estimates.T, known.of(drawn), alarm)
+        report = LoopObservation(estimates.T, known.of(drawn), alarm, stays=True)
         started = monitor.start(inside, once, report)
         if state is None:
             state = started
@@ -94,7 +94,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
         reasons = [EXPLANATIONS[code] for code in monitor.reasons(state)]
         for e, reference in enumerate(references):
             observed = estimates[e], shapes[drawn[e]], bool(alarm[e])
-            alone = LoopObservation(estimates[e], shield.errors_of(shapes[drawn[e]]), bool(alarm[e]))
+            alone = LoopObservation(estimates[e], shield.errors_of(shapes[drawn[e]]), bool(alarm[e]), stays=True)
             if begins[e]:
                 reference.start(bool(inside[e]), bool(once[e]), *observed)
                 states[e] = monitor.start(bool(inside[e]), bool(once[e]), alone)
@@ -116,7 +116,7 @@ def watched(certificate, loaded):
     shield = SafetyFilter(certificate, loaded)
 
     def report(estimate=(0.0, 0.0), shape=certificate.Sigma, alarm=False):
-        return LoopObservation(np.array(estimate), shield.errors_of(shape), alarm)
+        return LoopObservation(np.array(estimate), shield.errors_of(shape), alarm, stays=True)
 
     monitor = GuaranteeMonitor(shield)
     return monitor, report, lambda state: EXPLANATIONS[monitor.reasons(state)]

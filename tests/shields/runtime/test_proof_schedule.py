@@ -230,7 +230,7 @@ def test_flags_are_those_of_the_table_for_every_sequence_of_proofs(points, c):
     def seen(proof: np.ndarray) -> LoopObservation:
         estimates = np.where(proof == ESTIMATE, 0.0, np.array([[0.95], [7.5]]))
         errors = shield.errors_of_many(plant.initial_error.shape_matrix[None]).of(np.zeros(len(proof), np.intp))
-        return LoopObservation(estimates, errors, np.zeros(len(proof), np.bool_))
+        return LoopObservation(estimates, errors, np.zeros(len(proof), np.bool_), stays=True)
 
     def inputs(proof: np.ndarray) -> Decision:
         passed = proof == DECISION

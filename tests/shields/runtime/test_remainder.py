@@ -119,7 +119,7 @@ def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_
     for error, reason in ((0.0, ""), (0.009, ""), (0.011, LEFT_MODEL)):
         errors = shield.errors_of(np.diag([1e-12, 1e-12, error**2]))
         for last in (0.99, -0.99):
-            seen = LoopObservation(np.array([0.0, 0.0, last]), errors, False)
+            seen = LoopObservation(np.array([0.0, 0.0, last]), errors, False, stays=True)
             state = GuaranteeMonitor(shield).start(True, True, seen)
             assert EXPLANATIONS[state.broken] == reason
 
