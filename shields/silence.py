@@ -118,7 +118,8 @@ class _Fallbacks:
 
         y_hat_j = (A + B K)^j (y_0 + e_0),    e_j = A^j e_0 - sum_{i<j} A^i w,    y_j = y_hat_j - e_j,
 
-    so that a limit r y_j + s u_j with u_j = K y_hat_j is a sum of supports: of S for y_0, and of E(Sigma) and E(D).
+    so that a limit r y_j + s u_j with u_j = K y_hat_j is a sum of supports: of S for y_0, and of E(Sigma) and E(D). If
+    the resting point is no equilibrium, sum_{i<j} (A + B K)^i (A x_c + B u_c - x_c) is added to y_hat_j.
 
     Args:
         certificate: Gives S, K and the error set of the oldest sample.
@@ -143,6 +144,7 @@ class _Fallbacks:
         self._on_state, self._on_input = rows[:, :n], rows[:, n:]
         self._on_estimate = self._on_state + self._on_input @ rest.gain
         self._powers, self._loops = _powers(plant.A), _powers(plant.A + plant.B @ rest.gain)
+        self._moved = plant.A @ rest.resting_state + plant.B @ rest.resting_input - rest.resting_state
         self._plant, self._set = plant, _Supports(certificate, plant)
         self._rounded = float(ACTION_ROUNDING) * plant.largest_input
         self._error = certificate.Sigma
@@ -196,6 +198,7 @@ class _Fallbacks:
             disturbed = _support(self._on_state @ self._powers[:j], self._plant.disturbance.shape_matrix)
             rounded = np.abs(self._on_estimate @ self._loops[:j] @ self._plant.B) @ self._rounded
             reach = self._own + (disturbed + rounded).sum(axis=0) + np.abs(self._on_input) @ self._rounded
+            reach = reach + np.abs(self._on_estimate @ self._loops[:j].sum(axis=0) @ self._moved)
             self._known[j] = *self._set.of(self._on_estimate @ self._loops[j]), reach
         return self._known[j]
 

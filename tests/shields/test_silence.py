@@ -141,6 +141,26 @@ def test_box_is_kept_in_silence_under_the_worst_disturbances(name):
     assert np.array(outside)[:, some].any()
 
 
+def test_a_resting_point_that_is_no_equilibrium_moves_the_estimate():
+    """A certificate of larger disturbances may have one: its own hold what it lacks."""
+    bounds = {"sensor_bound": 0.003, "initial_bound": 0.003}
+    given = {"A": [[1.02, 0.05], [0.0, 0.9]], "B": [[0.1], [0.2]], "box": np.eye(2), "dt": 0.1, "u_max": 2.0}
+    plant, wide = (LinearPlant(**given, **bounds, disturbance_bound=each) for each in (0.001, 0.005))
+    found, x_c = certificate_of(wide, ChannelContract(3), "polytope"), np.array([0.1, 0.0])
+    moved = replace(
+        found,
+        fingerprint=plant.fingerprint,
+        proofs=tuple(replace(proof, shares=None, inputs=None) for proof in found.proofs),
+        resting_state=x_c,
+        polytope=replace(found.polytope, center=x_c),
+        L=1e-4 * found.L,
+    )
+    steps = shields.silence_of(moved, plant).at_rest
+    for each in (1, steps // 2, steps):
+        assert keeps_box(plant, extremes(plant, moved, 0, each, 0.0)[0], 0.0)
+    assert not keeps_box(plant, extremes(plant, moved, 0, steps + 1, 0.0)[0], -1e-6)
+
+
 def test_box_is_kept_in_silence_whatever_an_agent_does():
     plant, certificate, found = registered("drifts")
     h = certificate.contract.max_age
