@@ -51,6 +51,7 @@ class ErrorStatistics(NamedTuple):
         age: Steps since the newest sample used was taken; the first estimate counts as a sample at step 0.
         certified: Whether E(Sigma_k) lies in the certified set of its age, and will for as long as the contract is
             kept: an update, or the first estimate, brought it into that of age 0, and from there (C1) and (C2) lead on.
+            Without a contract, whether it lies in the one certified set, which nothing leaves.
     """
 
     covariance: np.ndarray
