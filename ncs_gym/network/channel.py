@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
@@ -264,6 +265,13 @@ class TraceChannel(Channel):
                 raise ValueError(f"{name} of a TraceChannel is that of its trace, {value}: leave it out")
             object.__setattr__(self, name, value)
         super().__post_init__()
+
+    def __repr__(self) -> str:
+        more = f", on_request={self.on_request}" if self.on_request else ""
+        return (
+            f"TraceChannel(trace={reprlib.repr(self.trace)} of {len(self.trace):,} samples, "
+            f"send_period={self.send_period}, quantization_step={self.quantization_step}{more})"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         # What is computed once is left out: a copy's array would not be read-only.
