@@ -572,8 +572,8 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         )
     if guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0:
         raise ValueError(
-            "the names of the columns say no unit, and most packets would take more than a second: name it, as in sent_ms "
-            "and received_ms, or sent_s and received_s"
+            "the names of the columns say no unit, and most packets would take more than a second: name it, as in "
+            "sent_ms and received_ms, or sent_s and received_s"
         )
     epoch = "" if origin < 10**8 else ", times since 1970"
     used = {each.index for each in columns.values()}
