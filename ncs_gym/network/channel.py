@@ -5,7 +5,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import inf
 from typing import Any, NamedTuple
 
@@ -124,7 +124,7 @@ class Channel:
         )
         return 0 if never else self.max_consecutive_losses
 
-    @property
+    @cached_property
     def mean_loss(self) -> float:
         """Long-run share of samples that are lost, one every `send_period` steps."""
         bursts = (
@@ -189,7 +189,6 @@ def widest(channels: Sequence[Channel]) -> Channel:
     return replace(max(channels, key=oldest), quantization_step=coarsest)
 
 
-@lru_cache
 def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     """Returns the long-run share of packets that are lost, of one every so many steps and at most `most` in a row.
 
@@ -277,7 +276,7 @@ class TraceChannel(Channel):
         # What is computed once is left out: a copy's array would not be read-only.
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
-    @property
+    @cached_property
     def mean_loss(self) -> float:
         """Share of the trace that is lost."""
         return self.trace.count(-1) / len(self.trace)
