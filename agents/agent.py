@@ -74,7 +74,8 @@ class Agent:
             ValueError: If observations have another number of entries than those the agent was trained with, or are
                 not finite.
         """
-        shape, entries = np.shape(observations), self.normalization.mean.size
+        observations = np.asarray(observations)
+        shape, entries = observations.shape, self.normalization.mean.size
         if shape[-1:] != (entries,) or len(shape) > 2:
             raise ValueError(
                 f"the agent was trained in {self.env} with observations of {entries} entries: "

@@ -177,6 +177,8 @@ def _fits(value: Any, annotation: Any) -> bool:
 
 # The info that says what was applied: behind a downlink what was decided, to be applied later.
 APPLIED = "action_committed"
+# By how much an action may differ from the agent's that it stands for, where spaces are scaled in float32.
+_SAME_ACTION = 1e-5
 
 
 class AppliedActionBuffer(ReplayBuffer):
@@ -198,7 +200,8 @@ class AppliedActionBuffer(ReplayBuffer):
         """Adds a transition of every environment.
 
         Raises:
-            ValueError: If infos do not say what was applied, or actions have entries that are no inputs.
+            ValueError: If infos do not say what was applied, actions have entries that are no inputs, or something but
+                the shield changes them.
         """
         if any(APPLIED not in info for info in infos):
             raise ValueError(f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym')
@@ -207,5 +210,11 @@ class AppliedActionBuffer(ReplayBuffer):
             raise ValueError(
                 f'"{APPLIED}" has the shape {applied.shape}, actions have {action.shape}: a wrapper adds entries to '
                 "them, which the buffer cannot store"
+            )
+        passed = np.array([not info.get("shield_intervened", False) for info in infos])
+        if not np.allclose(applied[passed], action[passed].clip(-1.0, 1.0), atol=_SAME_ACTION):
+            raise ValueError(
+                f'"{APPLIED}" is not the action of the agent, although nothing overrode it: a wrapper outside the '
+                "shield changes actions, and the buffer cannot say which of the agent's stands for what was applied"
             )
         super().add(obs, next_obs, applied.astype(action.dtype), reward, done, infos)

@@ -270,7 +270,10 @@ def _as_json(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
             copied |= json.loads(json.dumps({name: value}, allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             given = f"{shown(name)}: {shown(value)}"
-            raise ValueError(f"hyperparameters must be JSON values, got {given} ({reason_of(error)})") from error
+            raise ValueError(
+                f"hyperparameters must be JSON values, got {given} ({reason_of(error)}); what is none is written as a "
+                "text, as in 'nn.ReLU' or 'lin_0.003'"
+            ) from error
     return copied
 
 

@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ncs_gym import Channel
 from ncs_gym.envs.json_settings import from_json
-from ncs_gym.validation import AroundEnvironment, shown
+from ncs_gym.validation import AroundEnvironment, as_matrix, as_number, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import plan_horizon
@@ -33,7 +33,7 @@ class ShieldSettings:
 
     Raises:
         ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
-            that a shield takes, or mode "lookahead" does not take the horizon or the steps.
+            that a shield takes, or mode "lookahead" does not take the horizon or the steps, or the penalty is negative.
     """
 
     certificate: Certificate
@@ -46,6 +46,7 @@ class ShieldSettings:
     def __post_init__(self) -> None:
         if not isinstance(self.certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate, got {type(self.certificate).__name__}")
+        object.__setattr__(self, "penalty", as_number(self.penalty, "penalty", low=0.0))
         object.__setattr__(self, "horizon", plan_horizon(self.mode, self.horizon, self.least_safe_steps))
         LostGuarantee(self.on_unproved)
 
@@ -86,8 +87,8 @@ class LoopConfig:
         residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
 
     Raises:
-        ValueError: If the shield is something else than its settings, another filter is given beside it, or the id is
-            not registered.
+        ValueError: If the shield is something else than its settings, another filter is given beside it, the id is
+            not registered, or a penalty or gain is wrong.
     """
 
     env: str
@@ -106,10 +107,15 @@ class LoopConfig:
         try:
             gym.spec(self.env)
         except (gym.error.Error, ImportError, AttributeError) as error:
-            raise ValueError(
-                f"{shown(self.env)} is no registered environment: import the module that registers it, or write "
-                "module:id"
-            ) from error
+            module, _, alone = self.env.rpartition(":") if isinstance(self.env, str) else ("", "", "")
+            way = f"import {module}, and give {alone!r}" if module else "import the module that registers it"
+            raise ValueError(f"{shown(self.env)} is no registered environment: {way}") from error
+        penalty = as_number(self.violation_penalty, "violation_penalty", low=0.0)
+        object.__setattr__(self, "violation_penalty", penalty)
+        if penalty and self.lagrangian is not None:
+            raise ValueError("give either violation_penalty or lagrangian, which adapts it from its own multiplier")
+        if self.residual_gain is not None:
+            object.__setattr__(self, "residual_gain", as_matrix(self.residual_gain, (None, None), "residual_gain"))
         given = {name: value for name, value in self.kwargs.items() if value is not None}
         object.__setattr__(self, "kwargs", given)
 
@@ -182,6 +188,9 @@ class ResidualActions(AroundEnvironment, VectorWrapper):
     """
 
     def __init__(self, env: VectorEnv, gain: np.ndarray) -> None:
+        actions, observations = env.single_action_space.shape, env.single_observation_space.shape
+        if actions is None or observations is None or gain.shape[0] != actions[0] or gain.shape[1] > observations[0]:
+            raise ValueError(f"residual_gain must have the shape (m, n) of actions and states, got {gain.shape}")
         self.gain = gain
         super().__init__(env)
 

@@ -245,10 +245,9 @@ def require_same_spaces(model: SavedModel, observations: gym.Space, actions: gym
     low, high = model.observations
     if low.shape != observations.shape:
         entries, own = low.size, int(np.prod(observations.shape))
-        stacked = (
-            f": of {entries // own} stacked frames" if low.ndim == 1 and entries > own and entries % own == 0 else ""
-        )
-        raise ValueError(f"it saw observations of shape {low.shape}{stacked}, and those here are {observations.shape}")
+        more = ": perhaps with observe=(...)" if low.ndim == 1 and entries > own else ""
+        more += f", or of {entries // own} stacked frames" if more and entries % own == 0 else ""
+        raise ValueError(f"it saw observations of shape {low.shape}{more}, and those here are {observations.shape}")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(
             "it saw observations without bounds, as gymnasium's NormalizeObservation makes them, whose statistics are "

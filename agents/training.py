@@ -73,7 +73,8 @@ def train(
             (starts, disturbances, noise, packet losses) as long as their episodes last equally long.
         algorithm: A name in `agents.hyperparams.ALGORITHMS`.
         hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
-            what is not given has the values of `agents.hyperparams.DEFAULTS`.
+            what is not given has the values of `agents.hyperparams.DEFAULTS`. `n_timesteps` is for `ncs train`: here
+            `steps` counts.
         log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
         on_progress: Called with the number of steps taken since its last call; `TrainingStopped` ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.

@@ -221,13 +221,15 @@ def as_numbers(value: Any) -> np.ndarray | None:
 def shown(value: Any) -> str:
     """Returns a value as messages quote it: on one line, and not without end; a path as it is.
 
-    Of a tensor with gradient, which is no array, it says what to do.
+    Of a tensor with gradient, which is no array, and of a number of a kind that numpy does not have it says what to do.
     """
     try:
         text = " ".join((str(value) if isinstance(value, PurePath) else repr(value)).split())
     except Exception:
         text = f"a {type(value).__name__}"
     text = text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+    if "bfloat16" in str(getattr(value, "dtype", "")):
+        return f"{text}, which numpy has no such numbers for: convert it (.float())"
     return f"{text}, which has a gradient: detach it (.detach())" if _has_gradient(value) else text
 
 

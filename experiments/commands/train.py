@@ -6,7 +6,7 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import Arm
+from experiments.runs.arms import Arm, require_used
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
 from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, write_results
@@ -22,7 +22,7 @@ _SMOKE = {"steps": 4_096, "episodes": 10}
 def train(settings: TrainSettings) -> None:
     """Runs `ncs train`."""
     settings = short_version(settings, **_SMOKE)
-    Arm.of(settings.arm, settings.mode)
+    require_used(settings, [settings.arm])
     loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)

@@ -232,7 +232,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._committed = self._downlink_state.committed  # the inputs until the next decision takes effect
-        self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
+        self._uplinks = uplinks([self._channel], self._channel, plant.dt)
+        self._downlinks = downlinks([downlink], self._protocol, plant.dt)
         on_request, input_delay = self._channel.on_request, len(self._committed.pending)
         self._requests = Requests(self._channel, self._contract, input_delay) if on_request else None
         self._noise = as_noise(noise, plant)

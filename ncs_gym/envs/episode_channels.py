@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorWrapper
 
 from ncs_gym.envs.json_settings import from_json, to_json
-from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel import Channel, require_duration
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
 from ncs_gym.validation import AroundEnvironment, shown
 
@@ -127,17 +127,17 @@ class EpisodeChannels:
         return channel
 
 
-def uplinks(own: Sequence[Channel], declared: Channel) -> EpisodeChannels:
-    """Returns the channels between sensors and controllers.
+def uplinks(own: Sequence[Channel], declared: Channel, dt: float) -> EpisodeChannels:
+    """Returns the channels between sensors and controllers, in steps of duration dt [s].
 
     None may round more coarsely than declared, or send samples on request if the declared one does not, or otherwise.
     """
-    return EpisodeChannels(own, partial(_require_like, declared))
+    return EpisodeChannels(own, partial(_require_uplink, declared, dt))
 
 
-def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol) -> EpisodeChannels:
-    """Returns the channels between controllers and actuators, which keep the c steps of a protocol."""
-    return EpisodeChannels(own, partial(require_fitting_downlink, protocol))
+def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol, dt: float) -> EpisodeChannels:
+    """Returns the channels between controllers and actuators, which keep the c steps of duration dt of a protocol."""
+    return EpisodeChannels(own, partial(_require_downlink, protocol, dt))
 
 
 def channel_infos(up: EpisodeChannels, down: EpisodeChannels, *, many: bool = False) -> dict[str, Any]:
@@ -173,6 +173,16 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if not env.has_wrapper_attr("episode_channel"):
             raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")
+        self.draw_from(channel, downlink)
+
+    def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
+        """Takes the place of what was given: episodes from the next one on draw from it.
+
+        Where environments are in processes of their own, vector environments call it there (docs/ncs_gym.md).
+
+        Raises:
+            ValueError: See `RandomChannel`.
+        """
         self._drawn = _drawn(channel, downlink)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -195,6 +205,10 @@ class VectorRandomChannel(AroundEnvironment, VectorWrapper, RecordConstructorArg
     def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self, channel=to_json(channel), downlink=to_json(downlink))
         VectorWrapper.__init__(self, env)
+        self.draw_from(channel, downlink)
+
+    def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
+        """See `RandomChannel.draw_from`."""
         self._drawn = _drawn(channel, downlink)
 
     def reset(
@@ -227,8 +241,15 @@ def _chosen(choices: tuple[Channel, ...], rng: np.random.Generator) -> Channel:
     return choices[int(rng.integers(len(choices)))]
 
 
-def _require_like(declared: Channel, channel: Channel) -> None:
-    """Raises ValueError if an environment made for one channel cannot have another one."""
+def _require_downlink(protocol: DownlinkProtocol, dt: float, channel: Channel) -> None:
+    """Raises ValueError if a downlink in steps of duration dt [s] cannot have another channel."""
+    require_duration(channel, dt)
+    require_fitting_downlink(protocol, channel)
+
+
+def _require_uplink(declared: Channel, dt: float, channel: Channel) -> None:
+    """Raises ValueError if an environment made for one channel, in steps of duration dt [s], cannot have another."""
+    require_duration(channel, dt)
     coarsest = declared.quantization_step
     if channel.quantization_step > coarsest:
         raise ValueError(

@@ -126,8 +126,9 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._downlink, self._protocol = single.downlink, single.downlink_protocol
         self._certificate_contract = single.certificate_contract
         count = self.num_envs
-        self._uplinks = uplinks(own[0] or [self._channel] * count, self._channel)
-        self._downlinks = downlinks(own[1] or [None] * count, self._protocol)
+        dt = self._plant.dt
+        self._uplinks = uplinks(own[0] or [self._channel] * count, self._channel, dt)
+        self._downlinks = downlinks(own[1] or [None] * count, self._protocol, dt)
         histories = arrival_histories(self._plant, self._channel, self._certificate_contract)
         self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)

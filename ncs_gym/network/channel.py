@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from math import inf
+from math import inf, isclose
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -207,6 +207,15 @@ def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     return float(1.0 - 1.0 / packets)
 
 
+def require_duration(channel: Channel, dt: float) -> None:
+    """Raises ValueError if a channel replays a record in steps of another duration than dt [s]."""
+    if isinstance(channel, TraceChannel) and channel.dt is not None and not isclose(channel.dt, dt, rel_tol=1e-6):
+        raise ValueError(
+            f"the channel replays a record in steps of {channel.dt:g} s, and steps take {dt:g} s here: make another "
+            f"one with PacketLog.channel({dt:g})"
+        )
+
+
 def in_steps(number: int) -> str:
     """Returns a number of steps in words."""
     return "1 step" if number == 1 else f"{number} steps"
@@ -234,13 +243,15 @@ class TraceChannel(Channel):
 
     Attributes:
         trace: After how many steps each sample arrived, one after the other; -1 for one that was lost, or never sent.
+        dt: Duration of these steps, which is then that of every environment with this channel [s]; None for any.
 
     Raises:
-        ValueError: If the trace is empty, has other entries or more than two million of them, or a loss or delay is
-            given that is not the trace's.
+        ValueError: If the trace is empty, has other entries or more than two million of them, a loss or delay is
+            given that is not the trace's, or dt is not positive.
     """
 
     trace: tuple[int, ...] = ()
+    dt: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.trace, str) or len(self.trace) == 0:
@@ -249,6 +260,8 @@ class TraceChannel(Channel):
             )
         if len(self.trace) > MOST_PACKETS:
             raise ValueError(f"a trace has at most {MOST_PACKETS:,} packets, got {len(self.trace):,}")
+        if self.dt is not None:
+            object.__setattr__(self, "dt", as_number(self.dt, "dt", low=0.0, low_open=True))
         trace = tuple(as_count(each, "a delay of the trace", low=-1, high=LONGEST_DELAY) for each in self.trace)
         arrived = [each for each in trace if each >= 0] or [0]
         own = {
@@ -267,6 +280,7 @@ class TraceChannel(Channel):
 
     def __repr__(self) -> str:
         more = f", on_request={self.on_request}" if self.on_request else ""
+        more += "" if self.dt is None else f", dt={self.dt}"
         return (
             f"TraceChannel(trace={reprlib.repr(self.trace)} of {len(self.trace):,} samples, "
             f"send_period={self.send_period}, quantization_step={self.quantization_step}{more})"

@@ -38,10 +38,14 @@ class ChannelContract:
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
 
+    def follows_from(self, other: ChannelContract | None) -> bool:
+        """Returns whether whatever keeps another contract keeps this one, too."""
+        is_older = other is None or other.max_age > self.max_age
+        return not is_older and other.quantization_step <= self.quantization_step
+
     def is_kept_by(self, channel: Channel) -> bool:
         """Returns whether a channel can never break this contract."""
-        promised = contract_of(channel)
-        return promised is not None and promised.max_age <= self.max_age and self.is_fine_enough_for(channel)
+        return self.follows_from(contract_of(channel))
 
     def is_fine_enough_for(self, channel: Channel) -> bool:
         """Returns whether a channel rounds no more coarsely than promised."""

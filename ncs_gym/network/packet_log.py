@@ -136,7 +136,9 @@ class PacketLog(ReadOnlyArrays):
         Raises:
             ValueError: If the record spans more than ten million steps, or the trace has more than two million entries.
         """
-        return TraceChannel(trace=self.trace(dt), send_period=self.send_period(dt), quantization_step=quantization_step)
+        return TraceChannel(
+            trace=self.trace(dt), send_period=self.send_period(dt), quantization_step=quantization_step, dt=dt
+        )
 
     @own_error_state
     def ages(self, dt: float) -> np.ndarray:

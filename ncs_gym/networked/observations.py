@@ -50,7 +50,9 @@ def parts_of(space: spaces.Space, channel: Any) -> tuple[list[Part], list[Any]]:
         keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
         if unknown := [key for key in channel if key not in keys]:
             known = f"its keys are {', '.join(map(str, keys))}" if keys else f"the space is {shown(space)}"
-            raise ValueError(f"channel has the key {shown(unknown[0])}, which observations do not have: {known}")
+            raise ValueError(
+                f"channel has the key {shown(unknown[0])}, which neither channels nor observations have: {known}"
+            )
         return [Part(key, space[key]) for key in keys], [channel.get(key) for key in keys]  # type: ignore[index]
     if isinstance(space, spaces.Tuple) and isinstance(channel, tuple | list):
         if len(channel) != len(space.spaces):
@@ -161,7 +163,7 @@ class Entries:
     """The entries that `observe` adds to observations, of one environment or of N.
 
     Args:
-        names: Which ones, of "age", "arrived" and "pending_actions".
+        names: Which ones, of "age", "arrived" and "pending_actions"; a single one also alone.
         observations: Space of the observations of one environment.
         actions: Space of its actions.
         parts: Number of parts of an observation that have a channel of their own.
@@ -175,11 +177,12 @@ class Entries:
     """
 
     def __init__(
-        self, names: Sequence[str], observations: spaces.Space, actions: spaces.Space, parts: int, pending: int
+        self, names: str | Sequence[str], observations: spaces.Space, actions: spaces.Space, parts: int, pending: int
     ) -> None:
-        if isinstance(names, str) or any(name not in ENTRIES for name in names) or len(set(names)) < len(names):
+        names = (names,) if isinstance(names, str) else tuple(names)
+        if any(name not in ENTRIES for name in names) or len(set(names)) < len(names):
             raise ValueError(f"observe must be different ones of {', '.join(ENTRIES)}, got {shown(names)}")
-        self.names, self._inner, self._actions = tuple(names), observations, actions
+        self.names, self._inner, self._actions = names, observations, actions
         made = {
             "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),
             "arrived": lambda: spaces.MultiBinary(parts),

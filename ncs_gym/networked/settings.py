@@ -11,11 +11,12 @@ from gymnasium import spaces
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, EveryEpisode
 from ncs_gym.envs.json_settings import from_json, to_json
+from ncs_gym.envs.settings import channel_setting
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
-from ncs_gym.validation import as_count, as_flag, as_numbers, shown
+from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, setting, shown
 
 LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
 # What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
@@ -120,6 +121,22 @@ class NetworkSettings:
         if self.downlink is not None:
             return max(max(ages) + downlink_protocol(self.downlink, None).input_delay, 1)
         return max(*ages, 1)
+
+
+class ReadNetwork(AroundEnvironment):
+    """Mixin of the wrappers: what they are made with is read, and never set."""
+
+    channel: Any = channel_setting("channel", "_settings.channel")
+    downlink: Channel | None = channel_setting("downlink", "_settings.downlink")
+    observe: tuple[str, ...] = setting("observe", "_settings.entries.names")
+    fill: Any = setting("fill", "_settings.fill")
+    late: str = setting("late", "_settings.late")
+    idle: str = setting("idle", "_settings.idle")
+    neutral: Any = setting("neutral", "_settings.neutral")
+    pending: int = setting("pending", "_settings.pending")
+    delay_reward: bool = setting("delay_reward", "_settings.delay_reward")
+
+    _settings: NetworkSettings
 
 
 def as_channel(value: Any, name: str) -> Channel | None:

@@ -11,17 +11,16 @@ from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.settings import channel_setting
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import NetworkSettings, Predictor, require_action
+from ncs_gym.networked.settings import NetworkSettings, Predictor, ReadNetwork, require_action
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
-from ncs_gym.validation import AroundEnvironment, require_batched_infos, shown
+from ncs_gym.validation import require_batched_infos, shown
 
 
-class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
+class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
     """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
 
     Each environment has a network of its own; all draw from one generator, so that N = 1 is what `Networked` does. It
@@ -46,8 +45,6 @@ class VectorNetworked(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
     """
 
     made_by: ClassVar[str] = "VectorNetworked(envs, channel=...)"
-    channel: Any = channel_setting("channel", "_settings.channel")
-    downlink: Channel | None = channel_setting("downlink", "_settings.downlink")
 
     def __init__(
         self,
@@ -321,7 +318,7 @@ class _Actuators:
     def exchange(
         self, rng: np.random.Generator, steps: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Sends actions; returns those that act at these steps, and how many steps ago they were decided."""
+        """Sends actions; returns those that act at these steps, and their ages, -1 for `neutral` [steps]."""
         self._link.send(rng, steps)
         self._past = [actions.copy(), *self._past[: 2 * self._link.channel.longest_delay + 1]]
         arrivals = self._link.arrivals()
@@ -334,9 +331,8 @@ class _Actuators:
             fresh = arrives & ((steps - age > self._stamp) | (self._late == "queue"))
             rows = np.flatnonzero(fresh)
             self._action[rows], self._stamp[rows], acts[rows] = self._past[age][rows], steps[rows] - age, True
-        if self._idle == "neutral":
-            return _where(acts, self._action, self._neutral), steps - self._stamp
-        return self._action.copy(), steps - self._stamp
+        decided = acts if self._idle == "neutral" else self._stamp >= 0
+        return _where(decided, self._action, self._neutral), np.where(decided, steps - self._stamp, -1)
 
     def _next_in_turn(self, arrivals: list[tuple[int, np.ndarray]]) -> list[tuple[int, np.ndarray]]:
         """Returns the command of each environment whose turn it is, by its age, and has the others wait."""

@@ -12,13 +12,12 @@ from gymnasium.utils import RecordConstructorArgs, seeding
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos
-from ncs_gym.envs.settings import channel_setting
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import NetworkSettings, Predictor, require_action
-from ncs_gym.validation import AroundEnvironment, shown, warn_caller
+from ncs_gym.networked.settings import NetworkSettings, Predictor, ReadNetwork, require_action
+from ncs_gym.validation import shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
 PATIENCE = 10
@@ -26,7 +25,7 @@ PATIENCE = 10
 NETWORK_STREAM = 0x6E6574
 
 
-class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
+class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
     """Puts a network between an environment and its agent: observations and actions are late, lost, rare or rounded.
 
     It needs no model and proves nothing; where there is a linear model, `NCSEnv` has an estimator and a shield for it.
@@ -46,7 +45,7 @@ class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     |---|---|---|---|
     | `measurement_age` | int | steps | age of the newest sample that arrived; with several channels a dictionary |
     | `packet_arrived` | bool | - | whether one arrived that is newer than all before; with several channels likewise |
-    | `action_age` | int | steps | how long ago the action that acted in this step was decided; 0 at reset |
+    | `action_age` | int | steps | how long ago the action of this step was decided; -1 for `neutral`, 0 at reset |
     | `action_applied` | of the actions | - | that action; at reset the neutral one, or zeros |
     | `packets` | int | packets | samples sent in this episode |
     | `channel_loss` | float | - | long-run share of samples that this episode's channel loses; with several likewise |
@@ -90,8 +89,6 @@ class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """
 
     made_by: ClassVar[str] = "Networked(env, channel=...)"
-    channel: Any = channel_setting("channel", "_settings.channel")
-    downlink: Channel | None = channel_setting("downlink", "_settings.downlink")
 
     def __init__(
         self,
@@ -179,10 +176,10 @@ class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Sends the action, steps the environment with the one that acts now, and sees what arrives."""
         rng, settings, step = self.np_random, self._settings, self._step
-        applied, decided_at = action, step
+        applied, action_age = action, 0
         if self._actuator is not None:
             require_action(self.action_space, action)
-            applied, decided_at = self._actuator.exchange(rng, step, _kept(action))
+            applied, action_age = self._actuator.exchange(rng, step, _kept(action))
         if self._keeps_actions:
             self._decided.append(_kept(action))
         if self._requests is not None:
@@ -211,7 +208,7 @@ class Networked(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
         if settings.delay_reward:
             earned = self._earned if terminated or truncated else max(each.earned for each in self._arrivals)
             reward, self._told = earned - self._told, earned
-        return self._seen(), reward, terminated, truncated, self._with_network(info, applied, step - 1 - decided_at)
+        return self._seen(), reward, terminated, truncated, self._with_network(info, applied, action_age)
 
     def request(self, asked: bool = True) -> None:
         """Asks for samples in the next step, where the channel takes them on request (`RequestActions`).
@@ -336,7 +333,7 @@ class _Actuator:
         self._queue: deque[tuple[int, Any]] = deque()
 
     def exchange(self, rng: np.random.Generator, step: int, action: Any) -> tuple[Any, int]:
-        """Sends an action; returns the one that acts at this step, and the step at which it was decided."""
+        """Sends an action; returns the one that acts at this step, and its age, -1 for `neutral` [steps]."""
         arrived = self._link.carry(rng, step, (step, action))
         if self._late == "drop":
             arrived = [each for each in arrived if step - each[0] == self._link.channel.delay]
@@ -346,9 +343,9 @@ class _Actuator:
         newest = max(arrived, key=lambda each: each[0], default=None)
         if newest is not None and (newest[0] > self._stamp or self._late == "queue"):
             self._stamp, self._action = newest
-        elif self._idle == "neutral":
-            return self._neutral, self._stamp
-        return self._action, self._stamp
+        elif self._idle == "neutral" or self._stamp < 0:
+            return self._neutral, -1
+        return self._action, step - self._stamp
 
 
 def _kept(action: Any) -> Any:

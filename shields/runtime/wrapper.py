@@ -51,6 +51,16 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
     on_unproved: str = setting("on_unproved", "_lost.on_unproved")
     channel: Channel = channel_setting("channel", "_inner.channel")
 
+    @property
+    def penalty(self) -> float:
+        """Subtracted from the reward per intervention; it may be changed while an agent is trained."""
+        return self._penalty
+
+    @penalty.setter
+    def penalty(self, value: float) -> None:
+        self._penalty = as_number(value, "penalty", low=0.0)
+        self._saved_kwargs["penalty"] = self._penalty  # for the spec
+
     # Class of the innermost environment, base class of the wrappers around it, and those that may not be inside.
     _wanted: type[E]
     _wrappers: Any
@@ -76,7 +86,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
         for space in ("action_space", "single_action_space"):
             if getattr(env, space, None) != getattr(inner, space, None):
                 raise ValueError(f"a wrapper inside the shield changes the action space to {getattr(env, space)}")
-        self.penalty = as_number(penalty, "penalty", low=0.0)
+        self.penalty = penalty
         self._wrappers.__init__(self, env)
         self._lost = LostGuarantee(on_unproved, getattr(inner, "num_envs", 1))
         self._certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read

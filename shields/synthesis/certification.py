@@ -137,11 +137,7 @@ def carried_over(certificate: Certificate, plant: LinearPlant, contract: Channel
     """
     promised = certificate.contract
     if plant.fingerprint == certificate.fingerprint:
-        covered = promised is None or (
-            contract is not None
-            and contract.max_age <= promised.max_age
-            and contract.quantization_step <= promised.quantization_step
-        )
+        covered = promised is None or promised.follows_from(contract)
         return certificate if covered and verify(certificate, plant).valid else None
     if certificate.L.shape != (plant.n, plant.n) or certificate.K.shape != (plant.m, plant.n):
         return None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from agents import SB3VecEnv
 from agents.loop import CostPenalty, ResidualActions
@@ -39,9 +39,15 @@ WRAPPED = {
     "shield": (shield, ("channel", "disturbance", "plant", "steps", "episode_channel")),
     "random": (lambda: RandomChannel(shield(), [Channel()]), ("channel", "downlink", "penalty", "certificate")),
     "requests": (lambda: RequestActions(gym.make(ID, **ASKS)), ("channel", "noise", "task")),
-    "network": (lambda: Networked(gym.make(CLASSIC)), ("channel", "downlink", "gravity")),
+    "network": (
+        lambda: Networked(gym.make(CLASSIC)),
+        ("channel", "downlink", "gravity", "delay_reward", "fill", "late", "idle", "neutral", "observe", "pending"),
+    ),
     "around": (lambda: RandomChannel(Networked(gym.make(CLASSIC)), [Channel()]), ("channel", "downlink", "gravity")),
-    "networks": (lambda: VectorNetworked(gym.make_vec(CLASSIC, num_envs=2)), ("channel", "downlink", "gravity")),
+    "networks": (
+        lambda: VectorNetworked(gym.make_vec(CLASSIC, num_envs=2)),
+        ("channel", "downlink", "gravity", "delay_reward", "fill"),
+    ),
     "shields": (shields, ("channel", "disturbance", "rendered_env")),
     "randoms": (lambda: VectorRandomChannel(shields(), [Channel()]), ("channel", "penalty")),
     "asking": (lambda: VectorRequestActions(gym.make_vec(ID, num_envs=2, **ASKS)), ("channel", "noise")),
@@ -105,3 +111,32 @@ def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_an
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
         ours = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, autoreset_mode=mode, **made))
         assert episodes(ours) == theirs
+
+
+@pytest.mark.parametrize("kind", ["SubprocVecEnv", "AsyncVectorEnv"])
+def test_what_is_drawn_from_changes_in_worker_processes_too(kind):
+    makes = [lambda: RandomChannel(gym.make(ID), [Channel(loss=0.1)])] * 2
+    if kind == "AsyncVectorEnv":
+        envs = gym.vector.AsyncVectorEnv(makes)
+        say, losses = envs.call, lambda: envs.reset(seed=0)[1]["channel_loss"].tolist()
+    else:
+        envs = SubprocVecEnv(makes, "fork")
+        say, losses = envs.env_method, lambda: envs.reset() is None or [i["channel_loss"] for i in envs.reset_infos]
+    try:
+        assert losses() == [0.1, 0.1]
+        say("draw_from", [Channel(loss=0.5)])
+        assert losses() == [0.5, 0.5]
+    finally:
+        envs.close()
+
+
+def test_penalty_of_a_shield_may_change_and_is_that_of_its_spec():
+    for env in (shield(), shields()):
+        env.penalty = 0.5
+        assert env.penalty == 0.5
+        with pytest.raises(ValueError, match="penalty must be a number >= 0"):
+            env.penalty = -1.0
+        assert env.penalty == 0.5
+    made_of = shield()
+    made_of.penalty = 0.5
+    assert gym.make(made_of.spec).penalty == 0.5

@@ -1,14 +1,18 @@
 """Trainings that go on from an agent, keep what they learned when they are interrupted, and learn what was applied."""
 
 import json
+from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents import Agent, LoopConfig, ShieldSettings, TrainingStopped, train
+from agents import Agent, AppliedActionBuffer, LoopConfig, ShieldSettings, TrainingStopped, train
 from agents.results import HISTORY_FILE
 from ncs_gym import truck_trailer
+from shields import SafetyShield
 from tests.certificates import certificate_of
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -104,3 +108,15 @@ def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
     np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
     proposed = train(loop, 400, 0, algorithm, REPLAY).agent.model.replay_buffer
     assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
+
+
+def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
+    def learn(env):
+        model = SAC("MlpPolicy", env, learning_starts=50, replay_buffer_class=AppliedActionBuffer, seed=0)
+        model.learn(60)
+
+    shield = partial(SafetyShield, gym.make(CRUISE))
+    learn(gym.wrappers.RescaleAction(shield(), np.float32(-3.0), np.float32(5.0)))  # stable-baselines3 scales, too
+    turned = gym.wrappers.TransformAction(shield(), lambda action: -0.5 * action, shield().action_space)
+    with pytest.raises(ValueError, match="a wrapper outside the shield changes actions"):
+        learn(turned)

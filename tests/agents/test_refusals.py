@@ -79,6 +79,13 @@ CALLS = [
     (partial(evaluate, CRUISE, None, 0, 0), "episodes must be at least 1, got 0"),
     *((partial(ShieldSettings, value), f"certificate must be a Certificate, got {type(value).__name__}") for value in
       (PAPER, None, CERTIFICATE.document)),
+    (partial(LoopConfig, env=f"ncs_gym:{CRUISE.env}"), f"import ncs_gym, and give '{CRUISE.env}'"),
+    *((partial(LoopConfig, env=CRUISE.env, violation_penalty=value), "violation_penalty must be a number >= 0")
+      for value in (-50.0, NAN, "5")),
+    (partial(LoopConfig, env=CRUISE.env, violation_penalty=1.0, lagrangian=LagrangianSettings()),
+     "give either violation_penalty or lagrangian"),
+    (partial(LoopConfig(env=CRUISE.env, residual_gain=np.ones((3, 3))).vector, 2), "residual_gain must have the shape"),
+    (partial(ShieldSettings, CERTIFICATE, penalty=-1.0), "penalty must be a number >= 0"),
     (partial(LoopConfig, env=CRUISE.env, shield=CERTIFICATE),
      r"^shield must be ShieldSettings\(certificate\), got Certificate$"),
     (partial(LoopConfig, env=CRUISE.env, shield=ShieldSettings(CERTIFICATE), filter=print),

@@ -118,6 +118,8 @@ USAGE = [
     ("evaluate nowhere --shield project --least-safe-steps 6", "--least-safe-steps 6 is for mode lookahead"),
     ("render --horizon 6", "--horizon 6 is for mode lookahead"),
     ("train --horizon 6", "--horizon 6 is for mode lookahead"),
+    ("train --violation-penalty 7", "--violation-penalty 7 is for an arm penalized, which is not asked for"),
+    ("train --arm unshielded --intervention-penalty 5", "--intervention-penalty 5 is for an arm with +penalty"),
     ("loop --speed 0", "--speed must be positive"),
     ("loop --mischief 2", "--mischief must be at least 0 and at most 1"),
     ("loop --port 70000", "--port must be at least 1 and at most 65533"),

@@ -464,7 +464,7 @@ def test_damaged_file_is_read_or_refused_in_one_sentence(name, edits, written):
         assert "\n" not in str(error)  # noqa: PT017
 
 
-PLANT = truck_trailer()
+PLANT = truck_trailer(dt=1.0)
 RECORDS = st.lists(
     st.tuples(st.integers(0, 9), st.one_of(st.none(), st.integers(0, 20))), min_size=2, max_size=9
 ).filter(lambda record: any(gap for gap, _ in record[1:]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.stalls import broken_contracts, count_interval, stalls
-from ncs_gym import ChannelContract, PacketLog, TraceChannel, contract_of
+from ncs_gym import Channel, ChannelContract, PacketLog, TraceChannel, contract_of
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 
 PING = """PING host (192.0.2.1) 56(84) bytes of data.
@@ -195,3 +195,20 @@ def test_interval_covers_the_rate_of_stalls_in_clusters(tail):
     intervals = np.array([count_interval(record(steps), steps) for _ in range(200)])
     covered = ((intervals[:, 0] <= expected) & (expected <= intervals[:, 1])).mean()
     assert covered > 0.88  # of independent stalls it would be below a half
+
+
+def test_a_record_cut_for_one_duration_of_steps_is_for_that_alone(tmp_path):
+    file = tmp_path / "packets.csv"
+    file.write_text("sent,received\n0,0.01\n0.1,\n0.2,0.25\n0.3,0.31\n")
+    log, cruise = PacketLog.load(file), "ncs_gym/TruckTrailerCruise-v0"
+    assert gym.make(cruise, channel=log.channel(0.5)).unwrapped.channel.dt == 0.5
+    words = r"steps of 0.1 s, and steps take 0.5 s here: make another one with PacketLog.channel\(0.5\)"
+    with pytest.raises(ValueError, match=words):
+        gym.make(cruise, channel=log.channel(0.1))
+    with pytest.raises(ValueError, match=words):
+        gym.make_vec(cruise, num_envs=2, channel=[log.channel(0.1), Channel()])
+    env = gym.make(cruise, downlink=Channel(delay=2, max_consecutive_losses=1))
+    for name in ("channel", "downlink"):
+        with pytest.raises(ValueError, match=words):
+            env.reset(options={name: log.channel(0.1)})
+    assert repr(log.channel(0.1)).startswith("TraceChannel(trace=(1, -1, 1, 1) of 4 samples, send_period=1, ")
