@@ -324,8 +324,9 @@ def tuned(
 def _policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int], Policy]]:
     """What makes the policy of a seed, by name."""
     env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
-    certified = loop.shield.certificate.K
-    hyperparams, steps = tuned_hyperparams(loop.env), tuned_steps(loop.env)
+    assert loop.shield is not None
+    certified, hyperparams = loop.shield.certificate.K, tuned_hyperparams(loop.env)
+    steps = tuned_steps(loop.env) or STEPS
     found: dict[str, Callable[[int], Policy]] = {"tuned agent": lambda seed: trained(loop, hyperparams, steps, seed)}
     if with_defaults:
         found["agent, default settings"] = lambda seed: trained(loop, {}, STEPS, seed)

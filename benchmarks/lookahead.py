@@ -96,6 +96,8 @@ class PlainProgram:
 
     def __init__(self, shield: SafetyFilter) -> None:
         plant, steps = shield.plant, shield.horizon
+        assert steps is not None
+        assert shield.lookahead is not None
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
         self.row_limits, self.weighting, self.radius = (
@@ -134,7 +136,7 @@ class PlainProgram:
 class Recorded(SafetyFilter):
     """A safety filter that keeps what it decides about, and the microseconds per decision."""
 
-    def decide_columns(self, estimates, errors, proposed, stored=None):
+    def decide_columns(self, estimates: Any, errors: Any, proposed: Any, stored: Any = None) -> Any:
         start = time.process_time()
         decided = super().decide_columns(estimates, errors, proposed, stored)
         spent = 1e6 * (time.process_time() - start) / ENVS

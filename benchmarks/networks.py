@@ -540,10 +540,11 @@ def requests(
     rows = [["policy", *titles]]
     for name, policy_for in policies.items():
         envs = environments(env, episodes, certificate, cost)
-        result = played(envs, policy_for(envs), seed=1)
+        inner, result = envs.unwrapped, played(envs, policy_for(envs), seed=1)
+        assert isinstance(inner, NCSVectorEnv)
         mean, packets = float(result.returns.mean()), result.packets
         points[name] = packets, mean, float(1.96 * result.returns.std(ddof=1) / np.sqrt(episodes))
-        worth[name] = mean - cost * packets * envs.unwrapped.max_episode_steps
+        worth[name] = mean - cost * packets * (inner.max_episode_steps or 0)
         row = [name, f"{packets:.3f}", f"{result.forced:.1%}", f"{mean:.1f}", f"+- {points[name][2]:.1f}"]
         row += [f"{worth[name]:.1f}", f"{result.overridden:.1%}", str(result.violations), str(result.unproved)]
         rows.append([*row, str(result.oldest)])

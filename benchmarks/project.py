@@ -160,8 +160,8 @@ def changed(node: ast.AST) -> str:
     if isinstance(node, ast.If | ast.IfExp | ast.While):
         node.test = ast.UnaryOp(ast.Not(), node.test)
         return "the condition is negated"
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        before, node.value = node.value, node.value + 1 if type(node.value) is int else 1.5 * node.value + 0.5
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and type(node.value) is not bool:
+        before, node.value = node.value, node.value + 1 if isinstance(node.value, int) else 1.5 * node.value + 0.5
         return f"{before} becomes {node.value}"
     if isinstance(node, ast.Constant) and type(node.value) is bool:
         node.value = not node.value

@@ -74,15 +74,16 @@ def slow_and_fast_plant(seed: int, *, in_own_units: bool) -> LinearPlant:
     """
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(2, 5)), int(rng.integers(1, 3))
-    spread = np.log(TIME_CONSTANTS)
-    modes = -1.0 / np.exp(rng.uniform(*spread, n))
+    slow, fast = np.log(TIME_CONSTANTS)
+    modes = -1.0 / np.exp(rng.uniform(slow, fast, n))
     mixed = np.eye(n) + 0.5 * ortho_group.rvs(n, random_state=rng)
     A = mixed @ np.diag(modes) @ np.linalg.inv(mixed)
     B = mixed @ (modes[:, None] * rng.standard_normal((n, m)))
     low, high = -rng.uniform(0.5, 1.0, n), rng.uniform(0.5, 1.0, n)
     ends = -rng.uniform(0.5, 1.0, m), rng.uniform(0.5, 1.0, m)
     share = np.exp(rng.uniform(np.log(0.001), np.log(0.03)))
-    units = np.exp(rng.uniform(*np.log(UNITS), n + m)) if in_own_units else np.ones(n + m)
+    low_unit, high_unit = np.log(UNITS)
+    units = np.exp(rng.uniform(low_unit, high_unit, n + m)) if in_own_units else np.ones(n + m)
     x, u = units[:n], units[n:]
     return LinearPlant.from_statespace(
         ((x[:, None] * A) / x, (x[:, None] * B) / u, np.eye(n), 0),

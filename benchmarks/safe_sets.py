@@ -39,9 +39,10 @@ PLANES = {"CartPole": (2, 3), "BatchReactor": (0, 2)}
 # Sets, and their colors, apart for color-blind readers (Okabe and Ito).
 COLORS = {"upper bound": "#999999", "polytope": "#0072b2", "ellipsoid": "#d55e00"}
 # Points between two samples at which the box counts, where it does.
-POINTS = dict.fromkeys(("TruckTrailer", "TruckTrailerCruise", "TruckTrailerCruiseTwoWay"), 8) | dict.fromkeys(
-    ("CartPole", "CartPoleTwoWay", "BatchReactor", "CSTR", "Convoy", "LaneKeeping"), 4
-)
+POINTS: dict[str, int] = {
+    **dict.fromkeys(("TruckTrailer", "TruckTrailerCruise", "TruckTrailerCruiseTwoWay"), 8),
+    **dict.fromkeys(("CartPole", "CartPoleTwoWay", "BatchReactor", "CSTR", "Convoy", "LaneKeeping"), 4),
+}
 
 
 def _env(name: str) -> NCSEnv:
@@ -56,33 +57,27 @@ class Viability:
         scale, limits = plant.half_widths, plant.u_max
         A, B = plant.A * scale / scale[:, None], plant.B * limits / scale[:, None]
         # Variables: the size t of the start, states x_0 .. x_N and inputs u_0 .. u_{N-1}, in units of their limits.
-        moves = sparse.hstack([
-            sparse.kron(sparse.eye(steps, steps + 1), A) - sparse.kron(sparse.eye(steps, steps + 1, 1), np.eye(n)),
-            sparse.kron(sparse.eye(steps), B),
-        ])  # fmt: skip
-        self._moves = sparse.hstack([sparse.csr_matrix((moves.shape[0], 1)), moves])
+        columns, faces = 1 + (steps + 1) * n + steps * m, (steps + 1) * len(plant.box_rows)
+        moved = sparse.kron(sparse.eye(steps, steps + 1), A) - sparse.kron(sparse.eye(steps, steps + 1, 1), np.eye(n))
+        moves = [sparse.csr_matrix((steps * n, 1)), moved, sparse.kron(sparse.eye(steps), B)]
         rows = sparse.kron(sparse.eye(steps + 1), plant.box_rows * scale)
-        rows = sparse.hstack(
-            [sparse.csr_matrix((rows.shape[0], 1)), rows, sparse.csr_matrix((rows.shape[0], steps * m))]
-        )
-        self._box = sparse.vstack([rows, -rows]).tocsr()
-        self._scale, self._n = scale, n
-        self._bounds = [(0.0, None)] + [(None, None)] * ((steps + 1) * n) + [(-1.0, 1.0)] * (steps * m)
+        rows = sparse.hstack([sparse.csr_matrix((faces, 1)), rows, sparse.csr_matrix((faces, steps * m))])
+        self._moves, self._scale, self._start = sparse.hstack(moves), scale, sparse.lil_matrix((n, columns))
+        bounds = [(0.0, None)] + [(None, None)] * ((steps + 1) * n) + [(-1.0, 1.0)] * (steps * m)
+        self._problem: dict[str, Any] = {"c": -np.eye(1, columns)[0], "bounds": bounds}
+        self._problem |= {"A_ub": sparse.vstack([rows, -rows]).tocsr(), "b_ub": np.ones(2 * faces)}
+        self._problem |= {"b_eq": np.zeros((steps + 1) * n)}
 
     def reach(self, direction: np.ndarray) -> float:
         """Returns the largest t such that the state t direction, shape (n,), can be kept in the box."""
-        start = sparse.lil_matrix((self._n, self._moves.shape[1]))
-        start[:, 0], start[:, 1 : self._n + 1] = -(direction / self._scale)[:, None], np.eye(self._n)
+        start, n = self._start.copy(), len(direction)
+        start[:, 0], start[:, 1 : n + 1] = -(direction / self._scale)[:, None], np.eye(n)
         equal = sparse.vstack([start.tocsr(), self._moves])
-        cost = np.zeros(equal.shape[1])
-        cost[0] = -1.0
-        problem = {"A_ub": self._box, "b_ub": np.ones(self._box.shape[0]), "bounds": self._bounds}
-        problem |= {"A_eq": equal, "b_eq": np.zeros(equal.shape[0])}
         for method in ("highs-ds", "highs-ipm"):  # either gives up now and then, on different problems
-            found = linprog(cost, **problem, method=method)
+            found = linprog(**self._problem, A_eq=equal, method=method)
             if found.status == 0:
                 return float(found.x[0])
-        raise RuntimeError(f"the solver does not say how far a direction reaches: {found.message}")
+        raise RuntimeError("the solver does not say how far a direction reaches")
 
 
 def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> None:
@@ -117,7 +112,8 @@ def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> Non
                 (handles[kind],) = axes.plot(*outline, color=COLORS[kind], lw=1.5)
             box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * plant.half_widths[list(plane)]
             (handles["safe box"],) = axes.plot(*box.T, color="#222222", lw=1.0, ls="--")
-            label(axes, *(with_unit(plant.state_names[k], plant.state_units[k]) for k in plane), name)
+            x, y = (with_unit(plant.state_names[k], plant.state_units[k]) for k in plane)
+            label(axes, x, y, name)
         legend_below(figure, handles)
         out.write_bytes(figure.png)
 
@@ -212,7 +208,7 @@ def ours(case: Case) -> np.ndarray:
 
 
 def by_polytope(case: Case) -> np.ndarray:
-    from polytope import Polytope, is_subset, reduce
+    from polytope import Polytope, is_subset, reduce  # pyright: ignore[reportMissingImports]
 
     now = Polytope(np.concatenate([case.rows, -case.rows]), np.ones(2 * len(case.rows)))
     while True:
@@ -224,8 +220,8 @@ def by_polytope(case: Case) -> np.ndarray:
 
 
 def by_ampyc(case: Case) -> np.ndarray:
-    from ampyc.utils import Polytope
-    from ampyc.utils.set_computation import compute_mrpi
+    from ampyc.utils import Polytope  # pyright: ignore[reportMissingImports]
+    from ampyc.utils.set_computation import compute_mrpi  # pyright: ignore[reportMissingImports]
 
     n, count = len(case.W), len(case.rows)
     start = Polytope(np.concatenate([case.rows, -case.rows]), np.ones(2 * count))
@@ -251,7 +247,7 @@ def shortfall(faces: np.ndarray, case: Case) -> Fraction:
             if multiplier:
                 rest = [left - multiplier * entry for left, entry in zip(rest, other, strict=True)]
         support = sum(abs(f) * w for f, (w,) in zip(face, W, strict=True))
-        worst = max(worst, sum(multipliers) + sum(map(abs, rest)) + support - 1)
+        worst = max(worst, Fraction(sum(multipliers) + sum(map(abs, rest)) + support - 1))
     return worst
 
 

@@ -98,8 +98,9 @@ class ConicFilter:
         self.proposed.value, self.radius.value = proposed, 1.0 - h
         self.offset.value, self.effect.value = weighting @ test.state_rows @ estimate, weighting @ test.input_rows
         self.problem.solve(solver=cp.CLARABEL)
-        usable = self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
-        return self.u.value if usable else np.clip(self.shield.certificate.K @ estimate, -plant.u_max, plant.u_max)
+        if self.u.value is not None and self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+            return self.u.value
+        return np.clip(self.shield.certificate.K @ estimate, -plant.u_max, plant.u_max)
 
 
 def recorded(env: NCSEnv, shield: SafetyFilter, steps: int) -> list[tuple[np.ndarray, ...]]:
@@ -204,7 +205,8 @@ def _node(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple[
         start = np.array([time.thread_time(), time.perf_counter()])
         messages = [wire.decode(data) for data in arrived]
         echoes = [Echo(each.stamp, each.missing, each.digest) for each in messages if each.kind is Kind.ECHO]
-        loop.receive([(each.stamp, each.values) for each in messages if each.kind is Kind.SAMPLE], echoes=echoes)
+        samples: list[Any] = [(each.stamp, each.values) for each in messages if each.kind is Kind.SAMPLE]
+        loop.receive(samples, echoes=echoes)
         loop.decide(proposed)
         command = loop.command()
         wire.encode(Message(kind=Kind.COMMAND, episode=1, stamp=step, values=command.inputs))
@@ -231,7 +233,7 @@ def memory(steps: int = 100_000) -> None:
     """
     model = np.array([[0.0, 1.0, 0.0], [0.0, -2.0, 20.0], [0.0, -0.5, -10.0]]), np.array([[0.0], [0.0], [10.0]])
     A, B = zero_order_hold(*model, 0.01)
-    bounds = {
+    bounds: dict[str, Any] = {
         "disturbance_bound": [5e-4, 5e-3, 5e-3],
         "sensor_bound": [2e-3, 0.01],
         "initial_bound": [2e-3, 0.01, 0.01],

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.commands import run, table
 from benchmarks.random_plants import under_contracts
-from ncs_gym import ChannelContract, LinearPlant, NCSEnv, TraceChannel, certified_error_set
+from ncs_gym import ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel, certified_error_set
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.first_estimate import first_estimate
@@ -72,7 +72,7 @@ def network(ids: Sequence[str] = IDS, envs: int = 64, steps: int = 150) -> None:
 def shielded(name: str, count: int, least: int | None, **settings: Any) -> VectorSafetyShield:
     """Returns environments behind mode "lookahead" that is asked for so many steps; for None behind "project"."""
     env = gym.make_vec(name, count, disturbance="adversarial", terminate_on_violation=False, **settings)
-    given = {"mode": "project"} if least is None else {"mode": "lookahead", "least_safe_steps": least}
+    given: dict[str, Any] = {"mode": "project"} if least is None else {"mode": "lookahead", "least_safe_steps": least}
     return VectorSafetyShield(env, **given, on_unproved="ignore")
 
 
@@ -234,7 +234,9 @@ def broken_promises(
     env = gym.make_vec(name, count, channel=rare_then_silent(name), **settings)
     least = least if mode == "lookahead" else 0
     shield = VectorSafetyShield(env, certificate, mode=mode, on_unproved="ignore", least_safe_steps=least)
-    silence, rng = silence_of(certificate, shield.unwrapped.plant), np.random.default_rng(2)
+    inner = shield.unwrapped
+    assert isinstance(inner, NCSVectorEnv)
+    silence, rng = silence_of(certificate, inner.plant), np.random.default_rng(2)
     assert silence is not None
     held = np.zeros(count, np.bool_)
 
@@ -255,7 +257,7 @@ def broken_promises(
         broken += np.count_nonzero(((promised > 0) & (info["cost"] > 0.0) | (now < promised - 1)) & ~ended)
         kept += np.count_nonzero((promised > 0) & info["contract_broken"])
         promised, ended = now, terminated | truncated
-    return broken, kept
+    return int(broken), int(kept)
 
 
 COMMANDS = (network, back, ways, attack)

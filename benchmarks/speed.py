@@ -110,8 +110,9 @@ class PlainTruckTrailer(gym.Env):
     """
 
     def __init__(self, mass=4000.0, loss=0.3, step=0.05, period=2, delay=2, u_max=4.0):
-        continuous = (np.array([[0.0, 1.0], [-4500.0 / mass, -4600.0 / mass]]), np.array([[0.0], [1.0]]))
-        self.A, self.B, *_ = cont2discrete((*continuous, np.eye(2), np.zeros((2, 1))), 0.5)
+        continuous: Any = (np.array([[0.0, 1.0], [-4500.0 / mass, -4600.0 / mass]]), np.array([[0.0], [1.0]]))
+        model: Any = cont2discrete((*continuous, np.eye(2), np.zeros((2, 1))), 0.5)
+        self.A, self.B = model[:2]
         self.loss, self.step_size, self.period, self.delay, self.u_max = loss, step, period, delay, u_max
         self.observation_space = Box(-100.0, 100.0, (3,), np.float32)
         self.action_space = Box(-1.0, 1.0, (1,), np.float32)
@@ -120,7 +121,7 @@ class PlainTruckTrailer(gym.Env):
         super().reset(seed=seed)
         self.x, self.steps, self.in_flight = 0.2 * self.np_random.uniform(-1, 1, 2), 0, {}
         self.speed, self.target = self.np_random.uniform(0, 25, 2)
-        self.filter = KalmanFilter(dim_x=2, dim_z=2, dim_u=1)
+        self.filter: Any = KalmanFilter(dim_x=2, dim_z=2, dim_u=1)
         self.filter.x, self.filter.F, self.filter.B, self.filter.H = self.x.copy(), self.A, self.B, np.eye(2)
         self.filter.P, self.filter.Q, self.filter.R = 1e-4 * np.eye(2), 6e-4 * np.eye(2), 3e-4 * np.eye(2)
         return self._observation(), {}
@@ -147,7 +148,8 @@ class PlainTruckTrailer(gym.Env):
 
 
 PLAIN = "PlainTruckTrailer-v0"
-gym.register(PLAIN, entry_point=PlainTruckTrailer, max_episode_steps=200)
+_make: Any = PlainTruckTrailer
+gym.register(PLAIN, entry_point=_make, max_episode_steps=200)
 
 
 def many(env_id: str, count: int, *, shielded: bool = False) -> gym.vector.VectorEnv:
