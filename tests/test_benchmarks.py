@@ -13,7 +13,7 @@ NAMES = [path.stem for path in sorted((ROOT / "benchmarks").glob("*.py")) if "CO
 NAMED = sorted({
     (page.name, module, given.strip())
     for page in [*(ROOT / "docs").glob("*.md"), ROOT / "Makefile", ROOT / ".ci" / "run"]
-    for module, given in re.findall(r"python -m benchmarks\.(\w+)((?: [\w./-]+)*)", page.read_text())
+    for module, given in re.findall(r"python -m benchmarks\.([a-z_]+)((?: [\w./-]+)*)", page.read_text())
 })  # fmt: skip
 
 
