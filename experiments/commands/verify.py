@@ -25,7 +25,7 @@ def verify(settings: VerifySettings) -> None:
     else:
         origin, plant = str(settings.plant), LinearPlant.load(settings.plant)
     report = shields.verify(certificate, plant)
-    print(f"{certificate}\nagainst the plant of {origin}:\n{report}")
+    print(f"{settings.file}\nagainst the plant of {origin}:\n{report}")
     if settings.out is not None:
         conditions = [asdict(condition) for condition in report.conditions]
         document = {"env": origin, "valid": report.valid, "conditions": conditions}
@@ -40,6 +40,7 @@ def verify(settings: VerifySettings) -> None:
         raise CertificateError(
             f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
         )
+    print(certificate)
     if (silence := shields.silence_of(certificate, plant)) is not None:
         print(f"Beyond the contract:\n{silence}")
     contract = "" if certificate.contract is None else f"; it rests on {certificate.contract}"

@@ -231,8 +231,9 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             )
         self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
+        self._committed = self._downlink_state.committed  # the inputs until the next decision takes effect
         self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
-        on_request, input_delay = self._channel.on_request, len(self._pending)
+        on_request, input_delay = self._channel.on_request, len(self._committed.pending)
         self._requests = Requests(self._channel, self._contract, input_delay) if on_request else None
         self._noise = as_noise(noise, plant)
         allowed = self._allow_assumption_violation
@@ -241,7 +242,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         )
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        steps = self._horizon + len(self._pending)
+        steps = self._horizon + len(self._committed.pending)
         self._observe = read_observed(observe)
         sets = self._error_set, self._initial_set
         self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
@@ -335,8 +336,9 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         reward = float(self._task.reward(self._plant, self._task_state, self._state, u))
         worst = self._plant.worst_constraint_values(before, u, self._state)
         info = self._info(inputs, worst, arrived=bool(packets), read=read)
-        terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
-        truncated = self._process.truncated
+        process = self._process.process
+        terminated = process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
+        truncated = process.truncated
         self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
             sent = sent_at(self.steps, self._channel_state, packets)
@@ -381,7 +383,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     @property
     def request_limits(self) -> np.ndarray:
         """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        input_delay = len(self._pending)
+        input_delay = len(self._committed.pending)
         if self._contract is None:
             most = self._horizon, max(self._channel.longest_delay + input_delay, 1)
         else:
@@ -426,18 +428,16 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     @own_error_state
     def estimates_ahead(self) -> list[tuple[np.ndarray, int]]:
         """Returns estimate and number of the error shape of now and of every step until the next decision's effect."""
-        return [self._estimator.numbered(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
+        return [
+            self._estimator.numbered(self._committed.pending[:ahead])
+            for ahead in range(len(self._committed.pending) + 1)
+        ]
 
     def close(self) -> None:
         """Closes the window and the process."""
         self._process.close()
         if self.renderer is not None:
             self.renderer.close()
-
-    @property
-    def _pending(self) -> tuple[np.ndarray, ...]:
-        """The inputs of the steps until the next decision takes effect."""
-        return self._downlink_state.committed.pending
 
     def _links(self) -> list[tuple[str, EpisodeChannels]]:
         return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
@@ -451,7 +451,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
 
     def _observation(self) -> np.ndarray:
         task_state = self._task_state
-        for u in self._pending:
+        for u in self._committed.pending:
             task_state = self._task.predict(self._plant, task_state, u)
         return self._observer.observation(self._known, self._task.observe(task_state))
 
@@ -461,7 +461,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._violations += cost
         constraints = Constraints(values, worst, cost, self._violations)
         estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
-        estimate, number = estimator.numbered(self._pending)
+        estimate, number = estimator.numbered(self._committed.pending)
         (applied, committed, missing), table = inputs, estimator.table
         age, damaged = estimator.age, estimator.damaged
         self._known = Known(estimate, table.shape(number), age, alarm, damaged, applied, committed, table, number)

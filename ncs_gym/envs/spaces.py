@@ -164,7 +164,10 @@ class Observer:
         Raises:
             ValueError: If the task has another number of entries than it has bounds.
         """
-        entries = np.concatenate([known.estimate, own, *[self._observed(known, name) for name in self._observe]])
+        parts = [known.estimate, own]
+        for name in self._observe:
+            parts.append(self._observed(known, name))
+        entries = np.concatenate(parts)
         if len(entries) != len(self._low):
             bounds = len(self._low) - len(entries) + len(own)
             raise ValueError(
@@ -206,9 +209,12 @@ def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray
     """
     is_float = type(action) is np.ndarray and action.dtype.char in "fd"
     numbers = action.copy() if is_float else as_numbers(action)
-    if numbers is not None and numbers.shape == (plant.m,):
+    if numbers is not None and numbers.shape == plant.input_half.shape:
         values = numbers.tolist()
-        if all([-1.0 <= value <= 1.0 for value in values]):  # the usual case, in half the time
+        for value in values:
+            if not -1.0 <= value <= 1.0:
+                break
+        else:  # the usual case, in half the time
             return numbers, plant.input_half * numbers + plant.input_middle
         if all(map(isfinite, values)):
             clipped = np.array([min(max(value, -1.0), 1.0) for value in values])

@@ -358,8 +358,9 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     def _ends(self, cost: np.ndarray, restarted: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Returns which episodes are terminated and which truncated, shape (N,) each; those that just began are not."""
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
-        if self._process.terminated is not False:  # other people's environments may end
-            terminated, truncated = terminated | self._process.terminated, truncated | self._process.truncated
+        process = self._process.process
+        if process.terminated is not False:  # other people's environments may end
+            terminated, truncated = terminated | process.terminated, truncated | process.truncated
         if self._single.terminate_on_violation:
             terminated |= cost > 0.0
         if self._max_episode_steps is not None:

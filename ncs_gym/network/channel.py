@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import inf
 from typing import Any, NamedTuple
 
@@ -123,7 +124,7 @@ class Channel:
         )
         return 0 if never else self.max_consecutive_losses
 
-    @property
+    @cached_property
     def mean_loss(self) -> float:
         """Long-run share of samples that are lost, one every `send_period` steps."""
         bursts = (
@@ -188,7 +189,6 @@ def widest(channels: Sequence[Channel]) -> Channel:
     return replace(max(channels, key=oldest), quantization_step=coarsest)
 
 
-@lru_cache
 def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     """Returns the long-run share of packets that are lost, of one every so many steps and at most `most` in a row.
 
@@ -265,11 +265,18 @@ class TraceChannel(Channel):
             object.__setattr__(self, name, value)
         super().__post_init__()
 
+    def __repr__(self) -> str:
+        more = f", on_request={self.on_request}" if self.on_request else ""
+        return (
+            f"TraceChannel(trace={reprlib.repr(self.trace)} of {len(self.trace):,} samples, "
+            f"send_period={self.send_period}, quantization_step={self.quantization_step}{more})"
+        )
+
     def __getstate__(self) -> dict[str, Any]:
         # What is computed once is left out: a copy's array would not be read-only.
         return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
-    @property
+    @cached_property
     def mean_loss(self) -> float:
         """Share of the trace that is lost."""
         return self.trace.count(-1) / len(self.trace)

@@ -28,13 +28,11 @@ class Record(NamedTuple):
         sent: When each packet was sent, shape (k,), ascending [s].
         delays: How long each was on its way, shape (k,); NaN for a lost one [s].
         read_as: How the file was read, in sentences.
-        may_be_milliseconds: Whether times without a unit were taken for seconds, but most delays exceed one.
     """
 
     sent: np.ndarray
     delays: np.ndarray
     read_as: str
-    may_be_milliseconds: bool = False
 
 
 # Longer lines are not ping's, longer rows not those of a table, and longer cells are no numbers [characters].
@@ -572,6 +570,11 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
             f"its packets would be sent every {_median_gap(moments):.3g} s, if times were seconds: write the unit into "
             "the names of the columns (sent_ms), and the days of a spreadsheet as seconds"
         )
+    if guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0:
+        raise ValueError(
+            "the names of the columns say no unit, and most packets would take more than a second: name it, as in "
+            "sent_ms and received_ms, or sent_s and received_s"
+        )
     epoch = "" if origin < 10**8 else ", times since 1970"
     used = {each.index for each in columns.values()}
     unused = [shown(name) for index, name in enumerate(names) if index not in used]
@@ -582,7 +585,7 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         read_as += f" A number without a line stands for a lost packet ({_many(missing, 'number')})."
     if unused:
         read_as += f" Not used: {', '.join(unused)}."
-    return Record(moments, delays, read_as, guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0)
+    return Record(moments, delays, read_as)
 
 
 def _units(sent: _Column, until: _Column, by: str, first: Decimal) -> tuple[str, str]:

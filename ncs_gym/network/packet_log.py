@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel, replayed_ages
 from ncs_gym.network.log_formats import read_record
 from ncs_gym.reading import MOST_STEPS, require_packets
-from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state, shown, warn_caller
+from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state
 
 # Times that differ by less than this fraction of a step are the same; where the resolution of the times themselves is
 # coarser than the second fraction they cannot be placed.
@@ -81,12 +81,6 @@ class PacketLog(ReadOnlyArrays):
         """
         period = None if period is None else as_number(period, "period", low=0.0, low_open=True)
         record = read_record(path, period, as_number(step, "step", low=0.0, low_open=True))
-        if record.may_be_milliseconds:
-            warn_caller(
-                f"the times in {shown(path)} look like milliseconds, but are taken for seconds: most packets take "
-                "more than one; say the unit in the names of the columns, as in sent_ms and received_ms",
-                UserWarning,
-            )
         return cls(record.sent, record.delays, record.read_as)
 
     @property

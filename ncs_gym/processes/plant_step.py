@@ -96,16 +96,6 @@ class PlantSimulation:
         self.alarm: Any = False if size is None else np.zeros(size, np.bool_)
 
     @property
-    def terminated(self) -> Any:
-        """Whether the process ended the episode, a bool or shape (N,)."""
-        return self.process.terminated
-
-    @property
-    def truncated(self) -> Any:
-        """Whether the process cut the episode off, a bool or shape (N,)."""
-        return self.process.truncated
-
-    @property
     def infos(self) -> dict[str, np.ndarray]:
         """What infos say of the process: parameters of the member of a family, a fresh array, (k,) or (N, k)."""
         parameters = self.process.parameters

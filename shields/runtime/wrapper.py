@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import hypot
 from typing import Any, Generic, TypeVar
 
@@ -145,6 +146,21 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
         )
 
 
+@dataclass(slots=True)
+class _Episode:
+    """What changes from step to step.
+
+    Attributes:
+        clock: The episodes and steps of the environment so far; None before the first reset.
+        interventions: Of this episode.
+        proved: Number of states of this episode, the first included, that were proved safe.
+    """
+
+    clock: tuple[int, int] | None = None
+    interventions: int = 0
+    proved: int = 0
+
+
 class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
     """Overrides an action whenever the safe set could be left (docs/shield.md).
 
@@ -214,7 +230,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         self._make(env, certificate, mode, penalty, horizon, least_safe_steps, on_unproved)
         self._look_at({self._inner.channel})
         self._monitored = MonitoredFilter(self._filter, self._inner.downlink_protocol)
-        self._clock: tuple[int, int] | None = None
+        self._episode = _Episode()
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
@@ -227,14 +243,15 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
             ValueError: If what is wrapped is not any more what the shield was made for.
             GuaranteeLostError: If x in S is not proved and that is to be raised; the episode has begun then.
         """
-        before, self._clock = self._clock, self._clock and INTERRUPTED
+        now = self._episode
+        before, now.clock = now.clock, now.clock and INTERRUPTED
         if self._is_drawn:
             self._annotate(None, 0, NO_PLAN, intervened=False)
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except ValueError:
             if self._read_clock() == before:  # refused before anything moved
-                self._clock = before
+                now.clock = before
             raise
         self._require_same()
         self._look_at({self._inner.episode_channel})
@@ -245,10 +262,10 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._input_delay)
         self._monitored.begin(report, self._known, clock[1] == 0, earlier=earlier)
-        self._interventions = self._proved = 0
+        now.interventions = now.proved = 0
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, report.errors, u)
-        self._clock = clock
+        now.clock = clock
         info = info | self._info(u, u, margin, intervened=False)
         self._lost.begin()
         self._lost.tell_of(info["shield_reason"])
@@ -263,22 +280,23 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
             gymnasium.error.ResetNeeded: If there was no reset.
             GuaranteeLostError: If x in S is not proved and that is to be raised; the step has been taken then.
         """
-        if self._clock is None:
+        now = self._episode
+        if now.clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         action, proposed = read_action(self._filter.plant, action)  # what is tested is what is handed on
-        (episode, step), self._clock = self._clock, INTERRUPTED
+        (episode, step), now.clock = now.clock, INTERRUPTED
         decision = self._monitored.decide(proposed)
         if decision.intervened and self._filter.mode != "monitor":
             action = nearest_action(decision.input, self._filter.plant)
         if self._is_drawn:
-            count = self._interventions + decision.intervened
+            count = now.interventions + decision.intervened
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock, known = self._read_clock(), self._inner.known
         moved_once = clock == (episode, step + 1)
         self._monitored.advance(known.applied, moved_once, self._observed(known), known.committed)
-        self._interventions += decision.intervened
-        self._clock = clock
+        now.interventions += decision.intervened
+        now.clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         self._lost.tell_of(info["shield_reason"])
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
@@ -292,8 +310,8 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         return self._inner.episodes, self._inner.steps
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
-        reason = self._monitored.reason
-        self._proved += not reason
+        reason, now = self._monitored.reason, self._episode
+        now.proved += not reason
         ahead = {}
         if self._filter.lookahead is not None:
             ahead["shield_plan_length"] = self._monitored.plan_length
@@ -305,8 +323,8 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
             "shield_margin": margin,
             "shield_guaranteed": not reason,
             "shield_reason": reason,
-            "episode_interventions": self._interventions,
-            "episode_guaranteed": self._proved / (self._inner.steps + 1),
+            "episode_interventions": now.interventions,
+            "episode_guaranteed": now.proved / (self._inner.steps + 1),
         }
 
 

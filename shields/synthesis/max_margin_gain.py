@@ -87,6 +87,7 @@ class _GainSearch:
 
     def __init__(self, problem: DesignProblem, Sigma: np.ndarray, input_limits: bool) -> None:
         self._problem, self._Sigma, self._input_limits = problem, Sigma, input_limits
+        self._gain_shape = problem.m, problem.n
         self._last_point, self._last_uses = b"", (np.empty(0), np.empty((0, 0)))
 
     def largest_use(self, point: np.ndarray) -> float:
@@ -121,11 +122,11 @@ class _GainSearch:
     def _unpacked(self, point: np.ndarray) -> tuple[np.ndarray, float, float]:
         """Returns K, lx and the fraction le / (1 - lx)."""
         lx, fraction = 1.0 / (1.0 + np.exp(-np.clip(point[-2:], -30.0, 30.0)))
-        return point[:-2].reshape(self._problem.m, self._problem.n), float(lx), float(fraction)
+        return point[:-2].reshape(self._gain_shape), float(lx), float(fraction)
 
     def _smallest_set(self, K: np.ndarray, lx: float, fraction: float) -> tuple[np.ndarray, np.ndarray, tuple]:
         """Returns L = F L F' + S of (I), F = (A + BK) / sqrt(lx), and the factors of its linear equations."""
-        problem, n = self._problem, self._problem.n
+        problem, (_, n) = self._problem, self._gain_shape
         BK = problem.B @ K
         source = BK @ self._Sigma @ BK.T / ((1.0 - lx) * fraction) + problem.D_u / ((1.0 - lx) * (1.0 - fraction))
         F = (problem.A + BK) / np.sqrt(lx)
@@ -176,7 +177,7 @@ class _GainSearch:
         factors: tuple,
     ) -> np.ndarray:
         """Returns the derivatives of z'Lz for fixed z, the rows of `functionals` (k, n), shape (k, m n + 2)."""
-        problem, n = self._problem, self._problem.n
+        problem, (_, n) = self._problem, self._gain_shape
         sources = np.einsum("ij,ik->jki", functionals, functionals).reshape(n * n, -1)
         adjoints = lu_solve(factors, sources, trans=1, check_finite=False).T.reshape(-1, n, n)
         adjoints = 0.5 * (adjoints + adjoints.transpose(0, 2, 1))
