@@ -40,7 +40,7 @@ test: $(INSTALLED) ## the tests
 
 # The small agents of the package, in agents/trained. The extra [mujoco] adds ncs_gym/InvertedPendulum-v0.
 pretrained: $(INSTALLED) ## the small agents of the package, trained again
-	$(BIN)/python benchmarks/pretrained_agents.py
+	$(BIN)/python -m benchmarks.learning pretrained
 
 # What proves, verifies and decides, once more with other kernels of linear algebra and without wide instructions (x86).
 test-other-processor: $(INSTALLED) ## what proves and decides, as on another processor
@@ -68,7 +68,7 @@ test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)
 
 mutants: $(INSTALLED) ## sixty small faults, and the test that notices each
-	$(BIN)/python benchmarks/mutants.py
+	$(BIN)/python -m benchmarks.project mutants
 
 lint: $(INSTALLED) ## style and declared dependencies
 	$(BIN)/ruff check .
@@ -79,24 +79,24 @@ types: $(INSTALLED) ## types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environments ...
-	$(BIN)/python benchmarks/import_time.py
-	$(BIN)/python benchmarks/first_shield.py
-	$(BIN)/python benchmarks/networked.py
-	$(BIN)/python benchmarks/shield_decision.py
-	$(BIN)/python benchmarks/shield_cost.py
-	$(BIN)/python benchmarks/containment.py
-	$(BIN)/python benchmarks/kalman_gain.py
-	$(BIN)/python benchmarks/synthesis.py
-	$(BIN)/python benchmarks/contracts.py
-	$(BIN)/python benchmarks/families.py
-	$(BIN)/python benchmarks/numerical_trust.py
-	$(BIN)/python benchmarks/environment_speed.py
-	$(BIN)/python benchmarks/rendering.py
-	$(BIN)/python benchmarks/ppo_settings.py
-	$(BIN)/python benchmarks/ray_overhead.py
+	$(BIN)/python -m benchmarks.speed imports
+	$(BIN)/python -m benchmarks.speed first-shield
+	$(BIN)/python -m benchmarks.speed networked
+	$(BIN)/python -m benchmarks.shield decision
+	$(BIN)/python -m benchmarks.shield cost
+	$(BIN)/python -m benchmarks.shield containment
+	$(BIN)/python -m benchmarks.networks gains
+	$(BIN)/python -m benchmarks.synthesis times
+	$(BIN)/python -m benchmarks.networks contracts
+	$(BIN)/python -m benchmarks.synthesis families
+	$(BIN)/python -m benchmarks.synthesis trust
+	$(BIN)/python -m benchmarks.speed environments
+	$(BIN)/python -m benchmarks.speed rendering
+	$(BIN)/python -m benchmarks.speed ppo
+	$(BIN)/python -m benchmarks.speed ray
 
 example-times: $(INSTALLED) ## how long each example takes, and what it says (EXAMPLES="quick_start.py")
-	$(BIN)/python benchmarks/example_times.py $(EXAMPLES)
+	$(BIN)/python -m benchmarks.speed examples $(EXAMPLES)
 
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED) ## the site, in site/

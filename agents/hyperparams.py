@@ -61,7 +61,7 @@ MOST_WEIGHTS, MOST_OUTPUTS = 20_000_000, 1000
 ON_POLICY = ("PPO", "A2C", "TRPO")
 
 # Many environments, batches of 2048 and a higher learning rate than stable-baselines3's defaults train about eight
-# times as fast at no loss of return on these small tasks (`python benchmarks/ppo_settings.py`).
+# times as fast at no loss of return on these small tasks (`python -m benchmarks.speed ppo`).
 _ROLLOUTS = {
     "n_envs": 64,
     "gamma": 0.9,

@@ -1,48 +1,26 @@
-"""What mode "lookahead" admits and what it costs, against mode "project" and the same program in cvxpy.
+"""What mode "lookahead" admits and what it costs: `python -m benchmarks.lookahead COMMAND`.
 
-    python benchmarks/lookahead.py [--sections situations loop ends training] [--safe-set ellipsoid] [--situations 2000]
-
-Plans end in the safe set of the certificate: the polytope, with `--safe-set ellipsoid` the ellipsoid in it, with
-`--safe-set sought` the polytope of a sought gain.
-
-Section "loop" runs 64 environments in both modes with random actions and with actions pushed towards the upper limits,
-and says how often and how far inputs were changed and how long a frame takes. Section "ends" compares plans that end in
-either set on the batch reactor under random actions: in a loop of each, and for the same situations, taken from either
-loop, with nothing stored. "with the solver" asks it for plans that end in P, too, wherever nothing is stored; "outside"
-is the share of states outside the ellipsoid S. Section "training" trains PPO on the
-batch reactor behind both modes and runs every agent behind both. Times are CPU times; what follows is about section
-"situations".
-
-Situations are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is met
-in the middle of an episode (the one of median size), and the estimate that follows. A situation is admitted if some
-input is certified: by a plan of at most N steps, or for the second column by the one-step test alone. "bound" is the
-share for which some input keeps the next state in the box whatever error and disturbance are, with nothing asked of
-what comes later: no shield admits more. "in S" is the share of true states that lie in the safe set.
-Times are of situations that fail the one-step test, for proposals drawn uniformly from the limits: with nothing stored
-("search", the solver is called unless a candidate begins with the proposal), and with the plan found stored ("stored").
-"too far" is how much farther from the proposal the input is then than the search with the solver finds, in u_max.
+Commands: admitted, decisions. Plans end in the safe set of the certificate: the polytope, with `--safe-set ellipsoid`
+the ellipsoid in it, with `--safe-set sought` the polytope of a sought gain.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Annotated, Any
 
 import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 from scipy.optimize import linprog
-from stable_baselines3.common.vec_env import VecNormalize
 
-from agents import SB3VecEnv
-from agents.algorithms import build_model
-from agents.hyperparams import complete_hyperparams
+from benchmarks.commands import run, table
+from benchmarks.timing import microseconds
 from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
-from shields.runtime.backup_plans.plan_check import Tightening
-from shields.runtime.backup_plans.plan_search import Planner
+from shields.runtime.set_test import PredictedErrors
 
 # Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
 CASES = {
@@ -50,24 +28,67 @@ CASES = {
     "ellipsoid": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("BatchReactor", 6)),
     "polytope": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 6), ("BatchReactor", 6)),
 }
-EPISODES, STEPS = 5, 60
-# So many situations are given to cvxpy.
-CVXPY = 60
-SECTIONS = ("situations", "loop", "ends", "training")
-MODES = ("project", "lookahead")
-# Steps of 64 environments that are measured, and before that.
-ENVS, MEASURED, WARM = 64, 150, 50
-# Seed of sections "loop" and "training"; the rule was chosen on seed 0.
-SEED = 1
+SafeSet = Annotated[str, tuple(CASES)]
+# Environments side by side, steps before those that are timed, environments of every step whose decisions are timed one
+# by one, and situations that are given to cvxpy.
+ENVS, WARM, ALONE, CVXPY = 64, 50, 4, 60
 
 
-class Situations(NamedTuple):
-    """States, estimates and proposals, shapes (count, n), (count, n) and (count, m), and one error shape."""
+def certified(plant: LinearPlant, contract: Any, safe_set: str) -> Certificate:
+    """Returns the certificate of a plant with a safe set of that kind."""
+    sought = safe_set == "sought"
+    return synthesize(plant, contract=contract, safe_set=None if sought else safe_set, search_gain=sought)
 
-    states: np.ndarray
-    estimates: np.ndarray
-    proposed: np.ndarray
-    shape: np.ndarray
+
+def admitted(safe_set: SafeSet = "polytope", situations: int = 2000) -> None:
+    """In what share of situations some input is certified, by the one-step test alone and by a plan.
+
+    Situations are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is
+    met in the middle of an episode (the one of median size), and the estimate that follows. "in S" is the share of true
+    states that lie in the safe set; "one step" and "lookahead" the shares for which some input passes the test or
+    begins a plan. "bound" is the share for which some input keeps the next state in the box whatever error and
+    disturbance are, with nothing asked of what comes later: no shield admits more.
+    """
+    show = table("situations admitted", "N", "in S", "one step", "lookahead", "bound", first=20)
+    for name, horizon in CASES[safe_set]:
+        env = ncs_env(gym.make(f"ncs_gym/{name}-v0", terminate_on_violation=False))
+        plant, certificate = env.plant, certified(env.plant, env.certificate_contract, safe_set)
+        shape, rng = _median_shape(env), np.random.default_rng(0)
+        states = np.empty((0, plant.n))
+        while len(states) < situations:
+            more = rng.uniform(-1, 1, (situations, plant.n)) * plant.half_widths
+            states = np.concatenate([states, more[(np.abs(more @ plant.box_rows.T) <= 1.0).all(axis=1)]])
+        states = states[:situations]
+        estimates = states + Ellipsoid(shape).sample_boundary(rng, situations)
+        proposed = rng.uniform(-1, 1, (situations, plant.m)) * plant.u_max
+        shares = [np.mean(certificate.safe_set.gauge(states) <= 1.0)]
+        for shield in (SafetyFilter(certificate, plant), SafetyFilter(certificate, plant, "lookahead", horizon)):
+            decided = (shield.decide(x_hat, shape, u) for x_hat, u in zip(estimates, proposed, strict=True))
+            shares.append(np.mean([each.passed for each in decided]))
+        shares.append(_kept_by_some_input(plant, estimates, shape))
+        show(name, horizon, *(f"{share:.1%}" for share in shares))
+
+
+def _median_shape(env: Any) -> np.ndarray:
+    """Returns the error shape of median size of some episodes."""
+    shapes = []
+    for seed in range(5):
+        env.reset(seed=seed)
+        shapes += [env.step(np.zeros(env.plant.m, np.float32))[4]["error_shape"] for _ in range(60)]
+    return sorted(shapes, key=lambda each: np.trace(env.plant.weight @ each))[len(shapes) // 2]
+
+
+def _kept_by_some_input(plant: LinearPlant, estimates: np.ndarray, shape: np.ndarray) -> float:
+    """Returns for what share of estimates some input is sure to keep the next state in the box."""
+    C, D = plant.box_rows, plant.disturbance.shape_matrix
+    reach = sum(
+        np.sqrt(np.maximum(np.einsum("ji,ik,jk->j", *each), 0.0))
+        for each in ((C, D, C), (C @ plant.A, shape, C @ plant.A))
+    )
+    rows, drifts = C @ plant.B, estimates @ (C @ plant.A).T
+    A_ub, b_ub = np.vstack([rows, -rows]), np.hstack([1.0 - reach - drifts, 1.0 - reach + drifts])
+    bounds = np.stack([-plant.u_max, plant.u_max], axis=1)
+    return float(np.mean([linprog(np.zeros(plant.m), A_ub, each, bounds=bounds).success for each in b_ub]))
 
 
 class PlainProgram:
@@ -75,6 +96,8 @@ class PlainProgram:
 
     def __init__(self, shield: SafetyFilter) -> None:
         plant, steps = shield.plant, shield.horizon
+        assert steps is not None
+        assert shield.lookahead is not None
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
         self.row_limits, self.weighting, self.radius = (
@@ -103,250 +126,70 @@ class PlainProgram:
         self.row_limits.value, self.radius.value = row_limits[0], radius[0, -1]
         if self.plans.prediction.ends:
             self.weighting.value = known.weighting[0, -1]
-        return solved(self.problem)
+        try:
+            self.problem.solve(solver=cp.CLARABEL)
+        except cp.SolverError:  # it happens where there is hardly a solution
+            return False
+        return self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
 
 
-def kept_by_some_input(plant: LinearPlant, situations: Situations) -> float:
-    """Returns for what share of situations some input keeps the next state in the box, whatever error and disturbance.
+class Recorded(SafetyFilter):
+    """A safety filter that keeps what it decides about, and the microseconds per decision."""
 
-    No shield that knows no more than the estimate and the shape of its error can admit more.
+    def decide_columns(self, estimates: Any, errors: Any, proposed: Any, stored: Any = None) -> Any:
+        start = time.process_time()
+        decided = super().decide_columns(estimates, errors, proposed, stored)
+        spent = 1e6 * (time.process_time() - start) / ENVS
+        steps = self.__dict__.setdefault("steps", [])
+        steps.append((spent, estimates.copy(), errors, proposed.copy(), stored.copy()))
+        return decided
+
+
+def decisions(safe_set: SafeSet = "polytope", steps: int = 100) -> None:
+    """Microseconds per decision of mode "lookahead" in closed loop, against one cvxpy program per decision.
+
+    64 environments run behind the shield with random actions. Every decision they meet is timed as they make it, in a
+    batch of 64, and again one by one for some of them, as the wrapper of a single environment makes it. "searched" are
+    those whose proposal fails the one-step test. A predictive filter without this order asks its solver at every step:
+    "cvxpy" is the median time of the same convex program, with parameters (DPP) and solved by Clarabel.
     """
-    C, D = plant.box_rows, plant.disturbance.shape_matrix
-    reach = sum(
-        np.sqrt(np.maximum(np.einsum("ji,ik,jk->j", *each), 0.0))
-        for each in ((C, D, C), (C @ plant.A, situations.shape, C @ plant.A))
-    )
-    rows, drifts = C @ plant.B, situations.estimates @ (C @ plant.A).T
-    A_ub, b_ub = np.vstack([rows, -rows]), np.hstack([1.0 - reach - drifts, 1.0 - reach + drifts])
-    bounds = np.stack([-plant.u_max, plant.u_max], axis=1)
-    return float(np.mean([linprog(np.zeros(plant.m), A_ub, each, bounds=bounds).success for each in b_ub]))
+    titles = ("N", "searched", "median", "99%", "searched", "of 64", "99%", "cvxpy", "x median", "x of 64")
+    show = table("us per decision", *titles, first=20)
+    for name, horizon in CASES[safe_set]:
+        env, rng = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=ENVS), np.random.default_rng(0)
+        single = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
+        certificate = certified(single.plant, single.certificate_contract, safe_set)
+        shielded = VectorSafetyShield(env, certificate, "lookahead", horizon=horizon, on_unproved="ignore")
+        shielded._filter = Recorded(certificate, single.plant, "lookahead", horizon)
+        shielded.reset(seed=0)
+        for _ in range(WARM + steps):
+            shielded.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        met = shielded.filter.__dict__["steps"][WARM:]
+        together = np.array([step[0] for step in met])
+        shield = SafetyFilter(certificate, single.plant, "lookahead", horizon)
+        cases = [case for _, *step in met for case in _singles(*step)]
+        alone = microseconds(shield.decide, cases)
+        failed = np.array([shield.decide(*case).reason != "safe" for case in cases])
+        searched = [case for case, fails in zip(cases, failed, strict=True) if fails]
+        programs = [(x_hat, errors.shape, u) for x_hat, errors, u, _ in (searched or cases)[:CVXPY]]
+        theirs = np.median(microseconds(PlainProgram(shield).solve, programs))
+        times = [np.median(alone), np.quantile(alone, 0.99), np.median(alone[failed]) if failed.any() else np.nan]
+        times += [np.median(together), np.quantile(together, 0.99), theirs]
+        ratios = [f"{theirs / np.median(each):.0f}x" for each in (alone, together)]
+        show(name, horizon, f"{failed.mean():.1%}", *(f"{each:.0f}" for each in times), *ratios)
 
 
-def solved(problem: cp.Problem) -> bool:
-    try:
-        problem.solve(solver=cp.CLARABEL)
-    except cp.SolverError:  # it happens where there is hardly a solution
-        return False
-    return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+def _singles(
+    estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: np.ndarray
+) -> Iterator[tuple[Any, ...]]:
+    """Yields the first decisions of a batch as arguments of single ones."""
+    for e in range(ALONE):
+        plan = stored[..., e]
+        known = errors.of(np.array([e])).single()
+        yield estimates[:, e].copy(), known, proposed[:, e].copy(), plan[~np.isnan(plan[:, 0])]
 
 
-def drawn(env: gym.Env, count: int) -> Situations:
-    inner, rng, shapes = env.unwrapped, np.random.default_rng(0), []
-    for seed in range(EPISODES):
-        env.reset(seed=seed)
-        shapes += [env.step(np.zeros(inner.plant.m, np.float32))[4]["error_shape"] for _ in range(STEPS)]
-    shape = sorted(shapes, key=lambda each: np.trace(inner.plant.weight @ each))[len(shapes) // 2]
-    states = np.empty((0, inner.plant.n))
-    while len(states) < count:
-        more = rng.uniform(-1, 1, (count, inner.plant.n)) * inner.plant.half_widths
-        states = np.concatenate([states, more[(np.abs(more @ inner.plant.box_rows.T) <= 1.0).all(axis=1)]])
-    states = states[:count]
-    errors = Ellipsoid(shape).sample_boundary(rng, count)
-    return Situations(states, states + errors, rng.uniform(-1, 1, (count, inner.plant.m)) * inner.plant.u_max, shape)
-
-
-def timed(decide, situations: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-    """Microseconds of CPU time per call, each the better of two."""
-    times = np.empty((2, len(situations)))
-    for row in times:
-        for e, situation in enumerate(situations):
-            start = time.process_time()
-            decide(*situation)
-            row[e] = 1e6 * (time.process_time() - start)
-    return times.min(axis=0)
-
-
-@cache
-def certified(name: str, safe_set: str) -> Certificate:
-    """Returns the certificate of a registered environment."""
-    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    sought = safe_set == "sought"
-    return synthesize(
-        env.plant, contract=env.certificate_contract, safe_set=None if sought else safe_set, search_gain=sought
-    )
-
-
-def report(name: str, safe_set: str, horizon: int, count: int) -> str:
-    env = gym.make(f"ncs_gym/{name}-v0", terminate_on_violation=False)
-    certificate = certified(name, safe_set)
-    plant = env.unwrapped.plant
-    shield = SafetyFilter(certificate, plant, "lookahead", horizon)
-    project = SafetyFilter(certificate, plant)
-    situations = drawn(env, count)
-    inside = np.mean(certificate.safe_set.gauge(situations.states) <= 1.0)
-    cases = [(x_hat, situations.shape, u) for x_hat, u in zip(situations.estimates, situations.proposed, strict=True)]
-    one_step = np.mean([project.decide(*each).passed for each in cases])
-    admitted = np.mean([shield.decide(*each).passed for each in cases])
-    bound = kept_by_some_input(plant, situations)
-    searched = [each for each in cases if shield.decide(*each).reason != "safe"]
-    if not searched:
-        return f"{name:20s} {horizon:3d} every proposal passes the one-step test"
-    ours, plain = timed(shield.decide, searched), PlainProgram(shield)
-    others = timed(plain.solve, [searched[i % len(searched)] for i in range(CVXPY)])
-    found = [shield.decide(*each) for each in searched]
-    pairs = [
-        (case, one, shield.decide(*case[:2], -case[2])) for case, one in zip(searched, found, strict=True)
-    ]  # what is stored was made for another proposal
-    pairs = [
-        (*each, np.concatenate([each[2].input[None], each[2].plan])) for each in pairs if each[2].reason == "planned"
-    ]
-    again, faster, farther = "-", "-", "-"
-    if pairs:
-        median = np.median(timed(shield.decide, [(*case, stored) for case, _, _, stored in pairs]))
-        far = [
-            np.linalg.norm(shield.decide(*case, stored).input - case[2]) - np.linalg.norm(one.input - case[2])
-            for case, one, _, stored in pairs
-        ]
-        again, faster = f"{median:.0f}", f"{np.median(others) / median:.1f}x"
-        farther = f"{np.mean(far) / plant.u_max.max():.2f}"
-    quick = timed(project.decide, [each for each in cases if project.decide(*each).reason == "safe"][:300])
-    return (
-        f"{name:18s}{horizon:3d}{inside:7.1%}{one_step:9.1%}{admitted:10.1%}{bound:8.1%}"
-        f"{np.median(quick):9.0f}{np.median(ours):7.0f}{np.quantile(ours, 0.99):6.0f}"
-        f"{again:>7}{np.median(others):6.0f}{np.median(others) / np.median(ours):7.1f}x{faster:>8}{farther:>8}"
-    )
-
-
-def shielded(name: str, safe_set: str, mode: str, horizon: int, **settings) -> VectorSafetyShield:
-    env = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=ENVS, **settings)
-    longest = horizon if mode == "lookahead" else None
-    return VectorSafetyShield(env, certified(name, safe_set), mode, horizon=longest, on_unproved="ignore")
-
-
-def driven(env, act, steps: int) -> tuple[float, ...]:
-    """Microseconds per frame, share of inputs overridden, mean correction and reward per frame."""
-    observation, info = env.reset(seed=SEED)
-    sums, start = np.zeros(3), 0.0
-    for step in range(WARM + steps):
-        if step == WARM:
-            sums[:], start = 0.0, time.process_time()
-        observation, rewards, _, _, info = env.step(act(observation))
-        sums += info["shield_intervened"].mean(), info["shield_correction"].mean(), rewards.mean()
-    return 1e6 * (time.process_time() - start) / (steps * ENVS), *(sums / steps)
-
-
-def loop(safe_set: str) -> None:
-    print("environment            actions     us per frame: project lookahead   overridden            correction")
-    for name, horizon in CASES[safe_set][1:]:
-        for actions, mean, spread in (("random", 0.0, None), ("pushed", 0.8, 0.5)):
-            results = []
-            for mode in MODES:
-                env, rng = shielded(name, safe_set, mode, horizon), np.random.default_rng(SEED)
-                shape = env.action_space.shape
-
-                def act(_, rng=rng, shape=shape, mean=mean, spread=spread):
-                    drawn = rng.uniform(-1, 1, shape) if spread is None else rng.normal(mean, spread, shape)
-                    return np.clip(drawn, -1, 1).astype(np.float32)
-
-                results.append(driven(env, act, MEASURED))
-            (first, few, small, _), (second, many, large, _) = results
-            print(
-                f"{name:22s} {actions:10s} {first:22.1f} {second:9.1f}   {few:6.1%} -> {many:6.1%}   "
-                f"{small:7.3f} -> {large:7.3f}",
-                flush=True,
-            )
-
-
-class AskingPlanner(Planner):
-    """Asks the solver for plans that end in P as `Planner` does for those that end in S."""
-
-    def find(self, estimates, shapes, proposed, projected, stored):
-        plans = super().find(estimates, shapes, proposed, projected, stored)
-        tightening = self.test.tightenings_of(shapes)
-        left = np.flatnonzero(np.isnan(stored[:, 0, 0]) & (plans.distances > 0.0))
-        if left.size:
-            known = Tightening(*(part[left] for part in tightening))
-            plans.improve(left, self._solved(estimates[left], known, proposed[left]))
-        return plans
-
-
-def asking(shield: SafetyFilter) -> SafetyFilter:
-    shield.lookahead.planner.__class__ = AskingPlanner
-    return shield
-
-
-def ends() -> None:
-    name, horizon = CASES["polytope"][-1]
-    S, plant = certified(name, "ellipsoid").ellipsoid, gym.make(f"ncs_gym/{name}-v0").unwrapped.plant
-    kinds = {"S": "ellipsoid", "P": "polytope", "P, with the solver": "polytope"}
-    print(f"{name}, plans end in   {'overridden':>12s}{'correction':>12s}{'outside':>9s}")
-    situations = {}
-    for end, safe_set in kinds.items():
-        env, rng, sums = shielded(name, safe_set, "lookahead", horizon), np.random.default_rng(SEED), np.zeros(3)
-        if "solver" in end:
-            asking(env.filter)
-        _, info = env.reset(seed=SEED)
-        taken = situations[end] = []
-        for step in range(WARM + MEASURED):
-            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-            if step >= WARM and step % 25 == 0:
-                taken += zip(info["estimate"].copy(), info["error_shape"].copy(), action * plant.u_max, strict=True)
-            info = env.step(action)[4]
-            if step >= WARM:
-                outside = np.mean(S.gauge(info["state"]) > 1.0)
-                sums += info["shield_intervened"].mean(), info["shield_correction"].mean(), outside
-        overridden, correction, outside = sums / MEASURED
-        print(f"in a loop: {end:20s}{overridden:11.1%}{correction:12.3f}{outside:9.1%}", flush=True)
-    filters = {end: SafetyFilter(certified(name, kind), plant, "lookahead", horizon) for end, kind in kinds.items()}
-    asking(filters["P, with the solver"])
-    for loop_of in ("S", "P"):
-        for end, shield in filters.items():
-            found = [shield.decide(*each) for each in situations[loop_of]]
-            far = [np.linalg.norm(one.input - each[2]) for one, each in zip(found, situations[loop_of], strict=True)]
-            share = np.mean([one.intervened for one in found])
-            print(f"situations of loop {loop_of}: {end:20s}{share:6.1%}{np.mean(far):12.3f}", flush=True)
-
-
-def training(safe_set: str, steps: int) -> None:
-    name, horizon = CASES[safe_set][-1]
-    hyperparams, agents, rates = complete_hyperparams("PPO", {"n_envs": ENVS}), {}, {}
-    for count in (1, steps):  # what only the first training of a process takes time for is not measured
-        for mode in MODES:
-            env = SB3VecEnv(shielded(name, safe_set, mode, horizon, autoreset_mode="SameStep"))
-            normalized = VecNormalize(env, gamma=hyperparams["gamma"])
-            model, start = build_model("PPO", normalized, hyperparams, SEED), time.process_time()
-            model.learn(count)
-            rates[mode] = model.num_timesteps / (time.process_time() - start)
-            agents[mode] = model, normalized
-    print(f"PPO on {name}, frames per second of CPU time:", {mode: round(rate) for mode, rate in rates.items()})
-    print(f"ratio {rates['lookahead'] / rates['project']:.2f}")
-    for trained, (model, normalized) in agents.items():
-        for mode in MODES:
-
-            def act(observation, model=model, normalized=normalized):
-                return model.predict(normalized.normalize_obs(observation), deterministic=True)[0]
-
-            _, share, correction, reward = driven(shielded(name, safe_set, mode, horizon), act, 2 * MEASURED)
-            print(
-                f"trained behind {trained:9s} run behind {mode:9s}: overridden {share:6.1%}, correction "
-                f"{correction:.3f}, reward per step {reward:.4f}",
-                flush=True,
-            )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
-    parser.add_argument("--safe-set", choices=CASES, default="polytope")
-    parser.add_argument("--situations", type=int, default=2000)
-    parser.add_argument("--steps", type=int, default=150_000)
-    options = parser.parse_args()
-    if "situations" in options.sections:
-        print(f"{'states':>28s}{'situations admitted':>27s}{'us per decision':>35s}{'cvxpy over':>16s}")
-        print(
-            f"{'environment':18s}{'N':>3s}{'in S':>7s}{'one step':>9s}{'lookahead':>10s}{'bound':>8s}"
-            f"{'one step':>9s}{'search':>7s}{'99%':>6s}{'stored':>7s}"
-            f"{'cvxpy':>6s}{'search':>8s}{'stored':>8s}{'too far':>8s}"
-        )
-        for name, horizon in CASES[options.safe_set]:
-            print(report(name, options.safe_set, horizon, options.situations), flush=True)
-    if "loop" in options.sections:
-        loop(options.safe_set)
-    if "ends" in options.sections:
-        ends()
-    if "training" in options.sections:
-        training(options.safe_set, options.steps)
-
+COMMANDS = (admitted, decisions)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, COMMANDS)

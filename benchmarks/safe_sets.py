@@ -1,17 +1,19 @@
-"""How much of its box each safe set fills, next to what no controller can exceed; a picture of the sets.
+"""How large safe sets are, and what a larger one gives: `python -m benchmarks.safe_sets COMMAND`.
 
-    python benchmarks/safe_sets.py [--ids CartPole BatchReactor] [--points 512] [--picture docs/images/safe-sets.png]
-
-"bound" is the share of states from which some inputs within the limits keep the plant in the box for `STEPS` steps if
-the state is known and nothing disturbs it: a linear program for each of `--points` states spread over the box. The
-picture shows sections through the origin: states that are not on an axis are zero.
+Commands: sections, polytope, packages, between-samples.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
+import contextlib
+import io
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import matplotlib
@@ -20,111 +22,345 @@ from scipy import sparse
 from scipy.optimize import linprog
 from scipy.stats import qmc
 
-import ncs_gym  # noqa: F401  (registers the environments)
+from benchmarks.commands import run, table
+from benchmarks.timing import least_times, timed
+from experiments.baselines import controller
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
-from ncs_gym import LinearPlant
-from shields import Certificate, synthesize
+from ncs_gym import LinearPlant, NCSEnv
+from ncs_gym.envs.env import ncs_env
+from shields import Certificate, Infeasible, SafetyFilter, VectorSafetyShield, synthesize
+from shields.synthesis.invariant_polytope import Faces, in_half_ranges, invariant_faces
+from shields.synthesis.polytope_certificates import with_largest_polytope, with_polytope
+from shields.verification import ACTION_ROUNDING
 
 IDS = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum")
 # The two states that are shown where there are more: angle and rate of the pole; the reactor's first and third.
 PLANES = {"CartPole": (2, 3), "BatchReactor": (0, 2)}
-STEPS = 100
 # Sets, and their colors, apart for color-blind readers (Okabe and Ito).
 COLORS = {"upper bound": "#999999", "polytope": "#0072b2", "ellipsoid": "#d55e00"}
+# Points between two samples at which the box counts, where it does.
+POINTS: dict[str, int] = {
+    **dict.fromkeys(("TruckTrailer", "TruckTrailerCruise", "TruckTrailerCruiseTwoWay"), 8),
+    **dict.fromkeys(("CartPole", "CartPoleTwoWay", "BatchReactor", "CSTR", "Convoy", "LaneKeeping"), 4),
+}
+
+
+def _env(name: str) -> NCSEnv:
+    return ncs_env(gym.make(f"ncs_gym/{name}-v0"))
 
 
 class Viability:
-    """Which states some inputs within the limits keep in the box for `STEPS` steps, without disturbance."""
+    """Which states some inputs within the limits keep in the box for so many steps, without disturbance."""
 
-    def __init__(self, plant: LinearPlant) -> None:
+    def __init__(self, plant: LinearPlant, steps: int = 100) -> None:
         n, m = plant.n, plant.m
         scale, limits = plant.half_widths, plant.u_max
         A, B = plant.A * scale / scale[:, None], plant.B * limits / scale[:, None]
         # Variables: the size t of the start, states x_0 .. x_N and inputs u_0 .. u_{N-1}, in units of their limits.
-        moves = sparse.hstack([
-            sparse.kron(sparse.eye(STEPS, STEPS + 1), A) - sparse.kron(sparse.eye(STEPS, STEPS + 1, 1), np.eye(n)),
-            sparse.kron(sparse.eye(STEPS), B),
-        ])  # fmt: skip
-        self._moves = sparse.hstack([sparse.csr_matrix((moves.shape[0], 1)), moves])
-        rows = sparse.kron(sparse.eye(STEPS + 1), plant.box_rows * scale)
-        rows = sparse.hstack(
-            [sparse.csr_matrix((rows.shape[0], 1)), rows, sparse.csr_matrix((rows.shape[0], STEPS * m))]
-        )
-        self._box = sparse.vstack([rows, -rows]).tocsr()
-        self._scale, self._n = scale, n
-        self._bounds = [(0.0, None)] + [(None, None)] * ((STEPS + 1) * n) + [(-1.0, 1.0)] * (STEPS * m)
+        columns, faces = 1 + (steps + 1) * n + steps * m, (steps + 1) * len(plant.box_rows)
+        moved = sparse.kron(sparse.eye(steps, steps + 1), A) - sparse.kron(sparse.eye(steps, steps + 1, 1), np.eye(n))
+        moves = [sparse.csr_matrix((steps * n, 1)), moved, sparse.kron(sparse.eye(steps), B)]
+        rows = sparse.kron(sparse.eye(steps + 1), plant.box_rows * scale)
+        rows = sparse.hstack([sparse.csr_matrix((faces, 1)), rows, sparse.csr_matrix((faces, steps * m))])
+        self._moves, self._scale, self._start = sparse.hstack(moves), scale, sparse.lil_matrix((n, columns))
+        bounds = [(0.0, None)] + [(None, None)] * ((steps + 1) * n) + [(-1.0, 1.0)] * (steps * m)
+        self._problem: dict[str, Any] = {"c": -np.eye(1, columns)[0], "bounds": bounds}
+        self._problem |= {"A_ub": sparse.vstack([rows, -rows]).tocsr(), "b_ub": np.ones(2 * faces)}
+        self._problem |= {"b_eq": np.zeros((steps + 1) * n)}
 
     def reach(self, direction: np.ndarray) -> float:
         """Returns the largest t such that the state t direction, shape (n,), can be kept in the box."""
-        start = sparse.lil_matrix((self._n, self._moves.shape[1]))
-        start[:, 0], start[:, 1 : self._n + 1] = -(direction / self._scale)[:, None], np.eye(self._n)
+        start, n = self._start.copy(), len(direction)
+        start[:, 0], start[:, 1 : n + 1] = -(direction / self._scale)[:, None], np.eye(n)
         equal = sparse.vstack([start.tocsr(), self._moves])
-        cost = np.zeros(equal.shape[1])
-        cost[0] = -1.0
-        problem = {"A_ub": self._box, "b_ub": np.ones(self._box.shape[0]), "bounds": self._bounds}
-        problem |= {"A_eq": equal, "b_eq": np.zeros(equal.shape[0])}
         for method in ("highs-ds", "highs-ipm"):  # either gives up now and then, on different problems
-            found = linprog(cost, **problem, method=method)
+            found = linprog(**self._problem, A_eq=equal, method=method)
             if found.status == 0:
                 return float(found.x[0])
-        raise RuntimeError(f"the solver does not say how far a direction reaches: {found.message}")
+        raise RuntimeError("the solver does not say how far a direction reaches")
 
 
-def reaches(certificate: Certificate, viability: Viability) -> dict[str, Callable[[np.ndarray], float]]:
-    """Returns for each set the largest t such that t times a direction lies in it."""
-    sets = {"upper bound": viability.reach, "ellipsoid": lambda v: 1.0 / certificate.ellipsoid.gauge(v)}
-    return sets if certificate.polytope is None else sets | {"polytope": lambda v: 1.0 / certificate.polytope.gauge(v)}
+def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> None:
+    """Draws sections through the origin of ellipsoid, polytope and what no controller can exceed.
 
-
-def row(name: str, certificate: Certificate, viability: Viability, plant: LinearPlant, points: int) -> str:
-    shares = [certificate.provenance.get(each) for each in ("share_of_box", "polytope_share_of_box")]
-    drawn = (2.0 * qmc.Sobol(plant.n, seed=0).random(points) - 1.0) * plant.half_widths
-    bound = np.mean([viability.reach(point) >= 1.0 for point in drawn])
-    texts = [f"{share:9.1%}" if share is not None else f"{'-':>9s}" for share in shares]
-    return f"{name:20}{texts[0]}{texts[1]}{bound:9.1%}"
-
-
-def picture(cases: dict[str, tuple[LinearPlant, Certificate, Viability]]) -> CaptionedFigure:
-    """Sections of the sets, a panel for each environment."""
+    States that are not on an axis are zero. The upper bound are states from which some inputs within the limits keep
+    the plant in the box for 100 steps if the state is known and nothing disturbs it. `polytope` prints shares of the
+    box.
+    """
     angles = np.linspace(0.0, np.pi, 120, endpoint=False)  # the corners of the box among them
     with matplotlib.rc_context(STYLE):
-        figure, handles = CaptionedFigure((3.1 * len(cases), 3.3)), {}
-        panels = np.atleast_1d(figure.subplots(1, len(cases)))
-        for axes, (name, (plant, certificate, viability)) in zip(panels, cases.items(), strict=True):
-            plane = PLANES.get(name, (0, 1))
+        figure, handles = CaptionedFigure((3.1 * len(ids), 3.3)), {}
+        panels = np.atleast_1d(figure.subplots(1, len(ids)))
+        for axes, name in zip(panels, ids, strict=True):
+            env = _env(name)
+            plant, certificate = env.plant, synthesize(env.plant, contract=env.certificate_contract)
+            plane, sets = (
+                PLANES.get(name, (0, 1)),
+                {"ellipsoid": certificate.ellipsoid, "polytope": certificate.polytope},
+            )
+            reaches: dict[str, Callable[[np.ndarray], float]] = {"upper bound": Viability(plant).reach}
+            reaches |= {
+                kind: lambda v, each=each: 1.0 / each.gauge(v) for kind, each in sets.items() if each is not None
+            }
             directions = np.zeros((len(angles), plant.n))
             directions[:, plane] = np.column_stack([np.cos(angles), np.sin(angles)]) * plant.half_widths[list(plane)]
-            for each, reach in reaches(certificate, viability).items():
+            for kind, reach in reaches.items():
                 half = directions[:, plane] * np.array([reach(v) for v in directions])[:, None]
                 outline = np.concatenate([half, -half, half[:1]]).T
-                if each != "ellipsoid":
-                    axes.fill(*outline, color=COLORS[each], alpha=0.25, lw=0)
-                (handles[each],) = axes.plot(*outline, color=COLORS[each], lw=1.5)
+                if kind != "ellipsoid":
+                    axes.fill(*outline, color=COLORS[kind], alpha=0.25, lw=0)
+                (handles[kind],) = axes.plot(*outline, color=COLORS[kind], lw=1.5)
             box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * plant.half_widths[list(plane)]
             (handles["safe box"],) = axes.plot(*box.T, color="#222222", lw=1.0, ls="--")
-            names = [with_unit(plant.state_names[k], plant.state_units[k]) for k in plane]
-            label(axes, *names, name)
+            x, y = (with_unit(plant.state_names[k], plant.state_units[k]) for k in plane)
+            label(axes, x, y, name)
         legend_below(figure, handles)
-        return figure
+        out.write_bytes(figure.png)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--ids", nargs="*", default=IDS)
-    parser.add_argument("--points", type=int, default=512)
-    parser.add_argument("--picture", type=Path, default=None, help="PNG file")
-    options = parser.parse_args()
-    cases = {}
-    print("share of the box    ellipsoid polytope    bound")
-    for name in options.ids:
-        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-        certificate = synthesize(env.plant, contract=env.certificate_contract)
-        cases[name] = env.plant, certificate, Viability(env.plant)
-        if options.points:
-            print(row(name, certificate, cases[name][2], env.plant, options.points), flush=True)
-    if options.picture is not None:
-        options.picture.write_bytes(picture(cases).png)
+def _deciding(shield: SafetyFilter, inside: Certificate, count: int) -> Callable[[], object]:
+    """Returns decisions about estimates in the safe set of a certificate, and random inputs."""
+    rng, plant = np.random.default_rng(0), shield.plant
+    estimates = (inside.safe_set.sample_boundary(rng, count) * rng.uniform(0.2, 0.9, (count, 1))).T.copy()
+    proposals = rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.u_max[:, None]
+    errors = shield.errors_of(0.5 * shield.certificate.error_shapes[0])
+    if count == 1:
+        return lambda: shield.decide(estimates[:, 0], errors, proposals[:, 0])
+    batch = errors.batch().of(np.zeros(count, np.int64))
+    return lambda: shield.decide_columns(estimates, batch, proposals)
 
+
+def _behind(name: str, certificate: Certificate, K: np.ndarray, steps: int, **settings: Any) -> tuple[float, float]:
+    """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
+    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, **settings), certificate)
+    policy = controller("lqr", _env(name), K, 0)
+    observations, info = envs.reset(seed=0)
+    sums = np.zeros(2)
+    for _ in range(steps // 20):
+        observations, reward, *_, info = envs.step(policy(observations, info).astype(np.float32))
+        sums += info["shield_intervened"].sum(), reward.sum()
+    overridden, total = sums / (steps // 20 * 20)
+    return overridden, total
+
+
+def polytope(ids: Sequence[str] = IDS, steps: int = 8000) -> None:
+    """What a polytope in place of the ellipsoid gives, and what it costs, for registered environments.
+
+    Three safe sets: the ellipsoid, the polytope that its gain keeps in the box, and that of a gain that was sought for
+    it. "share" is the part of the safe box's volume that the set fills, "s" the processor's time for finding and
+    proving it, on top of the set above for a polytope. "x 1", "x 64" and "x 1024" compare a decision to one with the
+    ellipsoid, for one loop and for batches. "overridden" and "reward" (per step) are those of an LQR behind the shield,
+    in the same episodes.
+    """
+    columns = ("safe set", "rows", "share", "s", "x 1", "x 64", "x 1024", "overridden", "reward")
+    show = table("id", *columns, first=20, width=7)
+    for name in ids:
+        env = _env(name)
+        plant, contract = env.plant, env.certificate_contract
+        plain, seconds = timed(synthesize, plant, contract=contract, safe_set="ellipsoid")
+        made = {"ellipsoid": (plain, seconds)}
+        made["polytope"] = timed(with_polytope, plain, plant)
+        made["sought gain"] = timed(with_largest_polytope, plain, plant)
+        shields = [SafetyFilter(certificate, plant) for certificate, _ in made.values()]
+        inside = made["polytope"][0]
+        works = [[_deciding(shield, inside, count) for shield in shields] for count in (1, 64, 1024)]
+        times = np.array([least_times(each) for each in works])
+        for k, (kind, (certificate, seconds)) in enumerate(made.items()):
+            rows = getattr(certificate.polytope, "rows", ())
+            share = certificate.provenance["polytope_share_of_box" if len(rows) else "share_of_box"]
+            ratios = [f"{ratio:.2f}" for ratio in times[:, k] / times[:, 0]]
+            overridden, reward = _behind(name, certificate, plain.K, steps)
+            found = (f"{share:.1%}", f"{seconds:.1f}", *ratios, f"{overridden:.1%}", f"{reward:.3f}")
+            show(name, kind, len(rows) or "", *found)
+
+
+class Case(NamedTuple):
+    """A closed loop in units of the box: z+ = A z + w with |rows z| <= 1 and |w_k| <= W_k."""
+
+    A: np.ndarray
+    rows: np.ndarray
+    W: np.ndarray
+
+
+def case_of(name: str) -> Case:
+    env = _env(name)
+    plant, certificate = env.plant, synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid")
+    widths, K = plant.half_widths, certificate.K
+    reach = np.sqrt(np.einsum("ij,kjl,il->ki", K, certificate.error_shapes, K).max(axis=0))
+    inputs = K / (plant.u_max * (1.0 - float(ACTION_ROUNDING)) - reach)[:, None]
+    pushed = plant.B @ K
+    errors = np.sqrt(np.einsum("ij,kjl,il->ki", pushed, certificate.error_shapes, pushed).max(axis=0))
+    W = errors + np.sqrt(np.diag(certificate.D))
+    return Case(
+        (plant.A + pushed) * widths / widths[:, None], np.concatenate([plant.box_rows, inputs]) * widths, W / widths
+    )
+
+
+def ours(case: Case) -> np.ndarray:
+    def predecessor(faces: Faces) -> Faces:
+        # What the search keeps from every face for the rounding of rows and multipliers, as in the synthesis.
+        taken = 1e-6 + np.abs(faces.rows) @ case.W
+        return in_half_ranges(faces.rows @ case.A, faces.low + taken, faces.high - taken)
+
+    ones = np.ones(len(case.rows))
+    rows = invariant_faces(Faces(case.rows, -ones, ones), predecessor, case.A.shape[0]).rows
+    return np.concatenate([rows, -rows])
+
+
+def by_polytope(case: Case) -> np.ndarray:
+    from polytope import Polytope, is_subset, reduce  # pyright: ignore[reportMissingImports]
+
+    now = Polytope(np.concatenate([case.rows, -case.rows]), np.ones(2 * len(case.rows)))
+    while True:
+        left = now.b - np.abs(now.A) @ case.W
+        following = reduce(Polytope(np.vstack([now.A, now.A @ case.A]), np.append(now.b, left)))
+        if is_subset(now, following):
+            return now.A / now.b[:, None]
+        now = following
+
+
+def by_ampyc(case: Case) -> np.ndarray:
+    from ampyc.utils import Polytope  # pyright: ignore[reportMissingImports]
+    from ampyc.utils.set_computation import compute_mrpi  # pyright: ignore[reportMissingImports]
+
+    n, count = len(case.W), len(case.rows)
+    start = Polytope(np.concatenate([case.rows, -case.rows]), np.ones(2 * count))
+    W = Polytope(np.concatenate([np.eye(n), -np.eye(n)]), np.tile(case.W, 2))
+    with contextlib.redirect_stdout(io.StringIO()):
+        found = compute_mrpi(start, case.A, W, max_iter=10_000)
+    return found.A / found.b[:, None]
+
+
+def shortfall(faces: np.ndarray, case: Case) -> Fraction:
+    """Returns by how much the worst face fails in rational arithmetic; at most zero if the set is invariant."""
+    worst = Fraction(-1)
+    exact = [[Fraction(float(entry)) for entry in face] for face in faces]
+    A, W = ([[Fraction(float(entry)) for entry in row] for row in matrix] for matrix in (case.A.T, case.W[:, None]))
+    for face in exact:
+        image = [sum(a * f for a, f in zip(column, face, strict=True)) for column in A]
+        found = linprog(-np.array(image, float), A_ub=faces, b_ub=np.ones(len(faces)), bounds=(None, None))
+        if found.status != 0:
+            return Fraction(1)
+        multipliers = [Fraction(max(0.0, -float(price))) for price in found.ineqlin.marginals]
+        rest = list(image)
+        for multiplier, other in zip(multipliers, exact, strict=True):
+            if multiplier:
+                rest = [left - multiplier * entry for left, entry in zip(rest, other, strict=True)]
+        support = sum(abs(f) * w for f, (w,) in zip(face, W, strict=True))
+        worst = max(worst, Fraction(sum(multipliers) + sum(map(abs, rest)) + support - 1))
+    return worst
+
+
+def packages(
+    ids: Sequence[str] = ("TruckTrailerCruise", "BatchReactor", "Pendulum", "CartPole"), longest: int = 300
+) -> None:
+    """The largest robustly invariant polytope by other packages (pip install polytope ampyc), on the same closed loop.
+
+    All of them get A+BK, the box with the rows of the input limits, and W, the smallest box around what errors of the
+    estimate and disturbances do in a step: the packages take polytopes only. "ours" is the search of `synthesize` with
+    this W, "polytope" the textbook iteration with that package's intersection and reduction, "ampyc" its
+    `compute_mrpi`. "exact" says whether the result is invariant in rational arithmetic: for every face f with f x <= 1
+    there are multipliers with sum(lambda) + sum |f (A+BK) - lambda F|_k w_k + support of W <= 1, found by a linear
+    program and not trusted; if not, by how much the worst face fails. CPU time; what takes longer than `--longest`
+    seconds is stopped.
+    """
+    show = table("id", "by", "seconds", "faces", "of box", "exact", first=20, width=10)
+    for name in ids:
+        case = case_of(name)
+        for tool, find in {"ours": ours, "polytope": by_polytope, "ampyc": by_ampyc}.items():
+            show(name, tool, *_judged(find, case, longest))
+
+
+def _judged(find: Callable[[Case], np.ndarray], case: Case, longest: int) -> tuple[str, str, str, str]:
+    """Returns seconds, faces, share of the box, and what rational arithmetic says of a search."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError
+
+    signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, longest)
+    begin = time.process_time()
+    try:
+        faces = find(case)
+    except (TimeoutError, Infeasible) as none:
+        return f"{time.process_time() - begin:.2f}", "-", "-", f"  {str(none) or 'stopped'}"
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    seconds = time.process_time() - begin
+    points = 2.0 * qmc.Sobol(len(case.W), scramble=False).random_base2(16) - 1.0
+    share, failing = ((points @ faces.T).max(axis=1) <= 1.0).mean(), shortfall(faces, case)
+    verdict = "holds" if failing <= 0 else f"  fails by {float(failing):.1e}"
+    return f"{seconds:.2f}", str(len(faces)), f"{share:.1%}", verdict
+
+
+def between_samples(
+    ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: int = 8000, search_gain: bool = False
+) -> None:
+    """What it costs that the box counts between samples, too, for environments with a model in continuous time.
+
+    Each id has two lines: at sampling instants alone, and at all times. "S" and "P" are the shares of the safe box's
+    volume that ellipsoid and polytope fill, "rows" those of P, "s" the time of both searches and proofs, "bears" how
+    much larger all disturbances and errors could be for some ellipsoid ("tolerated_scale"). "overridden" and "reward"
+    (per step) are those of an LQR behind the shield with P in mode "project", in the same episodes. "left" is the
+    largest |c x| between two samples inside the box, without a shield, under random inputs of full size. "decision",
+    "step" and "x 64" (steps of 64 environments) are times, least of many in turns, next to those of the first line.
+    Where nothing certifies, the line says why.
+    """
+    columns = ("N", "S", "P", "rows", "s", "bears", "overridden", "reward", "left", "decision", "step", "x 64")
+    show = table("id", *columns, first=26, width=7)
+    for name in ids:
+        env = _env(name)
+        plants = [env.plant, replace(env.plant, between_samples=points or POINTS.get(name, 8))]
+        found: list[tuple[Certificate, float]] = []
+        for plant in plants:
+            try:
+                found.append(timed(synthesize, plant, contract=env.certificate_contract, search_gain=search_gain))
+            except Infeasible as none:
+                print(f"{name:<26}{plant.between_samples or 1:>3} {none}", flush=True)
+                break
+        if len(found) < len(plants):
+            continue
+        inside = found[1][0]
+        works = [[_deciding(SafetyFilter(each, p), inside, 64) for p, (each, _) in zip(plants, found, strict=True)]]
+        works += [[_stepping(name, plant, number) for plant in plants] for number in (1, 64)]
+        times = np.array([least_times(pair, blocks=200, repeats=10) for pair in works])
+        for k, (plant, (certificate, seconds)) in enumerate(zip(plants, found, strict=True)):
+            recorded, rows = certificate.provenance, getattr(certificate.polytope, "rows", ())
+            shares = recorded["share_of_box"], recorded.get("polytope_share_of_box", np.nan)
+            overridden, reward = _behind(name, certificate, certificate.K, steps, plant=plant)
+            cells = [*(f"{share:.1%}" for share in shares), len(rows), f"{seconds:.1f}"]
+            cells += [f"{recorded['tolerated_scale']:.2f}", f"{overridden:.1%}", f"{reward:.4f}"]
+            cells += [f"{_left(name, plant, steps):.3f}", *(f"{ratio:.2f}" for ratio in times[:, k] / times[:, 0])]
+            show(name, plant.between_samples or 1, *cells)
+
+
+def _left(name: str, plant: LinearPlant, steps: int) -> float:
+    """Returns the largest |c x| between two samples inside the box, under random inputs of full size."""
+    settings: dict[str, Any] = {"plant": plant, "terminate_on_violation": True, "max_episode_steps": 200}
+    envs, most = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=100, **settings), 0.0
+    rng, u = np.random.default_rng(0), np.ones((100, plant.m))
+    _, info = envs.reset(seed=0)
+    for _ in range(steps // 100):
+        before, u = info["constraint_values"], np.where(rng.random(u.shape) < 0.2, -u, u)
+        *_, info = envs.step(u.astype(np.float32))
+        inside = np.maximum(before, info["constraint_values"]).max(axis=1) <= 0.0
+        most = max(most, 1.0 + float(info["worst_constraint_values"][inside].max(initial=-1.0)))
+    return most
+
+
+def _stepping(name: str, plant: LinearPlant, number: int) -> Callable[[], object]:
+    """Returns a step of an environment, or of many."""
+    settings = {"plant": plant, "terminate_on_violation": False}
+    path = f"ncs_gym/{name}-v0"
+    env = gym.make(path, **settings).unwrapped if number == 1 else gym.make_vec(path, num_envs=number, **settings)
+    action = 0.0 * env.action_space.sample()
+    env.reset(seed=0)
+    for _ in range(300):  # patterns of arrivals are worked out when they occur first
+        env.step(action)
+    return lambda: env.step(action)
+
+
+COMMANDS = (sections, polytope, packages, between_samples)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, COMMANDS)

@@ -1,77 +1,78 @@
-"""For how many steps the box is kept when the network goes silent, and what it costs to ask for them.
+"""For how many steps the box is kept when the network goes silent: `python -m benchmarks.silence COMMAND`.
 
-    python -m benchmarks.silence [--envs 64] [--steps 150] [--ids CartPole ...] [--back | --ways | --attack]
-
-Registered environments with a contract under adversarial disturbances. With random actions, "safe"
-is the largest number of steps of a ladder that mode "lookahead", asked for it, promises at 95 % of the steps over the
-environment's own network; "overridden" the share of steps overridden when it is asked for, and when none are.
-"left at" is how old the newest sample had become when a state left the box first, the smallest of all episodes: samples
-come as rarely as the contract allows for a while and then no more for sixty steps, and the agent pushes all the time,
-behind mode "project", and behind "lookahead" that is asked for the steps. "never" stands for no state.
-
-With --back what `shields.silence_of` says in advance: until which age of the newest sample the box is kept, from any
-belief that the contract allows, and with the fallback input from half of the set and from rest; and after how many
-steps the error's ellipsoid lies in its certified set again, so that the guarantee can return, after outages of 2, 10
-and 100 contracts; samples come again at every step, or as rarely as the contract allows. The last row is the worst of
-30 random plants of 2 to 5 states, half of them unstable.
-
-With --ways the same after 10 contracts for three ways: an update that is chosen for the way back, which estimators use;
-an estimate from the newest samples alone, as at an unknown start; and a ladder of multiples of the certified set, each
-carried into the next by one sample.
-
-With --attack: how many promises are broken where samples come as rarely as the contract allows for a while and then no
-more for a while, again and again, an agent pushes one way and then another, and disturbances are adversarial: states
-outside the box within the steps that were promised, and promises that fall by more than one per step. In mode
-"lookahead" the promise is what is asked for, in the others what `silence_of` says from any belief that the contract
-allows; each with the certificate's own set and with its ellipsoid alone.
+Commands: network, back, ways, attack. All are about registered environments with a contract, of which --ids are names.
 """
 
 from __future__ import annotations
 
-import argparse
-import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from ncs_gym import (
-    BrokenContractWarning,
-    ChannelContract,
-    ClippedObservationWarning,
-    LinearPlant,
-    NCSEnv,
-    TraceChannel,
-    certified_error_set,
-)
+from benchmarks.commands import run, table
+from benchmarks.random_plants import under_contracts
+from ncs_gym import ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel, certified_error_set
+from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.registration import registered_ids
 from shields import Certificate, VectorSafetyShield, certificate_for
 from shields.silence import OUTAGES, silence_of, way_back
-from tests.plants import random_plant
 
 IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
 # Steps that the attack asks for, behind a downlink, too.
 ATTACKED = {"CartPole": 35, "CartPoleTwoWay": 20, "CartPoleNonlinear": 20, "BatchReactor": 15, "CSTR": 5}
 ATTACKED |= {"Convoy": 10, "LaneKeeping": 10}
-ATTACKED_MODES = ("lookahead", "project", "switch", "boundary")
 # More samples, and longer ways by a ladder, are not looked for.
 MOST_SAMPLES, LONGEST_LADDER = 30, 10_000
-LADDER = (5, 10, 15, 20, 25, 30, 35, 40, 45)
-# Share of steps at which all steps asked for are promised.
-MOST_STEPS = 0.95
 # Steps of an episode before the network goes silent, and afterwards.
 HEARD, SILENT = 40, 60
+
+
+def with_contracts(ids: Sequence[str]) -> Iterator[tuple[str, NCSEnv, ChannelContract]]:
+    """Yields environments by name, with the contracts of their certificates; all that have one if no ids are given."""
+    for name in ids or [each.removeprefix("ncs_gym/").removesuffix("-v0") for each in registered_ids()]:
+        env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
+        if env.certificate_contract is not None:
+            yield name, env, env.certificate_contract
+
+
+def network(ids: Sequence[str] = IDS, envs: int = 64, steps: int = 150) -> None:
+    """For how many steps mode "lookahead" may be asked, what that costs, and when a silence leaves the box.
+
+    Disturbances are adversarial. With random actions, "safe" is the largest number of steps of a ladder that is
+    promised at 95 % of the steps over the environment's own network when it is asked for; "overridden" the share of
+    steps overridden when none are asked for, and when these are. "left at" is how old the newest sample had become when
+    a state left the box first, the smallest of all episodes: samples come as rarely as the contract allows for a while
+    and then no more for sixty steps, and the agent pushes all the time, behind mode "project", and behind "lookahead"
+    that is asked for the steps. "never" stands for no state.
+    """
+    print(f"{'':20} {'contract':>8} {'safe':>5} {'':>8} {'overridden [%]':>13} {'left at an age of':>18}")
+    print(f"{'':20} {'[steps]':>8} {'':>5} {'[s]':>8} {'none':>6} {'asked':>6} {'project':>8} {'lookahead':>10}")
+    for name, env, contract in with_contracts(ids):
+        env_id = f"ncs_gym/{name}-v0"
+        free, most = over_its_network(env_id, envs, steps, 0)[1], (0, float("nan"))
+        for least in range(5, 50, 5):
+            promised, overridden = over_its_network(env_id, envs, steps, least)
+            if promised < 0.95:
+                break
+            most = least, overridden
+        texts = ["never" if age is None else age for age in (left_at(env_id, envs, each) for each in (None, most[0]))]
+        seconds = f"{most[0] * env.plant.dt:.2g}" if env.plant.dt else "-"
+        print(
+            f"{name + '-v0':20} {contract.max_age:8} {most[0]:5} {seconds:>8} {100 * free:6.1f} {100 * most[1]:6.1f} "
+            f"{texts[0]:>8} {texts[1]:>10}",
+            flush=True,
+        )
 
 
 def shielded(name: str, count: int, least: int | None, **settings: Any) -> VectorSafetyShield:
     """Returns environments behind mode "lookahead" that is asked for so many steps; for None behind "project"."""
     env = gym.make_vec(name, count, disturbance="adversarial", terminate_on_violation=False, **settings)
-    given = {"mode": "project"} if least is None else {"mode": "lookahead", "least_safe_steps": least}
+    given: dict[str, Any] = {"mode": "project"} if least is None else {"mode": "lookahead", "least_safe_steps": least}
     return VectorSafetyShield(env, **given, on_unproved="ignore")
 
 
@@ -89,11 +90,9 @@ def over_its_network(name: str, count: int, steps: int, least: int) -> tuple[flo
 
 def rare_then_silent(name: str) -> TraceChannel:
     """Returns a channel over which samples come as rarely as the contract allows, and then no more."""
-    env = gym.make(name).unwrapped
-    assert isinstance(env, NCSEnv)
-    contract = env.certificate_contract
-    assert contract is not None
-    period = contract.max_age - env.channel.delay + 1
+    env = ncs_env(gym.make(name))
+    assert env.certificate_contract is not None
+    period = env.certificate_contract.max_age - env.channel.delay + 1
     heard = [env.channel.delay if k % period == 0 else -1 for k in range(HEARD)]
     return TraceChannel(trace=(*heard, *[-1] * SILENT), quantization_step=env.channel.quantization_step)
 
@@ -114,39 +113,58 @@ def left_at(name: str, count: int, least: int | None) -> int | None:
     return min(ages, default=None)
 
 
-def random_plants(count: int) -> Iterator[tuple[LinearPlant, ChannelContract]]:
-    """Yields random plants, every second one unstable, with contracts."""
-    for seed in range(count):
-        plant = random_plant(seed, *((2, 1, 1), (3, 2, 1), (4, 2, 2), (4, 1, 3), (5, 2, 2))[seed % 5])
-        if seed % 2:
-            plant = replace(plant, A=plant.A * (1.0 + 0.02 * (seed % 7)) / plant.spectral_radius)
-        yield plant, ChannelContract(1 + seed % 4)
+def back(ids: Sequence[str] = ()) -> None:
+    """What `shields.silence_of` says in advance, of all registered environments with a contract if no --ids are given.
 
-
-def in_advance(ids: Sequence[str] | None) -> None:
-    """Prints the table of --back, of all ids with a contract if none are given."""
-    names = [f"ncs_gym/{name}-v0" for name in ids] if ids else registered_ids()
+    Until which age of the newest sample the box is kept, from any belief that the contract allows, and with the
+    fallback input from half of the set and from rest; and after how many steps the error's ellipsoid lies in its
+    certified set again, so that the guarantee can return, after outages of 2, 10 and 100 contracts; samples come again
+    at every step, or as rarely as the contract allows. The last row is the worst of 30 random plants of 2 to 5 states,
+    half of them unstable.
+    """
     print(f"{'':20} {'kept until an age of':>29}" + "".join(f" {f'{many} contracts':>13}" for many in OUTAGES))
-    print(f"{'[steps]':20} {'contract':>8} {'any':>6} {'half':>6} {'rest':>6}" + 3 * f" {'each':>6} {'rarely':>6}")
-    for name in names:
-        env = gym.make(name).unwrapped
-        assert isinstance(env, NCSEnv)
-        if env.certificate_contract is None:
-            continue
-        found = silence_of(certificate_for(env.plant, env.certificate_contract), env.plant)
+    columns = ("contract", "any", "half", "rest", *("each", "rarely") * 3)
+    row = "{:20} {:>8} {:>6} {:>6} {:>6}" + 3 * " {:>6} {:>6}"
+    print(row.format("[steps]", *columns))
+    for name, env, contract in with_contracts(ids):
+        found = silence_of(certificate_for(env.plant, contract), env.plant)
         assert found is not None
         kept = [found.max_age + steps for steps in (0, found.anywhere, found.at_half, found.at_rest)]
-        back = [steps for way in found.ways_back for steps in way[1:]]
-        print(f"{name[8:-3]:20} {kept[0]:8}" + "".join(f" {each:6}" for each in [*kept[1:], *back]), flush=True)
+        print(row.format(name, *kept, *(steps for way in found.ways_back for steps in way[1:])), flush=True)
     steps = []
-    for plant, contract in random_plants(30):
+    for plant, contract in under_contracts(30):
         recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
         age = contract.max_age
         ways = [way_back(recursion, many * age, period) for many in OUTAGES for period in (1, age)]
         steps.append([np.inf if each is None else each for each in ways])
-    print(
-        f"{'30 random plants':20} {'1 to 4':>8}" + " " * 21 + "".join(f" {each:6.0f}" for each in np.max(steps, axis=0))
-    )
+    print(row.format("30 random plants", "1 to 4", "", "", "", *(f"{each:.0f}" for each in np.max(steps, axis=0))))
+
+
+def ways(ids: Sequence[str] = ()) -> None:
+    """Three ways back compared, after outages of 10 contracts.
+
+    An update that is chosen for the way back, which estimators use; an estimate from the newest samples alone, as at an
+    unknown start; and a ladder of multiples of the certified set, each carried into the next by one sample.
+    """
+    print(f"{'':20} {'update for it':>15} {'samples alone':>15} {'ladder':>15}")
+    show = table("[steps]", *("each", "rarely") * 3, first=20, width=8)
+
+    def steps_of(plant: LinearPlant, contract: ChannelContract) -> list[float]:
+        errors, age = certified_error_set(plant, contract), contract.max_age
+        recursion = ErrorRecursion(plant, contract.quantization_step, errors)
+        chosen = [way_back(recursion, 10 * age, gap) for gap in (1, age)]
+        alone = [by_newest_samples(plant, contract, errors, gap) for gap in (1, age)]
+        ladder = [by_ladder(recursion, 10 * age, gap) for gap in (1, age)]
+        return [np.inf if each is None else each for each in chosen] + alone + ladder
+
+    def texts(columns: Sequence[float]) -> list[str]:
+        return ["never" if np.isinf(each) else f"{each:.0f}" for each in columns]
+
+    for name, env, contract in with_contracts(ids):
+        show(name, *texts(steps_of(env.plant, contract)))
+    steps = np.array([steps_of(*each) for each in under_contracts(30)])
+    show("30 random, at most", *texts(np.where(np.isfinite(steps), steps, -np.inf).max(axis=0).tolist()))
+    show("  of these never", *np.isinf(steps).sum(axis=0))
 
 
 def by_newest_samples(plant: LinearPlant, contract: ChannelContract, errors: ErrorSet, gap: int) -> float:
@@ -181,31 +199,31 @@ def by_ladder(recursion: ErrorRecursion, outage: int, gap: int) -> float:
     return np.inf
 
 
-def ways(ids: Sequence[str] | None) -> None:
-    """Prints the table of --ways, of all ids with a contract if none are given."""
-    print(f"{'':20} {'update for it':>15} {'samples alone':>15} {'ladder':>15}")
-    print(f"{'[steps]':20}" + 3 * f" {'each':>7} {'rarely':>7}")
+def attack(ids: Sequence[str] = tuple(ATTACKED), envs: int = 64, steps: int = 150) -> None:
+    """How many promises are broken under attack.
 
-    def steps_of(plant: LinearPlant, contract: ChannelContract) -> list[float]:
-        errors, age = certified_error_set(plant, contract), contract.max_age
-        recursion = ErrorRecursion(plant, contract.quantization_step, errors)
-        chosen = [way_back(recursion, 10 * age, gap) for gap in (1, age)]
-        alone = [by_newest_samples(plant, contract, errors, gap) for gap in (1, age)]
-        ladder = [by_ladder(recursion, 10 * age, gap) for gap in (1, age)]
-        return [np.inf if each is None else each for each in chosen] + alone + ladder
-
-    def show(name: str, columns: Sequence[float]) -> None:
-        texts = ["never" if np.isinf(each) else f"{each:.0f}" for each in columns]
-        print(f"{name:20}" + "".join(f" {text:>7}" for text in texts), flush=True)
-
-    for name in ids or [each[8:-3] for each in registered_ids()]:
-        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-        assert isinstance(env, NCSEnv)
-        if env.certificate_contract is not None:
-            show(name, steps_of(env.plant, env.certificate_contract))
-    steps = np.array([steps_of(*each) for each in random_plants(30)])
-    show("30 random, at most", np.where(np.isfinite(steps), steps, -np.inf).max(axis=0).tolist())
-    show("  of these never", np.isinf(steps).sum(axis=0).tolist())
+    Samples come as rarely as the contract allows for a while and then no more for a while, again and again, an agent
+    pushes one way and then another, and disturbances are adversarial. Counted are states outside the box within the
+    steps that were promised, and promises that fall by more than one per step. In mode "lookahead" the promise is what
+    is asked for, in the others what `silence_of` says from any belief that the contract allows; each with the
+    certificate's own set and with its ellipsoid alone.
+    """
+    print(f"{'':20} {'':10} {'':>9} {'silent and promised':>21} {'broken promises':>17}")
+    print(f"{'':20} {'set':10} {'steps':>9} {'lookahead':>10} {'others':>10} {'lookahead':>10} {'others':>6}")
+    modes = ("lookahead", "project", "switch", "boundary")
+    for name, env, contract in with_contracts(ids):
+        own = certificate_for(env.plant, contract)
+        for certificate in [own] if own.polytope is None else [own, own.without_polytope()]:
+            given = f"ncs_gym/{name}-v0", certificate
+            found = [broken_promises(*given, mode, ATTACKED[name], envs, steps) for mode in modes]
+            (broken, kept), *others = found
+            others_broken, others_kept = np.sum(others, axis=0)
+            kind = "ellipsoid" if certificate.polytope is None else "polytope"
+            print(
+                f"{name:20} {kind:10} {len(found) * envs * steps:9,} {kept:10,} {others_kept:10,} {broken:10} "
+                f"{others_broken:6}",
+                flush=True,
+            )
 
 
 def broken_promises(
@@ -216,7 +234,9 @@ def broken_promises(
     env = gym.make_vec(name, count, channel=rare_then_silent(name), **settings)
     least = least if mode == "lookahead" else 0
     shield = VectorSafetyShield(env, certificate, mode=mode, on_unproved="ignore", least_safe_steps=least)
-    silence, rng = silence_of(certificate, shield.unwrapped.plant), np.random.default_rng(2)
+    inner = shield.unwrapped
+    assert isinstance(inner, NCSVectorEnv)
+    silence, rng = silence_of(certificate, inner.plant), np.random.default_rng(2)
     assert silence is not None
     held = np.zeros(count, np.bool_)
 
@@ -237,73 +257,10 @@ def broken_promises(
         broken += np.count_nonzero(((promised > 0) & (info["cost"] > 0.0) | (now < promised - 1)) & ~ended)
         kept += np.count_nonzero((promised > 0) & info["contract_broken"])
         promised, ended = now, terminated | truncated
-    return broken, kept
+    return int(broken), int(kept)
 
 
-def attack(ids: Sequence[str], count: int, steps: int) -> None:
-    """Prints the table of --attack."""
-    print(f"{'':20} {'':10} {'':>9} {'silent and promised':>21} {'broken promises':>17}")
-    print(f"{'':20} {'set':10} {'steps':>9} {'lookahead':>10} {'others':>10} {'lookahead':>10} {'others':>6}")
-    for name in ids:
-        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-        assert isinstance(env, NCSEnv)
-        own = certificate_for(env.plant, env.certificate_contract)
-        for certificate in [own] if own.polytope is None else [own, own.without_polytope()]:
-            given = env.spec.id, certificate
-            found = [broken_promises(*given, mode, ATTACKED[name], count, steps) for mode in ATTACKED_MODES]
-            (broken, kept), *others = found
-            others_broken, others_kept = np.sum(others, axis=0)
-            kind = "ellipsoid" if certificate.polytope is None else "polytope"
-            print(
-                f"{name:20} {kind:10} {len(found) * count * steps:9,} {kept:10,} {others_kept:10,} {broken:10} "
-                f"{others_broken:6}",
-                flush=True,
-            )
-
-
-def row(name: str, count: int, steps: int) -> str:
-    """Returns the row of an environment."""
-    env = gym.make(name).unwrapped
-    assert isinstance(env, NCSEnv)
-    assert env.certificate_contract is not None
-    free, most = over_its_network(name, count, steps, 0)[1], (0, float("nan"))
-    for least in LADDER:
-        promised, overridden = over_its_network(name, count, steps, least)
-        if promised < MOST_STEPS:
-            break
-        most = least, overridden
-    ages = [left_at(name, count, each) for each in (None, most[0])]
-    texts = ["never" if age is None else str(age) for age in ages]
-    seconds = f"{most[0] * env.plant.dt:.2g}" if env.plant.dt else "-"
-    return (
-        f"{name.removeprefix('ncs_gym/'):20} {env.certificate_contract.max_age:8} {most[0]:5} {seconds:>8} "
-        f"{100 * free:6.1f} {100 * most[1]:6.1f} {texts[0]:>8} {texts[1]:>10}"
-    )
-
-
-def main() -> None:
-    """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--envs", type=int, default=64)
-    parser.add_argument("--steps", type=int, default=150)
-    parser.add_argument("--ids", nargs="+")
-    parser.add_argument("--back", action="store_true")
-    parser.add_argument("--ways", action="store_true")
-    parser.add_argument("--attack", action="store_true")
-    options = parser.parse_args()
-    if options.back:
-        return in_advance(options.ids)
-    if options.ways:
-        return ways(options.ids)
-    for category in (BrokenContractWarning, ClippedObservationWarning):
-        warnings.simplefilter("ignore", category)
-    if options.attack:
-        return attack(options.ids or tuple(ATTACKED), options.envs, options.steps)
-    print(f"{'':20} {'contract':>8} {'safe':>5} {'':>8} {'overridden [%]':>13} {'left at an age of':>18}")
-    print(f"{'':20} {'[steps]':>8} {'':>5} {'[s]':>8} {'none':>6} {'asked':>6} {'project':>8} {'lookahead':>10}")
-    for name in options.ids or IDS:
-        print(row(f"ncs_gym/{name}-v0", options.envs, options.steps), flush=True)
-
+COMMANDS = (network, back, ways, attack)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, COMMANDS)

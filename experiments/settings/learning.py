@@ -208,7 +208,7 @@ class CompareSettings(LearningSettings):
             loss, later packets, within the contract), ideal-channel, attacked (the worst disturbance, noise of full
             size, bursts of losses as long as the contract allows), attacked-on-an-ideal-channel, gaussian (noise
             without a bound).
-        tuned_arms: Whether arms that were tuned by themselves (benchmarks/tune_arms.py) are trained with what was
+        tuned_arms: Whether arms that were tuned by themselves (`benchmarks.learning`) are trained with what was
             found: hyperparameters of PPO, the price of a violation, settings of PPO-Lagrangian.
         noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
             episodes that left the safe set the bound on their probability.
@@ -296,7 +296,7 @@ class EvaluateSettings:
 NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
 # What the shield is compared with and needs no training, margins in percent: a regulator alone, with a governor of its
 # references, or behind a filter, and model predictive control. The weights of each are tuned by themselves
-# (benchmarks/tune_arms.py).
+# (`benchmarks.learning`).
 _MARGINS = ("", *(f":{margin}" for margin in MARGINS))
 REGULATED_ARMS = (
     "lqr",

@@ -28,7 +28,7 @@ ITERATIONS = 1000
 # No set is thinner than this in any direction, in units of the weight: an input under way is known exactly.
 THINNEST = 1e-5
 # The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
-# of a few tried, the one that leaves the unstable plants of benchmarks/contracts.py the largest disturbances.
+# of a few tried, the one that leaves the unstable plants of `benchmarks.networks` the largest disturbances.
 EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
 # How much the answer counts of a gain that the plant names.
 NAMED_ANSWER = 1000.0

@@ -18,7 +18,7 @@ def folder_of(env_id):
     try:
         return pretrained_folder(env_id)
     except AgentError:
-        pytest.fail(f"{env_id} has no pretrained agent: python benchmarks/pretrained_agents.py --env {env_id}")
+        pytest.fail(f"{env_id} has no pretrained agent: python -m benchmarks.learning pretrained --env {env_id}")
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.numerical_trust import badly_scaled_plant, outcome
+from benchmarks.random_plants import badly_scaled_plant
+from benchmarks.synthesis import outcome
 from ncs_gym import Channel, ChannelContract, certified_error_set
 from ncs_gym.envs.env import NCSEnv
 from shields import Infeasible, SafetyShield, synthesize

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
@@ -19,7 +20,7 @@ import pytest
 
 import ncs_gym
 from agents import Agent
-from benchmarks.portability import KERNELS, can_run, random_plant
+from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, SafetyFilter, verify
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.certificates import ROOT, certificate_of
@@ -29,8 +30,31 @@ on_x86 = pytest.mark.skipif(
     platform.machine() not in ("x86_64", "AMD64"), reason="only x86 has kernels that can be chosen"
 )
 
+KERNELS = ("Haswell", "SkylakeX", "Sandybridge", "Nehalem", "Prescott")
 WIDE = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3"
 IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleNonlinear")
+
+
+@cache
+def can_run(kernels: str) -> bool:
+    """Whether a product of matrices with these kernels ends; without their instructions the processor stops it."""
+    product = "import numpy as np; np.ones((64, 64)) @ np.ones((64, 64)); np.linalg.inv(np.eye(64))"
+    environment = os.environ | {"OPENBLAS_CORETYPE": kernels}
+    return subprocess.run([sys.executable, "-c", product], env=environment, capture_output=True).returncode == 0
+
+
+def random_plant(index):
+    """Returns a plant, and a contract where it is unstable and for half of the others."""
+    rng = np.random.default_rng([7, index])
+    n, m = 2 + index % 5, 1 + index // 5 % 2
+    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
+    is_stable = index % 3 != 0
+    if is_stable:
+        A = A - 0.5 * float(np.abs(A).sum(axis=1).max()) * np.eye(n)
+    bounds = {"disturbance_bound": 0.004 * np.ones(n), "sensor_bound": 0.003 * np.ones(n), "initial_bound": 0.003}
+    model = (A, B, np.eye(n), np.zeros((n, m)))
+    plant = LinearPlant.from_statespace(model, 0.1, box=np.ones(n), u_max=np.full(m, 2.0), **bounds)
+    return plant, ChannelContract(1 + index % 3) if index % 2 or not is_stable else None
 
 
 def all_plants():

@@ -21,7 +21,7 @@ from experiments.baselines.requests import (
 from ncs_gym import Channel, ChannelContract, VectorRequestActions
 from shields import VectorSafetyShield
 from tests.certificates import certificate_of
-from tests.command import ROOT, environment
+from tests.command import environment
 
 ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 16, 60
 
@@ -129,7 +129,7 @@ def test_policies_behind_a_downlink_are_refused():
 
 @pytest.mark.slow
 def test_command_prints_a_table_and_draws_a_figure(tmp_path):
-    command = [sys.executable, ROOT / "benchmarks" / "request_policies.py", "--episodes", "3", "--steps", "0"]
+    command = [sys.executable, "-m", "benchmarks.networks", "requests", "--episodes", "3", "--steps", "0"]
     command += ["--out", "figure.png"]
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment())
     assert "At this price the winner is " in run.stdout

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.kalman_gain import KINDS, gains_taken
+from benchmarks.networks import KINDS, gains_taken
 from ncs_gym import (
     Channel,
     ChannelContract,

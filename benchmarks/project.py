@@ -1,16 +1,10 @@
-"""Sixty small faults in what guarantees rest on, and the test of `make test` that notices each.
+"""Checks of the project itself: `python -m benchmarks.project COMMAND`.
 
-    python benchmarks/mutants.py [--count 60] [--jobs 2] [--only NUMBER ...] [--stages 3] [--list]
-
-A mutant is the program with one operator, comparison, condition or number changed. Fifteen each are spread evenly over
-shields/runtime, shields/verification, ncs_gym/estimation and ncs_gym/network, always the same ones for the same source.
-Tests run in a copy of the repository, those of the same folder first, until one fails. What survives either needs a
-test or changes nothing (a constant that is larger than it must be, a search that is checked afterwards).
+Commands: complexity, mutants.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import copy
 import os
@@ -19,12 +13,92 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import gymnasium as gym
+
+import ncs_gym
+from benchmarks.commands import run
+from shields import SafetyShield, synthesize
 
 ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
+FEATURES = ("contract", "polytope", "grid", "remainder", "lookahead", "downlink", "ages", "between", "protocol")
+
+
+def complexity() -> None:
+    """How much code there is, and how much of it a step runs through.
+
+    Lines of the product and of the tests; branches that ask whether a feature is there at all (`x is None` of a
+    contract, a polytope, a grid, a remainder, a plan, a downlink, ages); and calls of functions of the product in one
+    step of an environment, as it comes and behind a shield whose action passes, and how often the module changes from
+    one to the next.
+    """
+    product, tests = sources(*PACKAGES), sources("tests")
+    nodes = [node for path in product for node in ast.walk(ast.parse(path.read_text()))]
+    print(f"{lines(product):,} lines of the product in {len(product)} modules, {lines(tests):,} of tests")
+    print(f"{sum(map(asks_for_feature, nodes))} branches ask whether a feature is there")
+    case = "ncs_gym/TruckTrailerCruise-v0"
+    for name, env in {"a step": gym.make(case), "a shielded step": SafetyShield(gym.make(case))}.items():
+        calls, changes = walked(step_of(env))
+        print(f"{name}: {calls} calls, {changes} changes of module")
+    plant = ncs_gym.truck_trailer(mass=4000.0)
+    calls, changes = walked(lambda: synthesize(plant))
+    print(f"synthesize: {calls:,} calls, {changes:,} changes of module")
+
+
+def sources(*folders: str) -> list[Path]:
+    """Returns the Python files below some folders."""
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def lines(files: list[Path]) -> int:
+    """Returns the number of lines of some files."""
+    return sum(len(path.read_text().splitlines()) for path in files)
+
+
+def asks_for_feature(node: ast.AST) -> bool:
+    """Returns whether it compares something that is named after a feature with None."""
+    if not (isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.Is | ast.IsNot)):
+        return False
+    right = node.comparators[0]
+    name = ast.unparse(node.left).rpartition(".")[2]
+    return isinstance(right, ast.Constant) and right.value is None and any(each in name for each in FEATURES)
+
+
+def walked(run: Callable[[], Any]) -> tuple[int, int]:
+    """Returns how many functions of the product a call runs through, and how often their module changes."""
+    modules: list[str] = []
+
+    def note(frame: FrameType, event: str, _: Any) -> None:
+        name = frame.f_globals.get("__name__", "")
+        if event == "call" and name.partition(".")[0] in PACKAGES:
+            modules.append(name)
+
+    sys.setprofile(note)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return len(modules), sum(one != other for one, other in pairwise(modules))
+
+
+def step_of(env: gym.Env[Any, Any]) -> Callable[[], Any]:
+    """Returns a step after some others, with an action that no shield overrides."""
+    env.reset(seed=0)
+    action = 0.0 * env.action_space.sample()
+    for _ in range(50):
+        env.step(action)
+    return lambda: env.step(action)
+
+
 FOLDERS = ("shields/runtime", "shields/verification", "ncs_gym/estimation", "ncs_gym/network")
 SWAPPED: dict[type, type] = {
     ast.Lt: ast.LtE,
@@ -62,6 +136,9 @@ class Mutant:
     line: int
     change: str
 
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}, {self.change}"
+
     @property
     def source(self) -> str:
         """The changed file."""
@@ -83,8 +160,8 @@ def changed(node: ast.AST) -> str:
     if isinstance(node, ast.If | ast.IfExp | ast.While):
         node.test = ast.UnaryOp(ast.Not(), node.test)
         return "the condition is negated"
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        before, node.value = node.value, node.value + 1 if type(node.value) is int else 1.5 * node.value + 0.5
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and type(node.value) is not bool:
+        before, node.value = node.value, node.value + 1 if isinstance(node.value, int) else 1.5 * node.value + 0.5
         return f"{before} becomes {node.value}"
     if isinstance(node, ast.Constant) and type(node.value) is bool:
         node.value = not node.value
@@ -128,7 +205,7 @@ def chosen(count: int) -> list[Mutant]:
     return mutants
 
 
-def fate(mutant: Mutant, stages: int) -> str:
+def fate(stages: int, mutant: Mutant) -> str:
     """Returns the test that notices a mutant; an empty text if none does."""
     with tempfile.TemporaryDirectory() as folder:
         copied = Path(folder) / "copy"
@@ -159,26 +236,30 @@ def _first_failure(copied: Path, tests: str) -> str:
     return "" if run.returncode == 0 else f"{tests} (ended with {run.returncode})"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--only", type=int, nargs="*", help="numbers of mutants")
-    parser.add_argument("--stages", type=int, default=3, help="1 for tests of the same folder, 2 of the package, 3 all")
-    parser.add_argument("--list", action="store_true", help="name the mutants, run nothing")
-    options = parser.parse_args()
-    mutants = dict(enumerate(chosen(options.count)))
-    mutants = {number: each for number, each in mutants.items() if options.only is None or number in options.only}
-    killed = 0
-    with ThreadPoolExecutor(options.jobs) as pool:
-        fates = pool.map(lambda each: "" if options.list else fate(each, options.stages), mutants.values())
-        for (number, mutant), test in zip(mutants.items(), fates, strict=True):
-            killed += bool(test)
-            print(f"{number:3d} {mutant.file}:{mutant.line}, {mutant.change}", end="" if options.list else ": ")
-            print("" if options.list else test or "SURVIVES", flush=True)
-    if not options.list:
-        print(f"{killed} of {len(mutants)} noticed")
+def mutants(count: int = 60, jobs: int = 2, only: Sequence[int] = (), stages: int = 3, list: bool = False) -> None:
+    """So many small faults in what guarantees rest on, and the test of `make test` that notices each.
 
+    A mutant is the program with one operator, comparison, condition or number changed. They are spread evenly over
+    shields/runtime, shields/verification, ncs_gym/estimation and ncs_gym/network, always the same ones for the same
+    source. Tests run in a copy of the repository, those of the same folder first, until one fails. What survives either
+    needs a test or changes nothing (a constant that is larger than it must be, a search that is checked afterwards).
+    --only are numbers of mutants; --stages is 1 for tests of the same folder, 2 of the package, 3 for all; --list names
+    the mutants and runs nothing.
+    """
+    found = {number: each for number, each in enumerate(chosen(count)) if not only or number in only}
+    if list:
+        for number, each in found.items():
+            print(f"{number:3d} {each}")
+        return
+    noticed = 0
+    with ThreadPoolExecutor(jobs) as pool:
+        for (number, mutant), test in zip(found.items(), pool.map(partial(fate, stages), found.values()), strict=True):
+            noticed += bool(test)
+            print(f"{number:3d} {mutant}: {test or 'SURVIVES'}", flush=True)
+    print(f"{noticed} of {len(found)} noticed")
+
+
+COMMANDS = (complexity, mutants)
 
 if __name__ == "__main__":
-    main()
+    run(__doc__, COMMANDS)

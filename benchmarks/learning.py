@@ -1,0 +1,614 @@
+"""How good agents are, and the searches for their settings: `python -m benchmarks.learning COMMAND`.
+
+Commands: tune, tuned, pretrained, tune-arms, safe-layer.
+
+Behind the same shield (mode project), agents are compared with what needs no training: the best linear controller of a
+grid, action = clip((gain x_hat + task_gain y) / u_max), where y is the task's entry of the observation. Seeds are those
+of `ncs compare` with `--seed 1000000` for searches, 2000000 for the table and 3000000 for the agents of the package, so
+that neither a study (`--seed 0`) nor a table has what was searched on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+from zlib import crc32
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
+
+from agents import (
+    Agent,
+    AppliedActionBuffer,
+    LoopConfig,
+    SB3VecEnv,
+    ShieldSettings,
+    evaluate,
+    train,
+    tuned_hyperparams,
+    tuned_steps,
+)
+from agents.evaluation import Policy
+from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
+from agents.loop import LagrangianSettings
+from benchmarks.commands import run, table
+from benchmarks.timing import timed
+from experiments.analysis.statistics import mean_interval
+from experiments.baselines import RegulatorWeights, controller
+from experiments.baselines.controllers import equilibrium
+from experiments.runs.arms import Arm
+from experiments.settings import CompareSettings
+from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS, TRAINED_ARMS
+from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.plants.lqr import lqr_gain
+from ncs_gym.registration import registered_ids
+from ncs_gym.tasks.base_task import Task
+from shields import Certificate, VectorSafetyShield, certificate_for
+from shields.torch import SafeLayer
+
+ROOT = Path(__file__).resolve().parent.parent
+SEARCH_SEED, TABLE_SEED, PACKAGE_SEED = 1_000_000, 2_000_000, 3_000_000
+EPISODES = 200
+# Steps of a training; where more were seen to help, four times as many.
+STEPS, MORE_STEPS = 150_000, 600_000
+LONGER = ("ncs_gym/CartPole-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/CartPoleNonlinear-v0")
+
+
+def shielded_loop(env_id: str) -> LoopConfig:
+    """The environment behind the shield of its certificate."""
+    env = ncs_env(gym.make(env_id))
+    return LoopConfig(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.certificate_contract)))
+
+
+def seeds_of(experiment_seed: int, index: int) -> tuple[int, int]:
+    """Seeds of training and of evaluation of one run, as `ncs compare` derives them."""
+    first, second = np.random.SeedSequence([experiment_seed, index]).generate_state(2)
+    return int(first >> 1), int(second >> 1)
+
+
+def mean_return(loop: LoopConfig, policy: Policy, seed: int, episodes: int = EPISODES) -> float:
+    """Mean return of a policy over the episodes of a seed."""
+    return float(np.mean([each.episode_return for each in evaluate(loop, policy, episodes, seed).episodes]))
+
+
+def trained(loop: LoopConfig, hyperparams: dict[str, Any] | None, steps: int, seed: int) -> Policy:
+    """An agent after its training."""
+    agent = train(loop, steps, seed, hyperparams=hyperparams).agent
+    return lambda observations, infos: agent.act(observations)
+
+
+class Results:
+    """Numbers by what they are of, kept in a file as they come: started again, a search continues where it stopped."""
+
+    def __init__(self, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lines = file.read_text("utf-8").splitlines() if file.exists() else []
+        self._file, self._known = file, {json.dumps(each["key"]): each["return"] for each in map(json.loads, lines)}
+
+    def of(self, key: list[Any], measure: Callable[[], float]) -> float:
+        """The number of a key, measured unless it was before."""
+        if (text := json.dumps(key)) not in self._known:
+            self._known[text] = measure()
+            with self._file.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"key": key, "return": self._known[text]}) + "\n")
+        return self._known[text]
+
+
+EFFORTS = tuple(10.0**power for power in (-4, -3, -2, -1, 0))
+# Weights of the safe box beside that of the task's own error.
+BOX_WEIGHTS = (1e-2, 1e-1, 1.0)
+# The target that a controller follows is the present one, or one of those that the task shows ahead.
+TARGETS_AHEAD = (0, 1, 2, 4, 8)
+PROPORTIONAL_GAINS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearController:
+    """A linear controller.
+
+    Attributes:
+        name: Kind and weights.
+        gain: Shape (m, n).
+        task_gain: Shape (m, entries), for the entries that the task adds to the observation.
+    """
+
+    name: str
+    gain: np.ndarray
+    task_gain: np.ndarray
+
+    def policy(self, plant: LinearPlant) -> Callable[..., np.ndarray]:
+        """The policy that `agents.evaluate` takes."""
+
+        def act(observations: np.ndarray, infos: dict[str, np.ndarray]) -> np.ndarray:
+            inputs = infos["estimate"] @ self.gain.T + observations[:, plant.n :] @ self.task_gain.T
+            return np.clip(inputs / plant.u_max, -1.0, 1.0)
+
+        return act
+
+
+def linear_controllers(plant: LinearPlant, task: Task) -> list[LinearController]:
+    """The candidates among which the best linear controller of a task is chosen."""
+    if isinstance(task, SpeedTracking):
+        return _proportional(plant, task) + _speed_regulators(plant, task)
+    if isinstance(task, SetpointTracking):
+        return _setpoint_regulators(plant, task)
+    assert isinstance(task, Regulation)
+    weights = plant.box_rows.T @ plant.box_rows
+    nothing = np.zeros((plant.m, 0))
+    return [LinearController(f"LQR, effort {each:g}", _regulator(plant, weights, each), nothing) for each in EFFORTS]
+
+
+def _regulator(plant: LinearPlant, Q: np.ndarray, effort: float) -> np.ndarray:
+    """K, shape (m, n), of u = K x that minimizes the sum of x'Qx + effort |u|^2, u in units of its limits."""
+    return _gain(plant.A, plant.B, Q, effort * np.diag(1.0 / plant.u_max**2))
+
+
+def _gain(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    gain = lqr_gain(A, B, Q, R)
+    assert gain is not None
+    return gain
+
+
+def _setpoint_regulators(plant: LinearPlant, task: SetpointTracking) -> list[LinearController]:
+    state, held = equilibrium(plant, task.output)
+    found, entries = [], len(task.observation_bound(plant, 1))
+    for effort in EFFORTS:
+        for weight in BOX_WEIGHTS:
+            Q = np.outer(task.output, task.output) / task.width**2 + weight * plant.box_rows.T @ plant.box_rows
+            gain = _regulator(plant, Q, effort)
+            for ahead in [each for each in TARGETS_AHEAD if each <= task.preview]:
+                feed = np.zeros((plant.m, entries))
+                feed[:, ahead] = held - gain @ state
+                name = f"LQR, effort {effort:g}, box {weight:g}, target {ahead} steps ahead"
+                found.append(LinearController(name, gain, feed))
+    return found
+
+
+def _proportional(plant: LinearPlant, task: SpeedTracking) -> list[LinearController]:
+    direction = np.eye(plant.m)[:, task.input_index : task.input_index + 1]
+    return [
+        LinearController(f"proportional, {gain:g} / s", np.zeros((plant.m, plant.n)), gain * direction)
+        for gain in PROPORTIONAL_GAINS
+    ]
+
+
+def _speed_regulators(plant: LinearPlant, task: SpeedTracking) -> list[LinearController]:
+    """LQRs of the plant and the speed error e, e+ = e - dt u."""
+    n, found = plant.n, []
+    A = np.eye(n + 1)
+    A[:n, :n] = plant.A
+    row = -plant.dt * np.eye(plant.m)[task.input_index]
+    B = np.vstack([plant.B, row])
+    for effort in EFFORTS:
+        for weight in (0.0, *BOX_WEIGHTS):
+            Q = np.zeros((n + 1, n + 1))
+            Q[:n, :n], Q[n, n] = weight * plant.box_rows.T @ plant.box_rows, 1.0 / 25.0
+            gain = _gain(A, B, Q, effort * np.diag(1.0 / plant.u_max**2))
+            found.append(LinearController(f"LQR, effort {effort:g}, box {weight:g}", gain[:, :n], gain[:, n:]))
+    return found
+
+
+def best_linear(loop: LoopConfig) -> LinearController:
+    """The linear controller with the highest return on the first evaluation seed of the searches."""
+    env, seed = ncs_env(gym.make(loop.env)), seeds_of(SEARCH_SEED, 0)[1]
+    candidates = linear_controllers(env.plant, env.task)
+    return max(candidates, key=lambda each: mean_return(loop, each.policy(env.plant), seed))
+
+
+TUNED_PPO = ROOT / "agents" / "tuned" / "ppo.json"
+# Random stream of each environment's candidates, so that they stay the same when further environments are registered;
+# those that are not here have a checksum of their id.
+STREAMS = {
+    "ncs_gym/TruckTrailer-v0": 0,
+    "ncs_gym/TruckTrailerCruise-v0": 1,
+    "ncs_gym/TruckTrailerCruiseTwoWay-v0": 2,
+    "ncs_gym/CartPole-v0": 3,
+    "ncs_gym/CartPoleTwoWay-v0": 4,
+    "ncs_gym/BatchReactor-v0": 5,
+    "ncs_gym/Pendulum-v0": 6,
+    "ncs_gym/CartPoleNonlinear-v0": 7,
+    "ncs_gym/InvertedPendulum-v0": 7,
+}
+GUESS = {"n_envs": 128, "n_steps": 32, "gamma": 0.98, "gae_lambda": 0.95}
+# In the order in which they are drawn; `_NETWORKS` are in `policy_kwargs`.
+SPACE: dict[str, tuple[Any, ...]] = {
+    "n_envs": (128,),
+    "n_steps": (16, 32),
+    "batch_size": (512, 1024, 2048),
+    "n_epochs": (5, 10, 20),
+    "learning_rate": ("lin_0.001", "lin_0.002", "lin_0.003", "lin_0.005"),
+    "gamma": (0.9, 0.95, 0.98, 0.99),
+    "gae_lambda": (0.9, 0.95, 0.98),
+    "log_std_init": (-1.5, -0.7, -0.3),
+    "net_arch": ([64, 64], [128, 128]),
+    "ent_coef": (0.0, 1e-3),
+    "normalize": (True, True, {"norm_reward": False}),
+}
+_NETWORKS = ("log_std_init", "net_arch")
+
+
+def candidate(env_id: str, number: int) -> dict[str, Any]:
+    """All hyperparameters of a number: the defaults, the guess, then random ones."""
+    if number < 2:
+        return complete_hyperparams("PPO", ({}, GUESS)[number])
+    rng = np.random.default_rng([SEARCH_SEED, STREAMS.get(env_id, crc32(env_id.encode())), number])
+    drawn = {name: values[rng.integers(len(values))] for name, values in SPACE.items()}
+    return complete_hyperparams("PPO", drawn | {"policy_kwargs": {name: drawn.pop(name) for name in _NETWORKS}})
+
+
+def tune(
+    env: Sequence[str] = (),
+    candidates: int = 6,
+    finalists: int = 2,
+    seeds: int = 1,
+    out: Path = Path("runs/tune"),
+    write: bool = False,
+) -> None:
+    """Searches PPO's hyperparameters for each registered environment, or for --env, behind its shield (mode project).
+
+    A random search in two rounds: every candidate is trained once with 150,000 steps, the best ones `--seeds` times
+    more, on other seeds, with the steps that belong to the environment; those with the highest mean return of these
+    last trainings are chosen. The first candidate is the defaults, the second a guess by hand, the others are drawn
+    from `SPACE`. Every result is a line of OUT/results.jsonl: started again, the search continues where it stopped.
+    `--write` also writes what was chosen to agents/tuned/ppo.json.
+    """
+    results = Results(out / "results.jsonl")
+    known = json.loads(TUNED_PPO.read_text())
+    for env_id in env or registered_ids():
+        loop, steps = shielded_loop(env_id), MORE_STEPS if env_id in LONGER else STEPS
+
+        def measured(hyperparams: dict[str, Any], steps: int, run: int, loop: LoopConfig = loop) -> float:
+            def measure() -> float:
+                training_seed, evaluation_seed = seeds_of(SEARCH_SEED, run)
+                return mean_return(loop, trained(loop, hyperparams, steps, training_seed), evaluation_seed)
+
+            return results.of([loop.env, hyperparams, steps, run], measure)
+
+        tried = [candidate(env_id, number) for number in range(candidates)]
+        first = [measured(each, STEPS, 0) for each in tried]
+        order = sorted(range(candidates), key=lambda number, first=first: -first[number])
+        shown = ", ".join(f"#{number} {first[number]:.2f}" for number in order)
+        print(f"{env_id}, {STEPS} steps: {shown}", flush=True)
+        last = {
+            number: [measured(tried[number], steps, run) for run in range(1, 1 + seeds)] for number in order[:finalists]
+        }
+        shown = ", ".join(f"#{number} {np.mean(each):.2f} {np.round(each, 2)}" for number, each in last.items())
+        print(f"  {steps} steps: {shown}", flush=True)
+        best = max(last, key=lambda number, last=last: float(np.mean(last[number])))
+        changed = {name: value for name, value in tried[best].items() if value != DEFAULTS["PPO"][name]}
+        print(f"  chosen: #{best}, {changed}", flush=True)
+        known[env_id] = {"n_timesteps": steps} | tried[best]
+    if write:
+        TUNED_PPO.write_text(json.dumps(known, indent=1) + "\n")
+
+
+def tuned(
+    env: Sequence[str] = (), seeds: int = 5, defaults: bool = False, out: Path = Path("runs/tuned_agents.jsonl")
+) -> None:
+    """Mean return per episode behind the same shield (mode project): tuned agents against what needs no training.
+
+    The tuned agent has the hyperparameters and steps of agents/tuned; with `--defaults` there is one with the defaults
+    and 150,000 steps, too. Every policy plays 200 episodes per seed, the same for all policies; intervals are Student's
+    over seeds. The last line of an environment pairs the tuned agent with the best of those that need no training, seed
+    by seed. What was measured is kept in OUT.
+    """
+    results, agent = Results(out), "tuned agent"
+    print(f"{seeds} seeds, {EPISODES} episodes each\n\n| environment | policy | mean return |\n|---|---|---|")
+    for env_id in env or registered_ids():
+        loop = shielded_loop(env_id)
+
+        def measured(name: str, make: Callable[[int], Policy], index: int, loop: LoopConfig = loop) -> float:
+            training_seed, evaluation_seed = seeds_of(TABLE_SEED, index)
+            return results.of([loop.env, name, index], lambda: mean_return(loop, make(training_seed), evaluation_seed))
+
+        returns = {
+            name: [measured(name, make, index) for index in range(seeds)]
+            for name, make in _policies(loop, defaults).items()
+        }
+        lines = [f"| `{env_id}` | {name} | {with_interval(values)} |" for name, values in returns.items()]
+        means = {name: float(np.mean(values)) for name, values in returns.items() if "agent" not in name}
+        best = max(means, key=lambda name, means=means: means[name])
+        gain = [one - other for one, other in zip(returns[agent], returns[best], strict=True)]
+        print("\n".join([*lines, f"| `{env_id}` | {agent} - {best} | {with_interval(gain, '+')} |"]), flush=True)
+
+
+def _policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int], Policy]]:
+    """What makes the policy of a seed, by name."""
+    env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
+    assert loop.shield is not None
+    certified, hyperparams = loop.shield.certificate.K, tuned_hyperparams(loop.env)
+    steps = tuned_steps(loop.env) or STEPS
+    found: dict[str, Callable[[int], Policy]] = {"tuned agent": lambda seed: trained(loop, hyperparams, steps, seed)}
+    if with_defaults:
+        found["agent, default settings"] = lambda seed: trained(loop, {}, STEPS, seed)
+    for name in ("random", "K x_hat"):
+        found[name] = lambda seed, name=name: controller(name, env, certified, seed)
+    return found | {linear.name: lambda seed: linear.policy(env.plant)}
+
+
+def with_interval(values: Sequence[float], sign: str = "") -> str:
+    """The mean of some values with Student's interval."""
+    low, high = mean_interval(values) or (float("nan"),) * 2
+    return f"{np.mean(values):{sign}.2f} [{low:{sign}.2f}, {high:{sign}.2f}]"
+
+
+def pretrained(
+    env: Sequence[str] = (),
+    out: Path = ROOT / "agents" / "trained",
+    evaluate_only: bool = False,
+    table: bool = False,
+) -> None:
+    """Trains the small agents that come with the package, one per registered id, behind the shield (mode project).
+
+    PPO with the hyperparameters and steps of agents/tuned, or the defaults and 150,000 steps, and networks of two
+    layers of 32. Each agent is evaluated on 200 episodes and saved with its card; a line says how long that took. Its
+    certificate is the one in shields/certificates. --evaluate-only evaluates the agents that are there and writes their
+    cards again. --table prints them beside the best linear controller behind the same shield, on the same episodes,
+    without those whose packages are missing.
+    """
+    if table:
+        print("| environment | agent (overridden) | best linear controller | difference, paired |\n|---|---|---|---|")
+    for env_id in env or [each for each in registered_ids() if each.startswith("ncs_gym/")]:
+        folder = out / env_id.rpartition("/")[2]
+        if table:
+            with suppress(ModuleNotFoundError):
+                print(_row(env_id, folder), flush=True)
+        else:
+            line, seconds = timed(_train_and_save, env_id, folder, evaluate_only)
+            print(f"{line}, {seconds:.0f} s of CPU", flush=True)
+
+
+def _train_and_save(env_id: str, folder: Path, evaluate_only: bool) -> str:
+    """Trains (unless it is there), evaluates and saves the agent of an environment; returns a line about it."""
+    loop, (training_seed, evaluation_seed), violations = shielded_loop(env_id), seeds_of(PACKAGE_SEED, 0), 0
+    if evaluate_only:
+        agent = Agent.load(folder)
+    else:
+        small = {"policy_kwargs": {"net_arch": [32, 32]}}
+        hyperparams = with_changes(tuned_hyperparams(env_id) or DEFAULTS["PPO"], small)
+        training = train(loop, tuned_steps(env_id) or STEPS, training_seed, hyperparams=hyperparams)
+        agent, violations = training.agent, training.violation_steps
+    evaluation = evaluate(loop, lambda observations, infos: agent.act(observations), EPISODES, evaluation_seed)
+    agent.save(folder, loop.shield, evaluation)
+    refer_to_package(folder)
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    mean = np.mean([each.episode_return for each in evaluation.episodes])
+    violations += sum(each.violation_steps for each in evaluation.episodes)
+    return f"{env_id}: return {mean:.2f}, {violations} violating steps, {size / 1e3:.0f} kB"
+
+
+def _row(env_id: str, folder: Path) -> str:
+    """The line of a Markdown table about an agent and the best linear controller."""
+    loop, (_, seed) = shielded_loop(env_id), seeds_of(PACKAGE_SEED, 0)
+    agent, plant = Agent.load(folder), ncs_env(gym.make(env_id)).plant
+    both = [
+        evaluate(loop, policy, EPISODES, seed).episodes
+        for policy in (lambda observations, infos: agent.act(observations), best_linear(loop).policy(plant))
+    ]
+    returns = np.array([[each.episode_return for each in episodes] for episodes in both])
+    overridden = [sum(e.interventions for e in episodes) / sum(e.steps for e in episodes) for episodes in both]
+    cells = [
+        f"{mean:.2f} ({100.0 * share:.1f} %)" for mean, share in zip(returns.mean(axis=1), overridden, strict=True)
+    ]
+    return f"| `{env_id}` | {' | '.join(cells)} | {with_interval((returns[0] - returns[1]).tolist(), '+')} |"
+
+
+def refer_to_package(folder: Path) -> None:
+    """Leaves out the copy of the certificate, and has the card say where the package has it."""
+    (folder / "certificate.json").unlink()
+    card = folder / "README.md"
+    text = card.read_text()
+    changes = {
+        "`certificate.json`, SHA-256": "The certificate that `shields.certificate_for` returns, SHA-256",
+        "; `ncs verify certificate.json`": "",
+        "import Certificate\n\nagent = ": 'import certificate_for\n\nenv = gym.make("{env}").unwrapped\nagent = ',
+        'Certificate.load("certificate.json")': "certificate_for(env.plant, env.certificate_contract)",
+        "```python\nfrom agents": "```python\nimport gymnasium as gym\n\nfrom agents",
+    }
+    for old, new in changes.items():
+        if old not in text:
+            raise ValueError(f"the card of {folder} has no {old!r}")
+        text = text.replace(old, new.format(env=f"ncs_gym:ncs_gym/{folder.name}") if "{env}" in new else new)
+    card.write_text(text)
+
+
+TUNED_ARMS = ROOT / "experiments" / "baselines" / "tuned.json"
+GRID = [RegulatorWeights(effort, state) for effort, state in product((0.003, 0.03, 0.3, 3.0), (0.003, 0.03, 0.3))]
+CANDIDATES: tuple[dict[str, Any], ...] = (
+    {},
+    {"gamma": 0.98, "gae_lambda": 0.95},
+    {"n_envs": 16, "n_steps": 128, "batch_size": 512},
+)
+# Two more for each arm; the price of the first three is 10, and PPO-Lagrangian has its defaults there.
+PRICES = {"violation_penalty": 10.0}
+MORE: dict[str, tuple[dict[str, Any], ...]] = {
+    "penalized": ({"violation_penalty": 3.0}, {"violation_penalty": 30.0}),
+    "lagrangian": ({"lagrangian": {"learning_rate": 0.5}}, {"lagrangian": {"multiplier": 10.0}}),
+}
+OTHERS = ({"hyperparams": {"learning_rate": "lin_0.001"}}, {"hyperparams": {"policy_kwargs": {"log_std_init": -1.5}}})
+# Steps of a training, those of the published study.
+TRAINING_STEPS = 60_000
+
+
+def tune_arms(
+    env: Sequence[str] = NETWORK_ENVS,
+    arms: Annotated[Sequence[str], (*TRAINED_ARMS, *REGULATED_ARMS)] = (*TRAINED_ARMS, *REGULATED_ARMS),
+    episodes: int = 24,
+    out: Path = Path("runs/tuned_arms.jsonl"),
+    write: bool = False,
+) -> None:
+    """Tunes every arm of `ncs study` by itself, each behind its own filter, with the same budget.
+
+    Of a regulator a grid of weights is tried, of an agent `CANDIDATES` of PPO's hyperparameters and then, with the best
+    of the first three, two more: prices of a violation, settings of PPO-Lagrangian, or hyperparameters where an arm has
+    neither. Everything happens on the environment's own channel, on the same seeds and --episodes for all (agents are
+    evaluated on four times as many); the highest mean return is chosen (a violation ends an episode, and with it what
+    it would still have earned). Every result is a line of OUT: started again, the search continues where it stopped.
+    `--write` writes what was chosen to experiments/baselines/tuned.json.
+    """
+    results = Results(out)
+    chosen: dict[str, dict[str, dict[str, Any]]] = json.loads(TUNED_ARMS.read_text("utf-8"))
+    for env_id in env:
+        loop = LoopConfig(env=env_id)
+        single = ncs_env(loop.single())
+        certificate = certificate_for(single.plant, single.certificate_contract)
+
+        def best(arm: str, tries: list[dict[str, Any]], loop: LoopConfig = loop, own: Certificate = certificate) -> Any:
+            """Returns what gave the highest mean return, and prints it."""
+            is_trained = arm in TRAINED_ARMS
+            number, measure = (4 * episodes, _trained_arm) if is_trained else (episodes, _regulated_arm)
+            returns = [
+                results.of([loop.env, arm, number, each], lambda each=each: measure(loop, arm, own, each, number))
+                for each in tries
+            ]
+            found = tries[int(np.argmax(returns))]
+            shown = ", ".join(f"{each:.1f}" for each in returns)
+            print(f"{loop.env} {arm}: {max(returns):.1f} with {found}, of {shown}", flush=True)
+            return found
+
+        for arm in arms:
+            if arm in REGULATED_ARMS:
+                found = best(arm, [asdict(each) for each in GRID])
+            else:
+                price = PRICES if arm == "penalized" else {}
+                found = best(arm, [{"hyperparams": each, **price} for each in CANDIDATES])
+                more = [
+                    {**found, **each, "hyperparams": with_changes(found["hyperparams"], each.get("hyperparams", {}))}
+                    for each in MORE.get(arm, OTHERS)
+                ]
+                found = best(arm, [found, *more])
+            chosen.setdefault(env_id, {})[arm] = found
+    if write:
+        TUNED_ARMS.write_text(json.dumps(chosen, indent=1) + "\n", "utf-8")
+
+
+def _regulated_arm(
+    loop: LoopConfig, arm: str, certificate: Certificate, weights: dict[str, Any], episodes: int
+) -> float:
+    """Returns the mean return of a regulator with the given weights."""
+    env = ncs_env(loop.single())
+    policy = controller(arm.partition("+")[0], env, certificate.K, 0, RegulatorWeights(**weights))
+    return mean_return(Arm.of(arm).loops(loop, certificate, CompareSettings())[1], policy, SEARCH_SEED, episodes)
+
+
+def _trained_arm(loop: LoopConfig, arm: str, certificate: Certificate, tried: dict[str, Any], episodes: int) -> float:
+    """Returns the mean return of an agent that was trained with the given settings."""
+    own = {name: value for name, value in tried.items() if name != "hyperparams"}
+    if "lagrangian" in own:
+        own["lagrangian"] = LagrangianSettings(**own["lagrangian"])
+    training, evaluated = Arm.of(arm).loops(loop, certificate, replace(CompareSettings(), **own))
+    hyperparams = with_changes(DEFAULTS["PPO"], tried.get("hyperparams", {}))
+    return mean_return(evaluated, trained(training, hyperparams, TRAINING_STEPS, SEARCH_SEED), SEARCH_SEED, episodes)
+
+
+class SafePPOPolicy(ActorCriticPolicy):
+    """A Gaussian whose mean is projected at the estimate, the first entries of the observation."""
+
+    def __init__(self, *arguments: Any, layer: SafeLayer, **keywords: Any) -> None:
+        self.layer_of = [layer]  # in a list it is no module of this one, before the base class is ready
+        super().__init__(*arguments, **keywords)
+
+    def extract_features(self, obs: Any, features_extractor: Any = None) -> Any:
+        """Returns features, and remembers the observations."""
+        self.seen = obs
+        return super().extract_features(obs, features_extractor)
+
+    def get_distribution(self, obs: Any) -> Any:
+        """Returns the distribution of actions."""
+        self.seen = obs
+        return super().get_distribution(obs)
+
+    def _get_action_dist_from_latent(self, latent_pi: Any) -> Any:
+        (layer,) = self.layer_of
+        mean = layer(self.action_net(latent_pi), self.seen[:, : layer.filter.plant.n])
+        return self.action_dist.proba_distribution(mean, self.log_std)
+
+
+class SafeActor(Actor):
+    """SAC's actor with a projection behind it."""
+
+    layer: SafeLayer
+
+    def action_log_prob(self, obs: Any) -> Any:
+        """Returns projected actions, and the logarithm of the density of the proposed ones."""
+        actions, log_prob = super().action_log_prob(obs)
+        return self.layer(actions, obs[:, : self.layer.filter.plant.n]), log_prob
+
+
+class SafeSACPolicy(SACPolicy):
+    """SAC's policy with that actor."""
+
+    def __init__(self, *arguments: Any, layer: SafeLayer, **keywords: Any) -> None:
+        self.layer_of = [layer]
+        super().__init__(*arguments, **keywords)
+
+    def make_actor(self, features_extractor: Any = None) -> Actor:
+        """Returns the actor."""
+        actor = SafeActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
+        actor.layer = self.layer_of[0]
+        return actor
+
+
+def safe_layer(steps: Sequence[int] = (100_000, 20_000), seeds: int = 3) -> None:
+    """Does it pay to train through the shield? PPO and SAC, with and without `shields.torch.SafeLayer` in the policy.
+
+    Both act behind the same shield, in training and in evaluation. With the layer, PPO's Gaussian is centered at the
+    projected mean; SAC's actor and target see projected actions, and its replay buffer holds what was applied. Prints a
+    line per environment, algorithm and arm: means over seeds of return and overridden steps in 64 evaluation episodes.
+    --steps are those of PPO and of SAC.
+    """
+    show = table("environment", "algorithm", "layer", "return", "overridden", "violating steps", first=32, width=18)
+    for env_id in ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"):
+        single = ncs_env(gym.make(env_id))
+        certificate = certificate_for(single.plant, single.certificate_contract)
+        layer = SafeLayer(certificate, single.plant)
+        for algorithm, count in zip(("PPO", "SAC"), steps, strict=True):
+            for name, each in {"without": None, "with": layer}.items():
+                models = (_layered(env_id, certificate, algorithm, each, seed, count) for seed in range(seeds))
+                rows = np.array([_played(env_id, certificate, model) for model in models])
+                score = f"{rows[:, 0].mean():.2f} +- {rows[:, 0].std():.2f}"
+                show(env_id, algorithm, name, score, f"{rows[:, 1].mean():.1%}", f"{rows[:, 2].sum():.0f}")
+
+
+def _layered(
+    env_id: str, certificate: Certificate, algorithm: str, layer: SafeLayer | None, seed: int, steps: int
+) -> Any:
+    """Returns a model trained behind the shield, with the layer or without one."""
+    envs = SB3VecEnv(VectorSafetyShield(gym.make_vec(env_id, num_envs=32), certificate))
+    own = {} if layer is None else {"layer": layer}
+    if algorithm == "PPO":
+        settings = {"n_steps": 32, "batch_size": 256, "n_epochs": 5, "gamma": 0.9, "gae_lambda": 0.98}
+        kwargs = {"policy_kwargs": own | {"log_std_init": -1.0}, "seed": seed, "device": "cpu", "learning_rate": 1e-3}
+        return PPO("MlpPolicy" if layer is None else SafePPOPolicy, envs, **settings, **kwargs).learn(steps)
+    kwargs = {"gamma": 0.9, "learning_rate": 1e-3, "learning_starts": 1000, "gradient_steps": 8, "device": "cpu"}
+    if layer is not None:
+        kwargs |= {"replay_buffer_class": AppliedActionBuffer}
+    policy = own | {"net_arch": [64, 64]}
+    model = SAC("MlpPolicy" if layer is None else SafeSACPolicy, envs, seed=seed, policy_kwargs=policy, **kwargs)
+    return model.learn(steps)
+
+
+def _played(env_id: str, certificate: Certificate, model: Any) -> tuple[float, float, float]:
+    """Returns mean return, share of overridden steps and violating steps of 64 episodes."""
+    shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=64), certificate)
+    observations, infos = shield.reset(seed=1)
+    total = np.zeros(64)
+    for _ in range(200):
+        observations, rewards, _, _, infos = shield.step(model.predict(observations, deterministic=True)[0])
+        total += rewards
+    return total.mean(), infos["episode_interventions"].mean() / 200, infos["episode_violations"].sum()
+
+
+COMMANDS = (tune, tuned, pretrained, tune_arms, safe_layer)
+
+if __name__ == "__main__":
+    run(__doc__, COMMANDS)

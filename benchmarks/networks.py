@@ -1,0 +1,633 @@
+"""What contracts, networks both ways and requests cost: `python -m benchmarks.networks COMMAND`.
+
+Commands: contracts, downlink, recorded, requests, gains.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import gymnasium as gym
+import matplotlib
+import numpy as np
+from gymnasium.vector import VectorEnv
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents import SB3VecEnv
+from agents.evaluation import Policy
+from benchmarks.commands import run, table
+from benchmarks.timing import timed
+from experiments.baselines import EstimateFilterSettings, tuned_weights
+from experiments.baselines.controllers import REGULATORS, controller
+from experiments.baselines.requests import (
+    Asking,
+    RequestsOnly,
+    acknowledged,
+    at_random,
+    best_period,
+    every,
+    played,
+    slack,
+    with_rule,
+)
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
+from experiments.terminal import text_table
+from ncs_gym import (
+    Actuator,
+    Channel,
+    ChannelContract,
+    Estimator,
+    LinearPlant,
+    NCSEnv,
+    NCSVectorEnv,
+    PacketLog,
+    VectorRequestActions,
+    batch_reactor,
+    cart_pole,
+)
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
+from ncs_gym.network import CommittedInputs
+from ncs_gym.registration import registered_ids
+from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
+from shields import Certificate, Infeasible, SafetyShield, VectorSafetyShield, certificate_for, synthesize
+from shields.synthesis.design_problem import design_problem
+from shields.synthesis.initial_designs import initial_design
+from shields.synthesis.invariant_set_program import InvariantSetProgram
+
+PLANTS = {
+    "cart-pole, full state": cart_pole(),
+    "cart-pole, position and angle": cart_pole(full_state=False),
+    "batch reactor, two outputs": batch_reactor(),
+}
+# Colors of the plants in the figure, apart for color-blind readers (Okabe and Ito).
+COLORS = ("#0072b2", "#e69f00", "#009e73")
+# How precisely a radius is found, and the relative tightening of the semidefinite program: the smallest one that the
+# synthesis tries.
+PRECISION, SLACK = 1.01, 1e-6
+
+
+def contracts(ages: Sequence[int] = (1, 4, 8, 16), out: Path | None = None) -> None:
+    """The largest disturbance with an initial design, against the age a contract allows, per unstable plant.
+
+    Disturbance radii are in percent of the half-widths of the safe box; sensor noise and initial error are a hundredth
+    of that. They are found by bisection to 1 %: once there is an initial design, the rest of the synthesis enlarges its
+    set. Seconds are those of a whole synthesis, with exact verification, at two thirds of that radius. With --out a
+    figure of it, too.
+    """
+    show = table("plant", "max_age", "radius / box", "vol/ellipsoid", "synthesis [s]", first=32)
+    radii_of: dict[str, list[float]] = {}
+    for name, plant in PLANTS.items():
+        radii = radii_of[name] = []
+        for age in ages:
+            contract = ChannelContract(age)
+            radius = _largest_radius(plant, contract)
+            within = _with_radius(plant, radius / 1.5)
+            certificate, seconds = timed(synthesize, within, contract=contract, safe_set="ellipsoid")
+            volume = certificate.provenance["volume_of_box_ellipsoid"]
+            show(name, age, f"{radius:.3%}", f"{volume:.2f}", f"{seconds:.1f}")
+            radii.append(100.0 * radius)
+    if out is not None:
+        out.write_bytes(_radii_drawn(ages, radii_of).png)
+
+
+def _with_radius(plant: LinearPlant, radius: float) -> LinearPlant:
+    """The plant with a disturbance of that fraction of the box, and a hundredth of it elsewhere."""
+    half_widths, n = plant.half_widths, plant.n
+    outputs = np.abs(plant.H) @ half_widths
+    return replace(
+        plant,
+        process_noise_cov=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
+        measurement_noise_cov=np.diag((0.01 * radius * outputs) ** 2) / truncation_energy(0.05, plant.p),
+        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / truncation_energy(0.05, n) * np.eye(n),
+    )
+
+
+def _has_initial_design(plant: LinearPlant, contract: ChannelContract) -> bool:
+    try:
+        problem, _ = design_problem(plant, contract)
+    except Infeasible:
+        return False
+    return initial_design(problem, InvariantSetProgram(problem, SLACK), lambda stage, share: None) is not None
+
+
+def _largest_radius(plant: LinearPlant, contract: ChannelContract) -> float:
+    low, high = 1e-5, 0.1
+    while high / low > PRECISION:
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if _has_initial_design(_with_radius(plant, middle), contract) else (low, middle)
+    return low
+
+
+def _radii_drawn(ages: Sequence[int], radii_of: dict[str, list[float]]) -> CaptionedFigure:
+    """The largest radius against the contract's age, for every plant."""
+    with matplotlib.rc_context(STYLE):
+        figure = CaptionedFigure((8.0, 3.8))
+        axes, handles = figure.subplots(), {}
+        for (name, radii), color, marker in zip(radii_of.items(), COLORS, "os^", strict=False):
+            (handles[name],) = axes.semilogy(ages, radii, marker=marker, color=color, lw=1.5)
+        label(
+            axes,
+            "largest age of the newest sample that the contract allows [steps]",
+            "largest disturbance [% of the box]",
+        )
+        axes.set_xticks(ages)
+        axes.set_yticks([0.1, 0.3, 1.0, 3.0])
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.minorticks_off()
+        legend_below(figure, handles)
+        return figure
+
+
+# The picture: commands of steps 0 .. 7, one step late, of which one is lost; c = 2.
+STEPS, LEAD, DELAY, LOST = 8, 2, 1, 3
+
+
+def downlink(
+    leads: Sequence[int] = (0, 1, 2, 4, 8),
+    episodes: int = 200,
+    envs: Sequence[str] = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"),
+    picture: Path | None = None,
+) -> None:
+    """What an imperfect downlink costs: safe set, overrides and return against the number c of steps it commits inputs.
+
+    A downlink of c steps delays every command by c. The controller is the linear-quadratic regulator of `ncs compare
+    --arms lqr+shielded`, for c = 0 as for every other c. The set is the certified one in the safe box; return and
+    overrides are those of episodes with the same seed. --picture draws what one lost command does, which is simulated,
+    in place of the table.
+    """
+    if picture is not None:
+        picture.write_bytes(_lost_command().png)
+        return
+    show = table("environment", "c", "max_age", "S in box", "overridden", "return", "violations", first=24)
+    for env_id in envs:
+        for lead in leads:
+            show(env_id.removeprefix("ncs_gym/"), lead, *_delayed(env_id, lead, episodes))
+
+
+def _delayed(env_id: str, lead: int, episodes: int) -> tuple[str, ...]:
+    """Returns the row of an environment whose commands are so many steps late."""
+    settings: dict[str, Any] = {"downlink": Channel(delay=lead)} if lead else {}
+    env = ncs_env(gym.make(env_id, **settings))
+    certificate = certificate_for(env.plant, env.certificate_contract)
+    shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=episodes, **settings), certificate, on_unproved="ignore")
+    policy = controller("lqr", env, certificate.K, 0)
+    observation, info = shield.reset(seed=0)
+    returns, overridden, steps, violations = np.zeros(episodes), 0.0, 0, 0.0
+    running = np.ones(episodes, np.bool_)
+    while running.any():
+        observation, rewards, terminated, truncated, info = shield.step(policy(observation, info))
+        returns += np.where(running, rewards, 0.0)
+        overridden += np.count_nonzero(info["shield_intervened"] & running)
+        violations += float(info["cost"][running].sum())
+        steps += np.count_nonzero(running)
+        running &= ~(terminated | truncated)
+    age = "-" if env.certificate_contract is None else str(env.certificate_contract.max_age)
+    share = certificate.provenance["share_of_box"]
+    return age, f"{share:.1%}", f"{overridden / steps:.1%}", f"{returns.mean():.1f}", f"{violations:.0f}"
+
+
+def _lost_command() -> CaptionedFigure:
+    """Draws commands on their way, and from which of them each input that is applied comes."""
+    queue, actuator = CommittedInputs(LEAD, 1), Actuator(LEAD, 1)
+    flights, sources = [], []
+    for step in range(STEPS):
+        queue.commit(np.array([float(step + LEAD)]))
+        flights.append(queue.command(step, 0))
+        queue.pop()
+        arrived = [each for each in flights if each.stamp + DELAY == step and each.stamp != LOST]
+        actuator.receive(arrived)
+        newest = max(
+            (each.stamp for each in flights if each.stamp + DELAY <= step and each.stamp != LOST), default=None
+        )
+        sources.append((step, newest, actuator.apply(step).item(), actuator.missing))
+    with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
+        figure = CaptionedFigure((9.0, 3.9))
+        axes = figure.subplots()
+        axes.axhline(1.0, color="#555555", lw=1)
+        axes.axhline(0.0, color="#555555", lw=1)
+        for command in flights:
+            k, lost = command.stamp, command.stamp == LOST
+            label = "  ".join(f"$u_{int(u)}$" if k + j >= LEAD else "0" for j, u in enumerate(command.inputs[:, 0]))
+            color = "#b3261e" if lost else "#1f5f99"
+            axes.text(k, 1.1, label, ha="center", va="bottom", color=color, fontsize=9)
+            end = (k + 0.5 * DELAY, 0.5) if lost else (k + DELAY, 0.03)
+            if k + DELAY < STEPS or lost:
+                axes.annotate("", end, (k, 0.97), arrowprops={"arrowstyle": "-|>", "color": color, "lw": 1.4})
+            if lost:
+                axes.plot(*end, "x", color=color, ms=11, mew=2.5)
+                axes.text(end[0] + 0.12, end[1] + 0.03, "lost", color=color, va="bottom")
+        for step, newest, u, missing in sources:
+            assert not missing
+            text = f"$u_{int(u)}$" if step >= LEAD else "0"
+            axes.text(step, -0.1, text, ha="center", va="top", fontsize=12, weight="bold")
+            source = "agreed" if step < LEAD else f"of command {newest}"
+            second = step == LOST + DELAY
+            axes.text(step, -0.32, source, ha="center", va="top", fontsize=8, color="#b3261e" if second else "#555555")
+        axes.text(-0.75, 1.0, "controller\nsends", ha="right", va="center")
+        axes.text(-0.75, 0.0, "actuator\napplies", ha="right", va="center")
+        axes.set(xlim=(-0.7, STEPS - 0.4), ylim=(-0.5, 1.35), xticks=range(STEPS), yticks=[], xlabel="step")
+        for spine in ("left", "bottom"):
+            axes.spines[spine].set_visible(False)
+        return figure
+
+
+# Environments, with the steps that are asked for (`python -m benchmarks.silence network`).
+ASKED = {"CartPole": 35, "BatchReactor": 15, "Convoy": 10, "LaneKeeping": 10}
+SPAN, PERIOD, EPISODE = 3600.0, 0.02, 60.0
+
+
+def wifi(rng: np.random.Generator, sent: np.ndarray) -> np.ndarray:
+    """Returns delays of packets sent at these times [s], NaN for lost ones, over a Wi-Fi."""
+    delays = rng.gamma(4.0, 0.002, len(sent))
+    lost = rng.random(len(sent)) < 0.02
+    for cluster in rng.uniform(0.0, SPAN, 12):
+        for begin in cluster + np.cumsum(rng.exponential(8.0, rng.integers(1, 12))):
+            end = begin + 0.06 * (1.0 + rng.pareto(1.2))
+            stalled = (sent >= begin) & (sent < end)
+            lost |= stalled & (rng.random(len(sent)) < 0.5)
+            delays = np.where(stalled, np.maximum(delays, end - sent), delays)
+    return np.where(lost, np.nan, delays)
+
+
+def car(rng: np.random.Generator, sent: np.ndarray) -> np.ndarray:
+    """Returns such delays over a mobile network from a car."""
+    delays, lost = rng.gamma(6.0, 0.0025, len(sent)), rng.random(len(sent)) < 0.005
+    for begin in np.cumsum(rng.exponential(30.0, round(1.5 * SPAN / 30.0))):
+        seconds = rng.uniform(1.0, 5.0) if rng.random() < 0.05 else rng.uniform(0.05, 0.3)
+        lost |= (sent >= begin) & (sent < begin + seconds)
+    return np.where(lost, np.nan, delays)
+
+
+def bursts(rng: np.random.Generator, sent: np.ndarray) -> np.ndarray:
+    """Returns such delays beside an interferer with a period of ten seconds."""
+    lost = rng.random(len(sent)) < np.where(sent % 10.0 < 0.3, 0.9, 0.005)
+    return np.where(lost, np.nan, rng.gamma(4.0, 0.001, len(sent)))
+
+
+NETWORKS: dict[str, Callable[[np.random.Generator, np.ndarray], np.ndarray]] = {
+    "Wi-Fi": wifi,
+    "car": car,
+    "burst": bursts,
+}
+FILTERS = (
+    "none", "mpc", "mpc:20", "trusting", "trusting:20", "psf:20", "psf:tube", "project", "lookahead",
+    "lookahead, asked",
+)  # fmt: skip
+# Which of them claim what.
+CLAIMS = {"ever": ("project", "lookahead", "lookahead, asked"), "promised": ("lookahead, asked",)}
+
+
+# Colors and markers of the networks in the figure, apart for color-blind readers (Okabe and Ito).
+MARKS = {"Wi-Fi": ("#0072b2", "o"), "car": ("#d55e00", "s"), "burst": ("#009e73", "^")}
+
+
+class Measured(NamedTuple):
+    """How often the box is left per hour, and at which shares of the steps the two claims are made."""
+
+    left: float
+    ever: float
+    promised: float
+
+
+def behind(env: VectorEnv, name: str, least: int) -> VectorEnv:
+    """Returns environments behind a filter."""
+    if name == "none" or name in REGULATORS:
+        return env
+    if name in ("project", "lookahead"):
+        return VectorSafetyShield(env, mode=name, on_unproved="ignore")
+    if name == "lookahead, asked":
+        return VectorSafetyShield(env, mode="lookahead", least_safe_steps=least, on_unproved="ignore")
+    inner = env.unwrapped
+    assert isinstance(inner, NCSVectorEnv)
+    return EstimateFilterSettings(name, certificate_for(inner.plant, inner.certificate_contract))(env)
+
+
+def pushes(rng: np.random.Generator, dt: float, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+    """Yields actions, shape (N, m), that push in one direction for half a second to two, then in another."""
+    pushed, left = np.zeros(shape, np.float32), np.zeros(shape[0], np.int64)
+    while True:
+        turned = left == 0
+        left = np.where(turned, rng.integers(round(0.5 / dt), round(2.0 / dt) + 1, shape[0]), left - 1)
+        pushed[turned] = rng.choice([-1.0, 1.0], pushed.shape)[turned]
+        yield pushed
+
+
+def measured(env_id: str, network: str, name: str, least: int, count: int, hours: float) -> Measured:
+    """Returns what a filter, or a controller, does over a network, asked for so many least safe steps."""
+    plant = gym.make(env_id).unwrapped
+    assert isinstance(plant, NCSEnv)
+    dt, rng = plant.plant.dt, np.random.default_rng(0)
+    sent = PERIOD * np.arange(round(SPAN / PERIOD))
+    channel = PacketLog(sent, NETWORKS[network](rng, sent)).channel(dt)
+    settings = {"disturbance": "adversarial", "terminate_on_violation": True, "channel": channel}
+    settings |= {"contract": plant.contract, "max_episode_steps": round(EPISODE / dt)}
+    env = behind(gym.make_vec(env_id, count, **settings), name, least)
+    observation, info = env.reset(seed=0)
+    shape = env.action_space.shape
+    assert shape is not None
+    agent, kept = pushes(rng, dt, shape), np.zeros(count, np.int64)
+    controls = None
+    if name in REGULATORS:
+        gain = certificate_for(plant.plant, plant.certificate_contract).K
+        controls = controller(name, plant, gain, 0, tuned_weights(env_id, name.partition(":")[0]))
+    ended, ever, promised, steps = 0, 0, 0, round(hours * 3600.0 / (dt * count))
+    for _ in range(steps):
+        action = next(agent) if controls is None else controls(observation, info)
+        observation, _, terminated, _, info = env.step(action)
+        if np.any(terminated & (kept > 0)):
+            raise AssertionError("the box was left within the steps that were promised")
+        kept = np.where(terminated, 0, info.get("shield_safe_steps", kept))
+        ended += np.count_nonzero(terminated)
+        ever += np.count_nonzero(info.get("shield_guaranteed", False))
+        promised += np.count_nonzero(info.get("shield_safe_steps", False))
+    number = steps * count
+    return Measured(ended / (number * dt / 3600.0), ever / number, promised / number)
+
+
+def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
+    """Returns the figure of what was measured, by environment, filter and network."""
+    drawn = CaptionedFigure((8.0, 0.8 + 0.24 * sum(map(len, found.values())) + 0.5 * len(found)))
+    heights = [len(filters) for filters in found.values()]
+    axes = drawn.subplots(len(found), 2, squeeze=False, width_ratios=(3, 2), height_ratios=heights)
+    handles: dict[str, Artist] = {}
+    for (left, claimed), (env, filters) in zip(axes, found.items(), strict=True):
+        for axis in (left, claimed):
+            axis.set_yticks(range(len(filters)), filters if axis is left else [""] * len(filters))
+            axis.set_ylim(len(filters) - 0.4, -0.6)
+        left.set_xscale("symlog", linthresh=5.0)
+        left.set_xlim(-0.6, 60000.0)
+        left.set_xticks([0, 10, 100, 1000, 10000], ["0", "10", "100", "1,000", "10,000"])
+        left.xaxis.set_minor_locator(NullLocator())
+        left.set_title(env, loc="left")
+        claimed.set_xlim(96.9, 100.15)
+        for row, (name, networks) in enumerate(filters.items()):
+            for offset, (network, each) in zip((-0.22, 0.0, 0.22), networks.items(), strict=True):
+                color, marker = MARKS[network]
+                given = {"color": color, "marker": marker, "linestyle": "", "markersize": 4.5, "clip_on": False}
+                handles[network] = left.plot(each.left, row + offset, **given)[0]
+                for claim, share in (("ever", each.ever), ("promised", each.promised)):
+                    if name in CLAIMS[claim]:
+                        fill = "full" if claim == "ever" else "none"
+                        claimed.plot(100.0 * share, row + offset, fillstyle=fill, **given)
+    axes[-1][0].set_xlabel("ends of episodes per hour")
+    axes[-1][1].set_xlabel("steps with a claim [%]")
+    gray: dict[str, Any] = {"color": "#555555", "marker": "o", "linestyle": "", "markersize": 4.5}
+    handles["guaranteed"] = Line2D([], [], **gray)
+    handles["the box is kept for a step at least"] = Line2D([], [], fillstyle="none", **gray)
+    legend_below(drawn, handles)
+    return drawn
+
+
+def recorded(
+    hours: float = 1.0,
+    envs: int = 64,
+    ids: Annotated[Sequence[str], tuple(ASKED)] = tuple(ASKED),
+    filters: Annotated[Sequence[str], FILTERS] = FILTERS,
+    out: Path | None = None,
+) -> None:
+    """Loops over networks as records have them: how often the box is left behind filters, and what is claimed then.
+
+    The records are made here, with a seed, in the shapes of real ones: "Wi-Fi" stalls in clusters, for lengths with a
+    heavy tail; in a "car" a handover stops everything every half minute, now and then for seconds; an interferer's
+    "burst" takes nine of ten packets for .3 s every ten seconds. All are replayed by their clock, and all break the
+    contracts.
+
+    The agent pushes in one direction for half a second to two, then in another; "mpc" and "mpc:20" are model predictive
+    control of the task instead, without a margin and with one of a fifth. Disturbances are adversarial. An episode ends
+    where the box is left, or after a minute. "left" counts these ends per hour of plant time. "ever" and "promised" are
+    the shares of steps at which the guarantee holds, and at which the box is kept for at least one step whatever the
+    network does. A dash stands for a filter that claims nothing. With --out a figure of it, too.
+    """
+    shares_of = "  " + "".join(f"{each:>6}" for each in NETWORKS)
+    found: dict[str, dict[str, dict[str, Measured]]] = {}
+    for name in ids:
+        print(f"{name:16}{'left per hour':>24}  {'ever [%]':>18}  {'promised [%]':>18}")
+        print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + 2 * shares_of)
+        of_env = found[name] = {}
+        for each in filters:
+            given = ASKED[name], envs, hours
+            over = of_env[each] = {
+                network: measured(f"ncs_gym/{name}-v0", network, each, *given) for network in NETWORKS
+            }
+            text = "".join(f"{one.left:8.1f}" for one in over.values())
+            for claim, names in CLAIMS.items():
+                shares = [
+                    f"{100.0 * getattr(one, claim):6.1f}" if each in names else f"{'-':>6}" for one in over.values()
+                ]
+                text += "  " + "".join(shares)
+            print(f"{each:16}{text}", flush=True)
+        print()
+    if out is not None:
+        out.write_bytes(_claims_drawn(found).png)
+
+
+# Settings of both PPO agents.
+PPO_ENVS = 32
+PPO_SETTINGS: dict[str, Any] = {
+    "n_steps": 128,
+    "batch_size": 512,
+    "n_epochs": 5,
+    "learning_rate": 1e-3,
+    "gamma": 0.98,
+    "policy_kwargs": {"net_arch": [64, 64]},
+}
+POLICY_STYLES = {
+    "period": ("#777777", "s"),
+    "forced alone": ("#222222", "x"),
+    "random": ("#bb8844", "v"),
+    "acknowledged": ("#2266aa", "^"),
+    "slack": ("#22884d", "D"),
+    "PPO requests": ("#dd6677", "o"),
+    "PPO both": ("#882255", "*"),
+}
+
+
+def environments(env_id: str, count: int, certificate: Certificate, cost: float) -> VectorRequestActions:
+    return VectorRequestActions(VectorSafetyShield(gym.make_vec(env_id, num_envs=count), certificate), cost)
+
+
+def trained(env: Any, steps: int, seed: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns what PPO has learned in so many steps, a function of observations."""
+    normalized = VecNormalize(SB3VecEnv(env), gamma=PPO_SETTINGS["gamma"])
+    model = PPO("MlpPolicy", normalized, seed=seed, device="cpu", **PPO_SETTINGS).learn(steps)
+    return lambda observations: model.predict(normalized.normalize_obs(observations), deterministic=True)[0]
+
+
+def learned_requests(env_id: str, certificate: Certificate, control: Policy, cost: float, steps: int, seed: int) -> Any:
+    """Returns a function that makes the policy for environments: requests by PPO, inputs by the controller."""
+    env = environments(env_id, PPO_ENVS, certificate, cost)
+    act = trained(RequestsOnly(Asking(env, control), env), steps, seed)
+
+    def policy_for(env: VectorRequestActions) -> Policy:
+        only = RequestsOnly(Asking(env, control), env)
+        return lambda observations, info: only.complete(act(only.seen(observations, info)))
+
+    return policy_for
+
+
+def learned_both(env_id: str, certificate: Certificate, cost: float, steps: int, seed: int) -> Any:
+    """Returns a function that makes the policy for environments: requests and inputs by PPO."""
+    act = trained(environments(env_id, PPO_ENVS, certificate, cost), steps, seed)
+    return lambda env: lambda observations, info: act(observations)
+
+
+def _policies_drawn(results: dict[str, tuple[float, float, float]], env_id: str) -> CaptionedFigure:
+    """Draws packets per step, mean return and its half-width of each policy, a line through those of one kind."""
+    figure = CaptionedFigure((7.0, 4.2))
+    axis = figure.subplots()
+    for kind, (color, marker) in POLICY_STYLES.items():
+        mine = {name.removeprefix(kind).strip(" ,"): point for name, point in results.items() if name.startswith(kind)}
+        if mine:
+            x, y, width = np.array(sorted(mine.values())).T
+            line = "none" if kind.startswith("PPO") else "-"
+            axis.errorbar(x, y, width, color=color, marker=marker, ls=line, lw=0.8, capsize=2, label=kind)
+        for value, (packets, mean, _) in mine.items():
+            text = value.partition(",")[0]
+            if not text.startswith("seed"):
+                place = (4, 5) if kind == "period" else (4, -11)
+                axis.annotate(text, (packets, mean), place, textcoords="offset points", fontsize=7, color=color)
+    label(axis, "packets per step", "return of an episode", env_id.removeprefix("ncs_gym/"))
+    axis.legend(loc="lower right", fontsize=8)
+    return figure
+
+
+def requests(
+    env: str = "ncs_gym/LaneKeepingOnRequest-v0",
+    episodes: int = 400,
+    cost: float = 0.1,
+    steps: int = 100_000,
+    seeds: int = 2,
+    out: Path = Path("requests.png"),
+) -> None:
+    """Policies that ask for samples: return, overridden share and violations against packets per step.
+
+    A linear-quadratic regulator behind the shield proposes the inputs, and a policy asks: in every step, every few
+    steps, at random, when the newest sample is old and the last request could have arrived, when the proposed input has
+    little slack, or as PPO has learned. One more PPO learns inputs and requests. Where nobody asks, the contract forces
+    a request when it has to. Prints the table and the winner at the price --cost of a packet, in units of the reward,
+    and draws returns against packets. --episodes are those of each policy, --steps and --seeds those of each training;
+    --steps 0 leaves out PPO.
+    """
+    shield = SafetyShield(gym.make(env))
+    single, certificate = shield.unwrapped, shield.certificate
+    assert isinstance(single, NCSEnv)
+    assert single.contract is not None
+    weights = tuned_weights(env.replace("OnRequest", ""), "lqr+shielded")
+    control = controller("lqr", single, certificate.K, 0, weights)
+    best = best_period(single.channel, single.contract)
+    rules = {"period 1": every(1), f"period {best}, the best": every(best), "forced alone": at_random(0.0)}
+    rules |= {f"random {share:g}": at_random(share) for share in (0.1, 0.2, 0.4)}
+    rules |= {f"acknowledged {age}": acknowledged(age) for age in (1, 2, 3, 4)}
+    rules |= {f"slack {threshold:g}": slack(threshold) for threshold in (0.0, 0.1, 0.3, 0.5)}
+    policies: dict[str, Callable[[VectorRequestActions], Policy]] = {
+        name: lambda env, rule=rule: with_rule(Asking(env, control), rule) for name, rule in rules.items()
+    }
+    for seed in range(seeds if steps else 0):
+        policies[f"PPO requests, seed {seed}"] = learned_requests(env, certificate, control, cost, steps, seed)
+        policies[f"PPO both, seed {seed}"] = learned_both(env, certificate, cost, steps, seed)
+    points, worth = {}, {}
+    titles = ("packets", "forced", "return", "", "less price", "overridden", "violations", "unproved", "oldest")
+    rows = [["policy", *titles]]
+    for name, policy_for in policies.items():
+        envs = environments(env, episodes, certificate, cost)
+        inner, result = envs.unwrapped, played(envs, policy_for(envs), seed=1)
+        assert isinstance(inner, NCSVectorEnv)
+        mean, packets = float(result.returns.mean()), result.packets
+        points[name] = packets, mean, float(1.96 * result.returns.std(ddof=1) / np.sqrt(episodes))
+        worth[name] = mean - cost * packets * (inner.max_episode_steps or 0)
+        row = [name, f"{packets:.3f}", f"{result.forced:.1%}", f"{mean:.1f}", f"+- {points[name][2]:.1f}"]
+        row += [f"{worth[name]:.1f}", f"{result.overridden:.1%}", str(result.violations), str(result.unproved)]
+        rows.append([*row, str(result.oldest)])
+    print(f"{env}: {episodes} episodes of each policy, max_age = {single.contract.max_age}.")
+    print(single.channel.description)
+    print(f"packets per step; a packet costs {cost:g} in the column less price\n")
+    print(text_table(rows))
+    winner = max(worth, key=lambda name: worth[name])
+    print(f"\nAt this price the winner is {winner}: {worth[winner]:.1f}.")
+    out.write_bytes(_policies_drawn(points, env).png)
+
+
+KINDS = ("Kalman", "set-membership", "certified", "skipped")
+
+
+def count_gains(env: NCSEnv, histories: ArrivalHistories) -> Counter[str]:
+    """Returns counts of which gain an estimator takes, of every update that it looks up in a graph from now on."""
+    counts: Counter[str] = Counter()
+    kinds: dict[int, str] = {}
+    sensor = env.plant.kalman_covariances[1] + env.channel.quantization_step**2 / 12.0 * np.eye(env.plant.p)
+    table, update = histories.table, histories.table.update
+
+    def counted(number: int) -> tuple[np.ndarray, np.ndarray]:
+        found = update(number)
+        if number not in kinds:
+            kinds[number] = kind_of(found[0], table.statistics(number), histories.recursion, sensor)
+        counts[kinds[number]] += 1
+        return found
+
+    table.update = counted
+    return counts
+
+
+def kind_of(gain: np.ndarray, statistics: ErrorStatistics, recursion: ErrorRecursion, sensor: np.ndarray) -> str:
+    """Returns which of the gains one is, by computing the others anew."""
+    covariance, shape, age, _ = statistics
+    if np.allclose(gain, kalman_gain(recursion.plant, covariance, sensor), rtol=1e-9, atol=1e-12):
+        return "Kalman"
+    if np.array_equal(gain, recursion.sets.gain(shape)):
+        return "set-membership"
+    ages = recursion.error_set.ages
+    if ages is not None and 1 <= age <= len(ages.gains) and np.array_equal(gain, ages.gains[age - 1]):
+        return "certified"
+    assert not gain.any()
+    return "skipped"
+
+
+def kalman_gain(plant: LinearPlant, covariance: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    """Returns P H' (H P H' + R)^-1, shape (n, p)."""
+    innovation = plant.H @ covariance @ plant.H.T + sensor
+    return np.linalg.solve(innovation, plant.H @ covariance).T
+
+
+def gains_taken(env_id: str, episodes: int, seed: int = 0) -> Counter[str]:
+    """Returns how often each kind of gain is taken in some episodes under random actions."""
+    env = ncs_env(gym.make(env_id, terminate_on_violation=False))
+    histories = histories_of(env.plant, env.channel, env.error_set)
+    counts = count_gains(env, histories)
+    env._estimator = Estimator(env.plant, env.channel, histories=histories)
+    env.action_space.seed(seed)
+    for episode in range(episodes):
+        env.reset(seed=seed + episode)
+        for _ in range(gym.spec(env_id).max_episode_steps or 200):
+            env.step(env.action_space.sample())
+    assert env.estimator._histories is histories  # no history was forgotten, with it the counts
+    return counts
+
+
+def gains(episodes: int = 50) -> None:
+    """How often the gain that the estimator takes is the Kalman gain, in each registered environment.
+
+    The estimator tries the Kalman gain first and takes it only if the error stays in its certified set; otherwise it
+    takes the set-membership gain, or under a contract the certified gain of the estimate's age, or skips the sample
+    (docs/shield_proof.md). Counted is every update that it makes, those of replays included.
+    """
+    show = table("environment", "updates", *KINDS, first=26, width=16)
+    for env_id in registered_ids():
+        counts = gains_taken(env_id, episodes)
+        total = sum(counts.values())
+        show(env_id.removeprefix("ncs_gym/"), f"{total:,}", *(f"{counts[kind] / total:.2%}" for kind in KINDS))
+
+
+COMMANDS = (contracts, downlink, recorded, requests, gains)
+
+if __name__ == "__main__":
+    run(__doc__, COMMANDS)
