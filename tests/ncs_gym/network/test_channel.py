@@ -61,7 +61,11 @@ def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
 @pytest.mark.parametrize("most", [None, 0, 1, 3, 40])
 @pytest.mark.parametrize(
     ("loss", "period"),
-    [(0.6, 1), (1.0, 1), (0.9, 2), (BURSTS, 1), (BURSTS, 3), (GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.0), 1)],
+    [
+        *((0.6, 1), (1.0, 1), (0.9, 2), (BURSTS, 1), (BURSTS, 3)),
+        (GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.0), 1),
+        (GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.3, loss_good=0.2, loss_bad=0.7), 1),
+    ],
 )
 def test_mean_loss_is_the_share_that_is_lost_in_the_long_run(loss, period, most):
     channel, rng = Channel(loss=loss, send_period=period, max_consecutive_losses=most), np.random.default_rng(0)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv
+from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv, truck_trailer
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.backup_plans.plan_search import Plans
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
@@ -64,6 +64,12 @@ def test_a_start_in_the_box_is_decided_to_the_last_digit():
         shape = np.diag(np.full(plant.n, 1e-4)) + (reached**2 - 1e-4) * np.outer(row, row)
         assert Ellipsoid(shape).support(plant.box_rows[2]) == pytest.approx(scale, abs=1e-12)
         assert starts_in_box(plant, Ellipsoid(shape)) is inside
+
+
+def test_a_start_exactly_on_a_face_is_in_the_box():
+    plant = truck_trailer()  # limits of 2, whose products with the rows do not round
+    assert starts_in_box(plant, np.array([2.0, -2.0]))
+    assert not starts_in_box(plant, np.array([np.nextafter(2.0, 3.0), 0.0]))
 
 
 def test_an_estimate_proves_the_box_only_with_room_for_its_error():
