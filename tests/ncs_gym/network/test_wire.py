@@ -119,3 +119,10 @@ def test_layout_is_the_documented_one():
 
 def test_nothing_is_unpickled():
     assert reason_of(pickle.dumps(Message(kind=Kind.BEACON, episode=1, stamp=2, requests=(True,) * 4))) == "format"
+
+
+def test_keys_have_sixteen_bytes_at_least():
+    sample = Message(kind=Kind.ECHO, episode=1, stamp=2, challenge=3, missing=0, digest=bytes(16))
+    assert shown(Wire(PLANT, 3, bytes(16)).decode(Wire(PLANT, 3, bytes(16)).encode(sample))) == shown(sample)
+    with pytest.raises(ValueError, match="the key must be at least 16 bytes"):
+        Wire(PLANT, 3, bytes(15))

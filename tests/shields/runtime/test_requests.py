@@ -27,6 +27,7 @@ def test_commands_carry_requests_to_the_actuator():
     downlink = Channel(delay=1, loss=0.3, max_consecutive_losses=1)
     loop = SafeLoop(certificate_of(plant), plant, Channel(0.2, on_request=True), downlink=downlink)
     actuator, requested = Actuator(loop.input_delay, 1), []
+    assert actuator.requested  # nothing was heard
     loop.start(np.zeros(2))
     for step in range(7):
         loop.receive()
