@@ -135,7 +135,7 @@ def back(ids: Sequence[str] = ()) -> None:
     for plant, contract in under_contracts(30):
         recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
         age = contract.max_age
-        ways = [way_back(recursion, many * age, period) for many in OUTAGES for period in (1, age)]
+        ways = [way_back(recursion, many * age, period) for many in OUTAGES for period in (1, age + 1)]
         steps.append([np.inf if each is None else each for each in ways])
     print(row.format("30 random plants", "1 to 4", "", "", "", *(f"{each:.0f}" for each in np.max(steps, axis=0))))
 
@@ -152,9 +152,9 @@ def ways(ids: Sequence[str] = ()) -> None:
     def steps_of(plant: LinearPlant, contract: ChannelContract) -> list[float]:
         errors, age = certified_error_set(plant, contract), contract.max_age
         recursion = ErrorRecursion(plant, contract.quantization_step, errors)
-        chosen = [way_back(recursion, 10 * age, gap) for gap in (1, age)]
-        alone = [by_newest_samples(plant, contract, errors, gap) for gap in (1, age)]
-        ladder = [by_ladder(recursion, 10 * age, gap) for gap in (1, age)]
+        chosen = [way_back(recursion, 10 * age, gap) for gap in (1, age + 1)]
+        alone = [by_newest_samples(plant, contract, errors, gap) for gap in (1, age + 1)]
+        ladder = [by_ladder(recursion, 10 * age, gap) for gap in (1, age + 1)]
         return [np.inf if each is None else each for each in chosen] + alone + ladder
 
     def texts(columns: Sequence[float]) -> list[str]:

@@ -36,7 +36,7 @@ class WayBack(NamedTuple):
     Attributes:
         outage: Its length [steps].
         often: Where samples come at every step then.
-        rarely: Where they come as rarely as the contract allows.
+        rarely: Where they come as rarely as the contract allows, every max_age + 1 steps.
     """
 
     outage: int
@@ -105,8 +105,9 @@ def silence_of(certificate: Certificate, plant: LinearPlant) -> Silence | None:
         return None
     fallbacks = _Fallbacks(certificate, plant)
     recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
-    outages = [many * contract.max_age for many in OUTAGES]
-    ways = [WayBack(steps, *(way_back(recursion, steps, gap) for gap in (1, contract.max_age))) for steps in outages]
+    rarest = contract.max_age + 1  # steps from one sample to the next, if they arrive at once
+    outages = [many * max(contract.max_age, 1) for many in OUTAGES]
+    ways = [WayBack(steps, *(way_back(recursion, steps, gap) for gap in (1, rarest))) for steps in outages]
     at_half, at_rest = fallbacks.kept_from(0.5), fallbacks.kept_from(0.0)
     return Silence(contract.max_age, plant.dt, fallbacks.kept_anywhere(), at_half, at_rest, tuple(ways))
 

@@ -405,6 +405,10 @@ def _cheapest_text(found: Requirements, settings: RequirementsSettings, bearing:
             return ""
         plant = f"--env {settings.env or _DEFAULT_ENV}" if settings.plant is None else f"--plant {settings.plant}"
         advice = f"`ncs synthesize {plant} --max-age 0` says what binds, and what would help"
+        if settings.sampling_periods:  # it is about the plant's own
+            advice = (
+                "`shields.synthesize(plant.resampled(dt), contract=ChannelContract(0))` says what binds at one of them"
+            )
         return f"No certificate was found for any of these networks: {advice}."
     what = "Cheapest" if bearing is None else "Cheapest that bears the losses and delays of today"
     return f"{what}, with at least {settings.keep:g} % of the largest share: {_description(cheapest)}."

@@ -39,6 +39,8 @@ def registered_env(env_id: str) -> NCSEnv:
     elif name not in registered_ids() and name not in needing_extras():
         if near := get_close_matches(f"ncs_gym/{name.removeprefix('ncs_gym/')}", registered_ids(), 1, 0.95):
             raise ValueError(f"unknown environment {env_id!r}; did you mean {near[0]!r}?")
+        if name in gym.registry and gym.spec(name).namespace == "ncs_gym":
+            raise ValueError(f"{env_id} has no plant of its own: give the file of one by --plant, or register_plant it")
         raise ValueError(
             f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "
             "module that registers one of your own"

@@ -92,10 +92,14 @@ def warn_of_broken_contract(
     age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
     if age + input_delay <= contract.max_age:
         return
+    kept = contract_of(channel)
+    enough = f"{age + input_delay}), or of a larger max_age where packets are lost"
+    if kept is not None:
+        enough = f"{kept.max_age + input_delay}), which the channel keeps with its losses"
     later = f", and what is decided takes effect {in_steps(input_delay)} later" if input_delay else ""
     warn_caller(
         f"the channel lets the newest sample become {in_steps(age)} old{later}, but the certificate's contract allows "
         f"{in_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
-        f"ChannelContract(max_age={age + input_delay}), or of a larger max_age where packets are lost",
+        f"ChannelContract(max_age={enough}",
         BrokenContractWarning,
     )

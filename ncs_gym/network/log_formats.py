@@ -324,6 +324,25 @@ _ROLES = {
     "episode": "episode",
     "lost": "lost dropped",
 }
+# Columns of these names say when something happened, but not what.
+_MOMENTS = frozenset(
+    (
+        "time",
+        "t",
+        "timestamp",
+        "stamp",
+        "ts",
+        "date",
+        "datetime",
+        "clock",
+        "moment",
+        "when",
+        "epoch",
+        "unix",
+        "unix_time",
+        "at",
+    )
+)
 _ROLE_OF = {name: role for role, names in _ROLES.items() for name in names.split()}
 # Units in the names of columns [s].
 _UNITS = {
@@ -391,9 +410,18 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     if "sent" in columns and ("received" in columns or "delay" in columns):
         return _of_times(rows, columns, names)
     if set(columns) - {"number", "lost"} == {"delay"}:
+        used = {each.index for each in columns.values()}
+        unused = {name: _plain(name) for index, name in enumerate(names) if index not in used}
+        if moments := [name for name, plain in unused.items() if _SUFFIX.sub("", plain) in _MOMENTS]:
+            raise ValueError(
+                f"the column {shown(moments[0])} may say when packets were sent or when they came back: name it sent_s "
+                f"or received_s, and {shown(columns['delay'].name)} by its unit, as in rtt_ms"
+            )
         if not columns["delay"].unit:
             raise ValueError(f"the column {shown(names[columns['delay'].index])} has no unit: name it rtt_ms or rtt_s")
-        return _of_list(rows, period, columns)
+        found = _of_list(rows, period, columns)
+        more = f" Not used: {', '.join(map(shown, unused))}." if unused else ""
+        return found._replace(read_as=found.read_as + more)
     raise ValueError(
         f"it has the columns {shown(names)[1:-1]}; a log needs sent and received, or sent and delay, or one "
         "column of round trips, rtt_ms, with the units in their names (_s, _ms, _us, _ns)"
@@ -463,8 +491,7 @@ def _columns(names: Sequence[str]) -> dict[str, _Column]:
     """Returns the columns that are understood, by what they hold."""
     columns: dict[str, _Column] = {}
     for index, name in enumerate(names):
-        spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).replace("µ", "u").replace("μ", "u")
-        plain = re.sub(r"[^a-z0-9]+", "_", spaced.lower()).strip("_")
+        plain = _plain(name)
         suffix = _SUFFIX.search(plain)
         role = _ROLE_OF.get(plain) or _ROLE_OF.get(_SUFFIX.sub("", plain))
         if role in columns:
@@ -472,6 +499,12 @@ def _columns(names: Sequence[str]) -> dict[str, _Column]:
         if role is not None:
             columns[role] = _Column(index, name, suffix[1] if suffix and plain not in _ROLE_OF else "")
     return columns
+
+
+def _plain(name: str) -> str:
+    """Returns the name of a column in small letters, with underscores between its words."""
+    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).replace("µ", "u").replace("μ", "u")
+    return re.sub(r"[^a-z0-9]+", "_", spaced.lower()).strip("_")
 
 
 def _is_number(cell: str) -> bool:
@@ -490,7 +523,7 @@ def _number(cell: str) -> Decimal | None:
         value = Decimal(cell)
     except InvalidOperation:
         return _no_plain_number(cell)
-    if value.is_nan():
+    if value.is_nan() or value == Decimal("Infinity"):  # it never arrived
         return None
     if not -_LARGEST < value < _LARGEST:
         raise ValueError("too large")

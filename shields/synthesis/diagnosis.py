@@ -59,6 +59,8 @@ _SHOWN_DIGITS = 3
 # Where the ellipsoid's gain bears less of the radii than this with a polytope no better gain is sought: searches have
 # gained an eighth.
 _HOPELESS = 0.8
+# Of contracts, where there is none, none for older samples is named [steps].
+_OLDEST_NAMED = 32
 # In the details of the exception: the fraction of all radii that has a certificate.
 _SHARE = "share_of_radii"
 
@@ -199,6 +201,11 @@ def with_feasible_bounds(
             details["max_age"] = age
         elif not clock.is_over:
             smaller.append("max_age")
+    elif contract is None and infeasible.binding != "E1":
+        progress("no certificate: searching for a contract that has one")
+        if (age := search.oldest_with_contract()) is not None:
+            hints.append(f"a contract of the channel (contract=ChannelContract({age}), or of less age)")
+            details["max_age"] = age
     changes = [] if infeasible.binding == "E1" else [*_shrinkings(plant), *_widenings(plant)]
     promising: list[tuple[_Change, float]] = []
     for k, change in enumerate(changes):
@@ -441,6 +448,13 @@ class _Search:
         except TimeoutError:
             pass
         return None
+
+    def oldest_with_contract(self) -> int | None:
+        """Returns a max_age of a contract that has a certificate, where there is none; None for none in the time.
+
+        No larger one than `_OLDEST_NAMED` is sought.
+        """
+        return replace(self, contract=ChannelContract(_OLDEST_NAMED + 1)).largest_age()
 
     def largest_age(self) -> int | None:
         """Returns the largest max_age below the contract's that has a certificate; None for none in the time."""

@@ -9,7 +9,8 @@ import pytest
 from scipy.optimize import linprog
 
 import shields
-from ncs_gym import ChannelContract, LinearPlant, NCSVectorEnv, TraceChannel
+from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, Packet, TraceChannel, certified_error_set
+from ncs_gym.estimation.estimator import Estimator
 from shields import CertificateError, VectorSafetyShield, certificate_for
 from shields.silence import MOST_STEPS
 from shields.synthesis.faces import Extremes, Faces
@@ -233,6 +234,36 @@ def test_bounds_of_rows_hold_whatever_the_solver_says(size):
         assert least == -largest
         if size == 1.0:
             assert largest <= best + 1e-9
+
+
+@pytest.mark.parametrize("name", ["CartPole", "Pendulum", "drifts"])
+def test_ways_back_are_those_of_an_estimator_with_as_few_samples_as_the_contract_allows(name):
+    plant, certificate, silence = registered(name)
+    contract = certificate.contract
+    for way in silence.ways_back:
+        for period, said in ((1, way.often), (contract.max_age + 1, way.rarely)):
+            channel = Channel(send_period=period, quantization_step=contract.quantization_step)
+            assert contract.is_kept_by(channel)
+            estimator = Estimator(plant, channel, certified_error_set(plant, contract))
+            estimator.reset(np.zeros(plant.n))
+            first = 5 * period + way.outage  # the step of the first sample after the outage
+            for step in range(1, first + said + 1):
+                heard = step % period == 0 if step <= 5 * period else step >= first and (step - first) % period == 0
+                sample = Packet(step, plant.H @ estimator.mean, estimator.episode)
+                estimator.advance(np.zeros(plant.m), [sample] if heard else [])
+                certified = estimator.table.is_certified(estimator.numbered([])[1])
+                assert certified or 5 * period < step < first + said
+                assert not (certified and first <= step < first + said)
+    assert not contract.is_kept_by(Channel(send_period=contract.max_age + 2))
+
+
+def test_a_contract_of_age_0_is_exceeded_by_the_first_missing_sample():
+    plant = small([[1.02, 0.05], [0.0, 0.9]])
+    silence = shields.silence_of(certificate_of(plant, ChannelContract(0), "polytope"), plant)
+    assert silence.max_age == 0
+    assert silence.at_rest >= silence.at_half >= silence.anywhere >= 1
+    assert [way.outage for way in silence.ways_back] == [2, 10, 100]
+    assert all(way.often == way.rarely for way in silence.ways_back)
 
 
 def test_without_a_contract_there_is_nothing_to_exceed():

@@ -31,7 +31,7 @@ def unstable(seed):
 def steps_back(plant, contract, outage, period):
     """How many steps after an outage of so many the error's ellipsoid lies in the certified set again.
 
-    Samples come every `period` steps before and after; None if it does not within 60.
+    Samples come every `period` steps before and after; infinite if it does not within 100.
     """
     error_set = certified_error_set(plant, contract)
     recursion, steps = ErrorRecursion(plant, contract.quantization_step, error_set), 0
@@ -47,8 +47,8 @@ def steps_back(plant, contract, outage, period):
         assert is_inside(known.shape, error_set.shape_at(0))
     known = heard_after(known, outage)
     while not is_inside(known.shape, error_set.shape_at(0)):
-        if steps >= 60:
-            return None
+        if steps >= 100:
+            return np.inf
         known, steps = heard_after(known, period), steps + period
     return steps
 
@@ -57,15 +57,15 @@ def steps_back(plant, contract, outage, period):
 @pytest.mark.parametrize("name", IDS)
 def test_registered_plants_come_back(name, contracts):
     plant, contract = registered(name)
-    for period in {1, contract.max_age}:
-        assert steps_back(plant, contract, contracts * contract.max_age, period) <= 40
+    for period in (1, contract.max_age + 1):  # as often and as rarely as the contract allows
+        assert steps_back(plant, contract, contracts * contract.max_age, period) <= 50
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_random_unstable_plants_come_back(seed):
     plant, contract = unstable(seed)
     for contracts in (2, 100):
-        assert steps_back(plant, contract, contracts * contract.max_age, contract.max_age) <= 40
+        assert steps_back(plant, contract, contracts * contract.max_age, contract.max_age + 1) <= 70
 
 
 @pytest.mark.parametrize("arrivals", [{7: [4, 7], 8: [1, 8]}, {7: [4, 7], 9: [1, 9]}])

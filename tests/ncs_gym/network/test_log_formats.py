@@ -342,6 +342,8 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent received size\n0 60\n1 2 60\n", "line 2 has 2 columns instead of 3"),
         ("sent,received,lost\n0,1,perhaps\n1,2,no\n", "line 2"),
         ("rtt\n1\n2\n", "'rtt' has no unit"),
+        ("time,rtt_ms\n0,10\n0.1,11\n60,12\n", "'time' may say when packets were sent or when they came back"),
+        ("Time_s;latency\n0;10\n0.1;11\n", "name it sent_s or received_s, and 'latency' by its unit"),
         ("0.3\n0.4\n", "seconds or milliseconds"),
         ("rtt_ms\n12\nslow\n", "line 3 is not a delay"),
         (f"{LINUX}{ping([(1, 2)])}{LINUX}{ping([(1, 2)])}", "several runs"),

@@ -206,6 +206,17 @@ def test_clock_that_has_run_out_ends_a_search():
         Clock(time.thread_time() - 1.0).check()
 
 
+def test_a_contract_is_named_where_a_stable_plant_has_none():
+    plant = LinearPlant(
+        A=[[0.998]], B=[[0.01]], H=[[1.0]], dt=0.1, state_limits=([0.2], [0.9]), input_limits=([0.0], [1.0]),
+        operating_state=[0.5], operating_input=[0.1], disturbance_bound=([[1.0]], [-0.001], [0.001]),
+        sensor_bound=0.01, initial_bound=0.02,
+    )  # fmt: skip
+    with pytest.raises(Infeasible, match=r"a contract of the channel \(contract=ChannelContract\(32\)") as refused:
+        synthesize(plant)
+    assert verified(synthesize(plant, contract=ChannelContract(refused.value.details["max_age"])), plant)
+
+
 def test_less_age_is_named_where_it_helps():
     plant = LinearPlant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5})
     told = refusal(plant, ChannelContract(400))
