@@ -88,6 +88,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     process. Truncation is `TimeLimit`'s, or that environment's.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
+    States and inputs are deviations from the plant's operating point, if it has one (`plant.from_deviation`).
+
     | key | shape or type | unit | meaning |
     |---|---|---|---|
     | `state` | `(n,)` | of the states | the true state x |

@@ -55,20 +55,21 @@ class EpisodeChannels:
         """Returns the sources that an option of `reset` names, one for each environment.
 
         Args:
-            option: None for the environments' own; a channel, or what draws one, for all; or N of these. All of them
-                are for one episode, but for `EveryEpisode`.
+            option: None for the environments' own; a channel (or a dictionary of its fields), or what draws one, for
+                all; or N of these. All of them are for one episode, but for `EveryEpisode`.
             name: What the error message calls it.
 
         Raises:
             ValueError: If it is none of these, or a channel that the environments cannot have.
         """
-        count = len(self._own)
+        count, option = len(self._own), from_json(option, (Channel,), name)
         if option is None:
             return self._own
         if isinstance(option, EveryEpisode):
             firsts = [None] * count if option.first is None else self.read(option.first, name)
             return [EveryEpisode(option.draw, first) for first in firsts]
         each = [option] * count if isinstance(option, Channel) or callable(option) else option
+        each = [from_json(one, (Channel,), name) for one in each] if isinstance(each, (list, tuple)) else each
         if not isinstance(each, (list, tuple)) or len(each) != count:
             several = "" if count == 1 else f", or a list of {count} of these"
             raise ValueError(f"{name} must be a Channel or a function (rng) -> Channel{several}, got {shown(option)}")

@@ -385,8 +385,9 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     number, line = head
     rest = lines[number + 1 :]
     if "#" in line and (found := next(((n, each) for n, each in enumerate(lines) if _is_data(each)), None)):
-        # Of lines of comment in front of the numbers the last one may have the names.
-        number = next((n for n in reversed(range(found[0])) if lines[n].strip()), number)
+        # Of lines of comment in front of the numbers the last one may have the names, if no line of names follows.
+        has_names = not re.match(r"[\s\d.+-]", found[1])
+        number = found[0] if has_names else next((n for n in reversed(range(found[0])) if lines[n].strip()), number)
         line, rest = lines[number], lines[number + 1 :]
     line = line.strip().lstrip("#").strip()
     separator = next((each for each in ",;\t|" if each in line), " ")

@@ -513,9 +513,10 @@ def _around_middle_of_disturbance(
             f"{name}: the middle of this disturbance moves the operating point to {shown((point[0] + x).tolist())} "
             f"with input {shown((point[1] + u).tolist())}, which is not strictly within the limits"
         )
+    state, inputs_there = ([float(f"{each:.6g}") for each in around] for around in (point[0] + x, point[1] + u))
     warn_caller(
-        f"deviations are counted from the state {shown((point[0] + x).tolist())} and the input "
-        f"{shown((point[1] + u).tolist())}, where the middle of the disturbance rests (plant.operating_state)",
+        f"deviations are counted from the state {shown(state)} and the input {shown(inputs_there)}, where the middle "
+        "of the disturbance rests (plant.operating_state)",
         MovedOperatingPointWarning,
     )
     return {

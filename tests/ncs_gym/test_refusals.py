@@ -310,7 +310,7 @@ CHANNELS = [
     (log_in("sent,received\n0.0,0.1\n0.0,0.2\n"), "one after the other"),
     (log_in("sent,received\n1.0,0.5\n2.0,2.1\n"), "clocks"),
     (log_in("sent,received\n0.0,0.1\nlate,0.2\n"), "line 3"),
-    (log_in("sent,received\n0.0,0.1\n1.0,inf\n"), "line 3"),
+    (log_in("sent,received\n0.0,0.1\n1.0,1e999\n"), "line 3"),
     (log_in("episode,sent,received\n77,1,\n"), "line 2 is not an episode"),
     (lambda: Actuator(input_delay=2, inputs=1).start(episode=0.5), "episode must be a whole number >= 0"),
     *called(

@@ -185,8 +185,10 @@ def test_draws_follow_from_the_seed_and_pickled_wrappers_draw_the_same():
     drawn = [[each.reset(seed=seed) and each.unwrapped.episode_channel for seed in range(9)] for each in (env, again)]
     assert drawn[0] == drawn[1]
     assert set(drawn[0]) == set(LATE)
-    env.reset(options={"channel": Channel(delay=9)})
-    assert env.unwrapped.episode_channel == Channel(delay=9)
+    for option in (Channel(delay=9), {"delay": 9}):
+        env.reset(options={"channel": option})
+        assert env.unwrapped.episode_channel == Channel(delay=9)
+        env.reset()
     check_env(env, skip_render_check=True)
 
 

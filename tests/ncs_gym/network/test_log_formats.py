@@ -203,6 +203,12 @@ KINDS = {
         "0.02",
         "'rtt[ms]' in ms",
     ),
+    "table with a comment above its names, and infinity for what never arrived": Kind(
+        "# recorded with my script\nsent,received\n0,0.001\n0.02,inf\n0.04,0.1\n",
+        times("0.02", ["0.001", None, "0.06"]),
+        "0.02",
+        "'sent' in s",
+    ),
     "table with times of day and a flag": Kind(
         "sent,received,lost\n2026-01-02T23:59:59.990Z,2026-01-03T00:00:00.001Z,false\n"
         "2026-01-03T00:00:00.010Z,2026-01-03T00:00:00.011Z,true\n2026-01-03T00:00:00.030Z,2026-01-03T00:00:00.031Z,0\n",
