@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,43 +12,66 @@ from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
 from experiments.terminal import text_table, wrapped
-from ncs_gym import NCSEnv, PacketLog, contract_of
+from ncs_gym import ChannelContract, LinearPlant, PacketLog, contract_of
 from ncs_gym.network.channel import in_steps
 from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.reading import MOST_PACKETS
-from shields import silence_of
+from shields import Certificate, silence_of
 from shields.atomic_write import write_atomically
 from shields.certificates import certificate_of_package
+
+
+class _Promise(NamedTuple):
+    """What a record is compared with.
+
+    Attributes:
+        whose: "environment" or "certificate".
+        dt: Duration of a control step [s].
+        contract: What was promised of samples; None for nothing.
+        oldest: Until which age of the newest sample the certificate keeps the box; None if there is none.
+    """
+
+    whose: str
+    dt: float
+    contract: ChannelContract | None
+    oldest: int | None
 
 
 def channel(settings: ChannelSettings) -> None:
     """Runs `ncs channel`."""
     require_place(settings.out)
-    env = None if settings.env is None else registered_env(settings.env)
-    step = settings.sampling_period or (1.0 if env is None else env.plant.dt)
+    promise, least = _promise(settings), settings.least_safe_steps
+    step = settings.sampling_period or (1.0 if promise is None else promise.dt)
     log = PacketLog.load(settings.file, settings.ping_period, step)
-    dt = settings.sampling_period or (log.period if env is None else env.plant.dt)
-    contract = None if env is None else env.contract
-    oldest = None if env is None else _oldest(env)
-    asked = () if contract is None else (contract.max_age, contract.max_age + settings.least_safe_steps)
+    dt = settings.sampling_period or (log.period if promise is None else promise.dt)
+    contract = None if promise is None else promise.contract
+    oldest = None if promise is None else promise.oldest
+    asked = () if contract is None else (contract.max_age, contract.max_age + least)
     asked += () if oldest is None else (oldest,)
     found = _numbers(log, dt, asked)
     print(_text(log, found))
-    if env is not None:
-        print(wrapped(_compared(contract, found)))
+    if promise is not None:
+        print(wrapped(_compared(promise, found)))
     if oldest is not None:
         print(wrapped(silences_text(oldest, _row(found, oldest))))
-    if settings.least_safe_steps and contract is not None:
-        print(wrapped(_beyond(contract, settings.least_safe_steps, found)))
+    if least and contract is not None:
+        print(wrapped(_beyond(contract, least, found)))
     if settings.out is not None:
         write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
 
 
-def _oldest(env: NCSEnv) -> int | None:
-    """Returns until which age the certificate of the package keeps the box; None if there is none, or no contract."""
+def _promise(settings: ChannelSettings) -> _Promise | None:
+    if settings.certificate is not None and settings.plant is not None:
+        certificate, plant = Certificate.load(settings.certificate), LinearPlant.load(settings.plant)
+        silence = silence_of(certificate, plant)
+        return _Promise("certificate", plant.dt, certificate.contract, silence and silence.max_age + silence.anywhere)
+    if settings.env is None:
+        return None
+    env = registered_env(settings.env)
     certificate = certificate_of_package(env.plant, env.certificate_contract)
     silence = None if certificate is None else silence_of(certificate, env.plant)
-    return None if silence is None or env.contract is None else env.contract.max_age + silence.anywhere
+    oldest = None if silence is None or env.contract is None else env.contract.max_age + silence.anywhere
+    return _Promise("environment", env.plant.dt, env.contract, oldest)
 
 
 def _numbers(log: PacketLog, dt: float, asked: tuple[int, ...]) -> dict[str, Any]:
@@ -141,12 +164,14 @@ def _time(seconds: float) -> str:
     return f"{seconds:.4g} s" if seconds < 3600.0 else f"{seconds / 3600.0:,.4g} h"
 
 
-def _compared(contract: Any, found: dict[str, Any]) -> str:
+def _compared(promise: _Promise, found: dict[str, Any]) -> str:
+    contract = promise.contract
     if contract is None:
-        return "The environment's certificate needs no contract: it holds through any silence."
+        certificate = "certificate" if promise.whose == "certificate" else "environment's certificate"
+        return f"The {certificate} needs no contract: it holds through any silence."
     row = _row(found, contract.max_age)
     share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
-    said = f"The environment's contract, a newest sample of at most {in_steps(contract.max_age)}, was broken"
+    said = f"The {promise.whose}'s contract, a newest sample of at most {in_steps(contract.max_age)}, was broken"
     return f"{said} {how_often(row)}{share}."
 
 

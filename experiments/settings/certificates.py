@@ -278,10 +278,13 @@ class ChannelSettings:
     Attributes:
         file: A table with the named columns sent and received (sent_ms, ...), the output of ping or fping, a list of
             round trips, a log of `ncs loop`, or the JSON of irtt (docs/requirements.md).
-        sampling_period: Duration of a control step [s]; by default that of --env, or the time between packets.
+        sampling_period: Duration of a control step [s]; by default that of --env or --plant, or the time between
+            packets.
         ping_period: Time between packets whose file does not say when they were sent, as of ping without -D [s]; by
             default that of ping's summary, or 1.
         env: Id of an environment whose contract is compared with the record.
+        certificate: File of a certificate whose contract is compared with the record, in place of an environment's.
+        plant: File of the plant that it is for (`LinearPlant.save`).
         least_safe_steps: Steps that a shield of it in mode "lookahead" promises while the contract is kept: the command
             counts longer silences. Whether it promises them is to be seen in `info["shield_safe_steps"]`.
         out: File for the numbers (JSON).
@@ -291,13 +294,17 @@ class ChannelSettings:
     sampling_period: float | None = None
     ping_period: float | None = None
     env: str | None = None
+    certificate: Path | None = None
+    plant: Path | None = None
     least_safe_steps: int = 0
     out: Path | None = None
 
     def __post_init__(self) -> None:
         require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1))
-        if self.least_safe_steps and self.env is None:
-            raise ValueError("--least-safe-steps are those of a shield of --env: give both")
+        if (self.certificate is None) != (self.plant is None) or (self.env and self.plant):
+            raise ValueError("give --certificate and --plant, or --env, whose contract and certificate are known")
+        if self.least_safe_steps and self.env is None and self.plant is None:
+            raise ValueError("--least-safe-steps are those of a shield of --env, or of --certificate: give one")
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")

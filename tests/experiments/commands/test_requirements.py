@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import runpy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant
-from shields import Certificate, verify
+from shields import Certificate, certificate_for, verify
 from tests.command import ROOT, ncs
 
 
@@ -99,6 +100,23 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     assert numbers["kept"] <= numbers["replay"]
     assert "Read as a table: 'sent' in s, 'received' in s." in found.stdout
     assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
+
+
+def test_channel_compares_a_record_with_a_certificate_of_one_s_own_as_with_that_of_an_environment(tmp_path):
+    rng = np.random.default_rng(1)
+    lines = [f"{0.02 * i},{'' if rng.random() < 0.4 else 0.02 * i + 0.01}" for i in range(500)]
+    (tmp_path / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
+    env = gym.make("ncs_gym/CartPole-v0").unwrapped
+    env.plant.save(tmp_path / "plant.json")
+    certificate_for(env.plant, env.certificate_contract).save(tmp_path / "certificate.json")
+    own = ("--certificate", tmp_path / "certificate.json", "--plant", tmp_path / "plant.json")
+    texts = []
+    for given in (own, ("--env", "ncs_gym/CartPole-v0")):
+        found = ncs("channel", tmp_path / "packets.csv", *given, "--least-safe-steps", 3)
+        assert found.returncode == 0, found.stderr
+        texts.append(" ".join(found.stdout.split()))
+    assert texts[0].replace("The certificate's contract", "The environment's contract") == texts[1]
+    assert "The certificate's contract, a newest sample of at most 4 steps, was broken" in texts[0]
 
 
 def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_path):
