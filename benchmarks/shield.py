@@ -265,7 +265,7 @@ def exact(shield: SafetyFilter, estimate: np.ndarray, error_shape: np.ndarray, u
     if p[-1] >= 1.0:
         return False
     bounds = (p[-1] * (1.0 + 1e-9), 1.0)
-    best = minimize_scalar(lambda s: (c**2 * s / (s - p)).sum() + s, bounds=bounds, method="bounded")
+    best: Any = minimize_scalar(lambda s: (c**2 * s / (s - p)).sum() + s, bounds=bounds, method="bounded")
     return best.fun <= 1.0
 
 

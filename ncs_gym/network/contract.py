@@ -40,8 +40,9 @@ class ChannelContract:
 
     def follows_from(self, other: ChannelContract | None) -> bool:
         """Returns whether whatever keeps another contract keeps this one, too."""
-        is_older = other is None or other.max_age > self.max_age
-        return not is_older and other.quantization_step <= self.quantization_step
+        if other is None:
+            return False
+        return other.max_age <= self.max_age and other.quantization_step <= self.quantization_step
 
     def is_kept_by(self, channel: Channel) -> bool:
         """Returns whether a channel can never break this contract."""
