@@ -369,6 +369,9 @@ _SINCE = datetime(1970, 1, 1, tzinfo=UTC)
 _YEARS = 946_684_800, 4_102_444_800
 # Packets closer to each other are in another unit than seconds, as in the days of spreadsheets [s].
 _CLOSEST = 1e-4
+# A sender is regular if so many of the times between packets, and at least so many, differ by no more than this from
+# multiples of the usual one. Where more periods have no packet, it paused.
+_REGULAR_SHARE, _FEWEST, _IRREGULAR, _LONGEST_ABSENCE = 0.9, 20, 0.25, 100
 
 
 class _Column(NamedTuple):
@@ -414,9 +417,10 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
         used = {each.index for each in columns.values()}
         unused = {name: _plain(name) for index, name in enumerate(names) if index not in used}
         if moments := [name for name, plain in unused.items() if _SUFFIX.sub("", plain) in _MOMENTS]:
+            unit = "" if columns["delay"].unit else f", and {shown(columns['delay'].name)} by its unit, as in rtt_ms"
             raise ValueError(
                 f"the column {shown(moments[0])} may say when packets were sent or when they came back: name it sent_s "
-                f"or received_s, and {shown(columns['delay'].name)} by its unit, as in rtt_ms"
+                f"or received_s{unit}"
             )
         if not columns["delay"].unit:
             raise ValueError(f"the column {shown(names[columns['delay'].index])} has no unit: name it rtt_ms or rtt_s")
@@ -599,6 +603,11 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         before = len(moments)
         moments, delays = _with_missing(moments, delays, np.array(numbers)[order])
         missing = len(moments) - before
+    absent, usual = 0, _median_gap(moments)
+    if "number" not in columns:
+        before = len(moments)
+        moments, delays = _with_absent(moments, delays)
+        absent = len(moments) - before
     if guessed and abs(origin) < 10**8 and 0.0 < _median_gap(moments) < _CLOSEST:
         raise ValueError(
             f"its packets would be sent every {_median_gap(moments):.3g} s, if times were seconds: write the unit into "
@@ -617,6 +626,11 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         read_as += f" A {shown(until.name)} of 0 or -1 stands for a lost packet ({_many(len(marked), 'line')})."
     if missing:
         read_as += f" A number without a line stands for a lost packet ({_many(missing, 'number')})."
+    if absent:
+        read_as += (
+            f" {_many(absent, 'packet')} without a line, where one is usually sent every {1000.0 * usual:.4g} ms, "
+            "stand for lost ones."
+        )
     if unused:
         read_as += f" Not used: {', '.join(unused)}."
     return Record(moments, delays, read_as)
@@ -729,9 +743,30 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
     steps = np.diff(numbers)
     gaps = np.where(steps > 1, steps - 1, 0)
     require_packets(len(sent) + int(np.minimum(gaps, 10**9).sum()))
-    before = np.repeat(np.arange(len(gaps)), gaps)
-    place = np.arange(len(before)) - np.repeat(np.cumsum(gaps) - gaps, gaps) + 1
-    added = sent[before] + (sent[before + 1] - sent[before]) * place / (gaps[before] + 1)
+    return _with_lost(sent, delays, gaps)
+
+
+def _with_absent(sent: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the packets of a record without numbers with those that a regular sender sent and that have no line.
+
+    A receiver's log has lines of what it received alone. Nothing is added where times between packets are no multiples
+    of the usual one, nor to longer pauses, in which nothing was sent.
+    """
+    usual = _median_gap(sent)
+    periods = np.diff(sent) / usual if usual else np.zeros(len(sent) - 1)
+    whole = np.rint(periods)
+    if len(whole) < _FEWEST or np.mean(np.abs(periods - whole) <= _IRREGULAR) < _REGULAR_SHARE:
+        return sent, delays
+    missing = np.where((whole >= 2.0) & (whole <= _LONGEST_ABSENCE), whole - 1.0, 0.0).astype(np.int64)
+    require_packets(len(sent) + int(missing.sum()))
+    return _with_lost(sent, delays, missing)
+
+
+def _with_lost(sent: np.ndarray, delays: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the packets with so many lost ones after each but the last, evenly between their neighbors."""
+    before = np.repeat(np.arange(len(counts)), counts)
+    place = np.arange(len(before)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    added = sent[before] + (sent[before + 1] - sent[before]) * place / (counts[before] + 1)
     sent, delays = np.append(sent, added), np.append(delays, np.full(len(added), np.nan))
     order = np.argsort(sent, kind="stable")
     return sent[order], delays[order]

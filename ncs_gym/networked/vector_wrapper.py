@@ -7,6 +7,7 @@ from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
@@ -168,6 +169,8 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Sends the actions, steps the environments with those that act now, and sees what arrives."""
+        if not self._started:
+            raise ResetNeeded("call reset before the first step")
         rng, settings = self.np_random, self._settings
         actions = np.array(actions)
         restarted = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, np.bool_)

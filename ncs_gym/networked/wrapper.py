@@ -117,6 +117,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         on_request = settings.channels[0].on_request
         self._requests = Requests(settings.channels[0], None) if on_request else None
         self._snapshots, self._rng = Snapshots(), None
+        self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
         self._keys = [part.key for part in settings.parts] if settings.parts[0].key is not None else None
         self._sees_newest = self._keys is None and settings.fill == "last" and not settings.entries.names
@@ -175,6 +176,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Sends the action, steps the environment with the one that acts now, and sees what arrives."""
+        if self._network is None:
+            raise gym.error.ResetNeeded("call reset before the first step")
         rng, settings, step = self.np_random, self._settings, self._step
         applied, action_age = action, 0
         if self._actuator is not None:

@@ -109,8 +109,11 @@ def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
         A, B, C, D, *sampling = sys
         return A, B, C, D, sampling[0] if sampling else None
     model: Any = sys
-    if hasattr(model, "to_ss") and not hasattr(model, "A"):
-        model = model.to_ss()
+    if not hasattr(model, "A") and (hasattr(model, "to_ss") or hasattr(model, "num")):
+        raise ValueError(
+            f"{shown(sys)} is a transfer function, whose states would be nobody's: limits and names are of states, so "
+            "give a state-space model with states of yours"
+        )
     if not all(hasattr(model, name) for name in "ABCD"):
         raise ValueError(
             "sys must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "

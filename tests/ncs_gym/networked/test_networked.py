@@ -388,3 +388,9 @@ def test_what_is_no_action_is_refused_where_it_is_sent_and_nothing_moves(inner, 
     wrong = np.array([NEUTRAL[inner]] * 3) if action is None else [action, action]
     with pytest.raises(ValueError, match="is sent to the actuator, got"):
         many.step(wrong)
+
+
+def test_a_step_before_the_first_reset_says_what_is_needed():
+    for env in (Networked(gym.make("CartPole-v1")), VectorNetworked(gym.make_vec("CartPole-v1", num_envs=2))):
+        with pytest.raises(gym.error.ResetNeeded, match="call reset before the first step"):
+            env.step(env.action_space.sample())

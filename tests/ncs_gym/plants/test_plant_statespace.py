@@ -24,7 +24,6 @@ CONTINUOUS = {
     "python-control": control_model((A, B, C, D), 0),
     "python-control, dt None": control_model((A, B, C, D), None),
     "scipy": signal.StateSpace(A, B, C, D),
-    "scipy transfer function": signal.TransferFunction([1.0], [1.0, 3.0, 2.0]),
     "tuple": (A, B, C, D),
     "lists without D": [A.tolist(), B.tolist(), C.tolist(), None],
 }
@@ -41,11 +40,19 @@ def test_continuous_model_is_sampled_exactly(name):
     plant = LinearPlant.from_statespace(CONTINUOUS[name], dt=0.1, **REST)
     assert LinearPlant.from_statespace(CONTINUOUS[name], 0.1, **REST).fingerprint == plant.fingerprint
     assert plant.dt == 0.1
-    model = CONTINUOUS[name].to_ss() if name == "scipy transfer function" else SimpleNamespace(A=A, B=B, C=C)
+    model = SimpleNamespace(A=A, B=B, C=C)
     end = solve_ivp(lambda _, x: model.A @ x + model.B[:, 0] * 1.7, (0.0, 0.1), [0.4, -0.9], rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(plant.A @ [0.4, -0.9] + plant.B @ [1.7], end.y[:, -1], atol=1e-9)
     np.testing.assert_array_equal(plant.H, model.C)
     np.testing.assert_array_equal(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
+
+
+@pytest.mark.parametrize("kind", [signal.TransferFunction, lambda num, den: SimpleNamespace(num=num, den=den)])
+def test_transfer_functions_are_refused_since_limits_are_of_states(kind):
+    with pytest.raises(ValueError, match="is a transfer function, whose states would be nobody's"):
+        LinearPlant.from_statespace(kind([100.0], [1.0, 5.0, 0.0]), dt=0.02, **REST)
+    with pytest.raises(ValueError, match="is a transfer function"):
+        LinearPlant.from_statespace(signal.ZerosPolesGain([], [0.0, -5.0], 100.0), dt=0.02, **REST)
 
 
 @pytest.mark.parametrize("name", DISCRETE)
