@@ -92,7 +92,7 @@ def how_often(row: dict[str, Any]) -> str:
         return f"at no time; a record of this length excludes more than {high} times per hour"
     times = "once" if row["times"] == 1 else f"{row['times']:,} times"
     halves = " and ".join(map(rate_text, row["halves"]))
-    return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}], {halves} in its halves"
+    return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}] (by halves {halves})"
 
 
 def silences_text(oldest: int, row: dict[str, Any], contract: str = "the contract") -> str:

@@ -345,8 +345,8 @@ class LinearPlant(ReadOnlyArrays):
         """Returns the plant of a state-space model; its C becomes H.
 
         Args:
-            sys: A state-space model of python-control or scipy.signal, or a tuple (A, B, C, D) in continuous or (A, B, C, D, dt)
-                in discrete time. A model in continuous time is sampled exactly, by zero-order hold.
+            sys: A state-space model of python-control or scipy.signal, or a tuple (A, B, C, D) in continuous or
+                (A, B, C, D, dt) in discrete time. A model in continuous time is sampled exactly, by zero-order hold.
             dt: Duration of a step [s], needed unless the model has one.
             input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
                 estimator knows; box, bounds and names are given for the model's own states.
