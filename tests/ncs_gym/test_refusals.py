@@ -445,7 +445,7 @@ PLANTS = [
         ({"sys": (A[:1], B, C, D), "dt": 0.1}, r"A of the model must have shape \(1, 1\), got \(1, 2\)"),
         ({"sys": (A, B), "dt": 0.1}, r"sys must be a state-space model of python-control \(control.ss"),
         ({"sys": "plant", "dt": 0.1}, "sys must be a state-space model"),
-        ({"sys": SimpleNamespace(num=[1.0]), "dt": 0.1}, "sys must be a state-space model"),
+        ({"sys": SimpleNamespace(num=[1.0]), "dt": 0.1}, "is a transfer function"),
         ({"sys": (*MODEL, 0.1), "between_samples": 8}, "needs a plant that was sampled from a model in continuous"),
     ),
     *changed(
