@@ -431,10 +431,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     @own_error_state
     def estimates_ahead(self) -> list[tuple[np.ndarray, int]]:
         """Returns estimate and number of the error shape of now and of every step until the next decision's effect."""
-        return [
-            self._estimator.numbered(self._committed.pending[:ahead])
-            for ahead in range(len(self._committed.pending) + 1)
-        ]
+        pending = self._committed.pending
+        return [self._estimator.numbered(pending[:ahead]) for ahead in range(len(pending) + 1)]
 
     def close(self) -> None:
         """Closes the window and the process."""

@@ -325,24 +325,7 @@ _ROLES = {
     "lost": "lost dropped",
 }
 # Columns of these names say when something happened, but not what.
-_MOMENTS = frozenset(
-    (
-        "time",
-        "t",
-        "timestamp",
-        "stamp",
-        "ts",
-        "date",
-        "datetime",
-        "clock",
-        "moment",
-        "when",
-        "epoch",
-        "unix",
-        "unix_time",
-        "at",
-    )
-)
+_MOMENTS = {"time", "t", "ts", "timestamp", "time_stamp", "stamp", "date", "datetime", "epoch", "unix_time", "clock"}
 _ROLE_OF = {name: role for role, names in _ROLES.items() for name in names.split()}
 # Units in the names of columns [s].
 _UNITS = {
@@ -389,7 +372,7 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     rest = lines[number + 1 :]
     if "#" in line and (found := next(((n, each) for n, each in enumerate(lines) if _is_data(each)), None)):
         # Of lines of comment in front of the numbers the last one may have the names, if no line of names follows.
-        has_names = not re.match(r"[\s\d.+-]", found[1])
+        has_names = not re.match(r"[\d.+-]", found[1].lstrip())
         number = found[0] if has_names else next((n for n in reversed(range(found[0])) if lines[n].strip()), number)
         line, rest = lines[number], lines[number + 1 :]
     line = line.strip().lstrip("#").strip()
@@ -750,7 +733,8 @@ def _with_absent(sent: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, np.n
     """Returns the packets of a record without numbers with those that a regular sender sent and that have no line.
 
     A receiver's log has lines of what it received alone. Nothing is added where times between packets are no multiples
-    of the usual one, nor to longer pauses, in which nothing was sent.
+    of the usual one, nor to longer pauses, in which nothing was sent, nor where more would be added than there are, as
+    between bursts.
     """
     usual = _median_gap(sent)
     periods = np.diff(sent) / usual if usual else np.zeros(len(sent) - 1)
@@ -758,6 +742,8 @@ def _with_absent(sent: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, np.n
     if len(whole) < _FEWEST or np.mean(np.abs(periods - whole) <= _IRREGULAR) < _REGULAR_SHARE:
         return sent, delays
     missing = np.where((whole >= 2.0) & (whole <= _LONGEST_ABSENCE), whole - 1.0, 0.0).astype(np.int64)
+    if missing.sum() > len(sent):
+        return sent, delays
     require_packets(len(sent) + int(missing.sum()))
     return _with_lost(sent, delays, missing)
 

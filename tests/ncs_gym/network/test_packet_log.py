@@ -235,9 +235,10 @@ def test_packets_without_a_line_of_a_regular_sender_are_lost_ones(tmp_path):
     assert [int(np.isnan(log.delays).sum()) for log in logs] == [missing, missing]
 
 
-def test_nothing_is_added_where_packets_are_sent_at_any_time(tmp_path):
+@pytest.mark.parametrize("gaps", ["at any time", "in bursts"])
+def test_nothing_is_added_where_the_sender_is_not_regular(gaps, tmp_path):
     rng = np.random.default_rng(1)
-    sent = np.cumsum(rng.exponential(0.02, 500))
+    sent = np.cumsum(rng.exponential(0.02, 500) if gaps == "at any time" else np.tile([0.02, 0.001, 0.001], 200)[:500])
     file = tmp_path / "events.csv"
     file.write_text("sent,received\n" + "\n".join(f"{each:.6f},{each + 0.01:.6f}" for each in sent))
     assert len(PacketLog.load(file).sent) == 500
