@@ -1,61 +1,32 @@
 """Makes commands of functions, and prints tables: `python -m benchmarks.MODULE COMMAND --help` says what each does.
 
-A command is a function with a docstring whose parameters are its options: `--seconds 2` for `seconds: float = 1.0`,
-`--brief` for `brief: bool = False`, several values for a `Sequence`, and values without a name for `*names: str`. What
-an `Annotated` type carries are the values allowed.
+A command is a function with a docstring whose parameters are its options, as `ncs` has them (tyro).
 """
 
 from __future__ import annotations
 
-import argparse
-import inspect
 import warnings
 from collections.abc import Callable, Sequence
-from types import NoneType
-from typing import Annotated, Any, get_args, get_origin
+from typing import Any
+
+import tyro
 
 
-def parser_of(doc: str | None, commands: Sequence[Callable[..., None]]) -> argparse.ArgumentParser:
-    """Returns the parser of a module's commands."""
-    shown: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
-    parser = argparse.ArgumentParser(description=doc, **shown)
-    chosen = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in commands:
-        text = inspect.getdoc(command) or ""
-        brief = text.partition("\n")[0].replace("%", "%%")
-        own = chosen.add_parser(command.__name__.replace("_", "-"), help=brief, description=text, **shown)
-        own.set_defaults(command=command)
-        for each in inspect.signature(command, eval_str=True).parameters.values():
-            if each.kind is each.VAR_POSITIONAL:
-                own.add_argument(each.name, nargs="*", type=each.annotation)
-            else:
-                own.add_argument(f"--{each.name.replace('_', '-')}", default=each.default, **_kind_of(each.annotation))
-    return parser
+def run(doc: str | None, commands: Sequence[Callable[..., Any]], args: Sequence[str] | None = None) -> Any:
+    """Runs the command that is asked for, of the command line by default, without warnings; returns what it returns."""
+    by_name = {command.__name__.replace("_", "-"): command for command in commands}
+    with warnings.catch_warnings(action="ignore"):
+        return tyro.extras.subcommand_cli_from_dict(by_name, description=doc, args=args)
 
 
-def _kind_of(annotation: Any) -> dict[str, Any]:
-    """Returns how an option of a type is parsed."""
-    choices = None
-    if get_origin(annotation) is Annotated:
-        annotation, choices = get_args(annotation)
-    if annotation is bool:
-        return {"action": "store_true"}
-    if NoneType in get_args(annotation):
-        annotation = get_args(annotation)[0]
-    more = {"choices": choices, "metavar": "NAME", "help": ", ".join(choices)} if choices else {}
-    if get_origin(annotation) is Sequence:
-        return {"nargs": "+", "type": get_args(annotation)[0]} | more
-    return {"type": annotation} | more
+def one_of(names: Sequence[str]) -> Any:
+    """Returns what an option is annotated with that takes one of some names."""
+    return tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(names))
 
 
-def run(doc: str | None, commands: Sequence[Callable[..., None]]) -> None:
-    """Runs the command that is asked for, without warnings."""
-    given = vars(parser_of(doc, commands).parse_args())
-    command = given.pop("command")
-    parameters = inspect.signature(command).parameters.values()
-    positional = [value for each in parameters if each.kind is each.VAR_POSITIONAL for value in given.pop(each.name)]
-    warnings.simplefilter("ignore")
-    command(*positional, **given)
+def some_of(names: Sequence[str]) -> Any:
+    """Returns what an option is annotated with that takes some of some names."""
+    return tyro.conf.arg(constructor=tuple[tyro.extras.literal_type_from_choices(names), ...])  # type: ignore[misc]
 
 
 def table(*titles: str, first: int = 28, width: int = 9) -> Callable[..., None]:

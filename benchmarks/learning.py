@@ -39,7 +39,7 @@ from agents import (
 from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
-from benchmarks.commands import run, table
+from benchmarks.commands import run, some_of, table
 from benchmarks.timing import timed
 from experiments.analysis.statistics import mean_interval
 from experiments.baselines import RegulatorWeights, controller
@@ -441,7 +441,7 @@ TRAINING_STEPS = 60_000
 
 def tune_arms(
     env: Sequence[str] = NETWORK_ENVS,
-    arms: Annotated[Sequence[str], (*TRAINED_ARMS, *REGULATED_ARMS)] = (*TRAINED_ARMS, *REGULATED_ARMS),
+    arms: Annotated[Sequence[str], some_of((*TRAINED_ARMS, *REGULATED_ARMS))] = (*TRAINED_ARMS, *REGULATED_ARMS),
     episodes: int = 24,
     out: Path = Path("runs/tuned_arms.jsonl"),
     write: bool = False,

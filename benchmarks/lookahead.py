@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.optimize import linprog
 
-from benchmarks.commands import run, table
+from benchmarks.commands import one_of, run, table
 from benchmarks.timing import microseconds
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.envs.env import ncs_env
@@ -28,7 +28,7 @@ CASES = {
     "ellipsoid": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("BatchReactor", 6)),
     "polytope": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 6), ("BatchReactor", 6)),
 }
-SafeSet = Annotated[str, tuple(CASES)]
+SafeSet = Annotated[str, one_of(tuple(CASES))]
 # Environments side by side, steps before those that are timed, environments of every step whose decisions are timed one
 # by one, and situations that are given to cvxpy.
 ENVS, WARM, ALONE, CVXPY = 64, 50, 4, 60

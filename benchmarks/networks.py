@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import SB3VecEnv
 from agents.evaluation import Policy
-from benchmarks.commands import run, table
+from benchmarks.commands import run, some_of, table
 from benchmarks.timing import timed
 from experiments.baselines import EstimateFilterSettings, tuned_weights
 from experiments.baselines.controllers import REGULATORS, controller
@@ -391,8 +391,8 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
 def recorded(
     hours: float = 1.0,
     envs: int = 64,
-    ids: Annotated[Sequence[str], tuple(ASKED)] = tuple(ASKED),
-    filters: Annotated[Sequence[str], FILTERS] = FILTERS,
+    ids: Annotated[Sequence[str], some_of(tuple(ASKED))] = tuple(ASKED),
+    filters: Annotated[Sequence[str], some_of(FILTERS)] = FILTERS,
     out: Path | None = None,
 ) -> None:
     """Loops over networks as records have them: how often the box is left behind filters, and what is claimed then.

@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from benchmarks.commands import run, table
+from benchmarks.commands import run, some_of, table
 from benchmarks.random_plants import random_plant
 from benchmarks.timing import Steps, microseconds, resident, timed
 from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
@@ -156,8 +156,8 @@ MODES = ("project", "switch", "boundary", "lookahead", "monitor")
 
 def loop(
     steps: int = 100_000,
-    plants: Annotated[Sequence[str], tuple(PLANTS)] = tuple(PLANTS),
-    modes: Annotated[Sequence[str], MODES] = MODES,
+    plants: Annotated[Sequence[str], some_of(tuple(PLANTS))] = tuple(PLANTS),
+    modes: Annotated[Sequence[str], some_of(MODES)] = MODES,
 ) -> None:
     """How long a step of a controller node takes, by mode: decode what arrived, receive, decide, encode what is sent.
 

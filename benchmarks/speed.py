@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+import tyro
 from filterpy.kalman import KalmanFilter
 from gymnasium.spaces import Box, Discrete
 from gymnasium.wrappers import DelayObservation
@@ -93,7 +94,7 @@ print(*(f"{1e3 * (later - earlier):.0f}" for earlier, later in zip(times, times[
 """
 
 
-def first_shield(*ids: str) -> None:
+def first_shield(ids: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
     """Processor time until the first shield of each registered environment is made, in a process of its own.
 
     Imports are not counted: `imports` has them.
@@ -371,7 +372,7 @@ def rendering() -> None:
         show(env_id, f"{1e3 * step:.2f}", f"{1e3 * picture:.2f}", f"{1.0 / (step + picture):.0f}")
 
 
-def examples(*names: str) -> None:
+def examples(names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
     """How long every example takes as it is, beside what it says; each in a process of its own, one after the other.
 
     Processor time and time on the clock differ where more threads compute than are needed, or where something waits.

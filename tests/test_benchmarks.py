@@ -1,12 +1,13 @@
 """The commands of `benchmarks/` are those that pages, Makefile, CI and docstrings name."""
 
 import re
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from benchmarks.commands import parser_of
+from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = [path.stem for path in sorted((ROOT / "benchmarks").glob("*.py")) if "COMMANDS = " in path.read_text()]
@@ -21,6 +22,15 @@ def commands_of(name):
     return import_module(f"benchmarks.{name}").COMMANDS
 
 
+def asked_for(module, given):
+    """The name of the command that a line asks for, whose options are parsed; nothing is measured."""
+
+    def named(command):
+        return wraps(command)(lambda *names, **options: command.__name__)
+
+    return run(None, [named(each) for each in commands_of(module)], given.split())
+
+
 def test_commands_are_named():
     assert len(NAMED) > 40
     assert {module for _, module, _ in NAMED} == set(NAMES)
@@ -28,7 +38,7 @@ def test_commands_are_named():
 
 @pytest.mark.parametrize(("page", "module", "given"), NAMED)
 def test_command_that_is_named_somewhere_exists_with_its_options(page, module, given):
-    parser_of(None, commands_of(module)).parse_args(given.split())
+    assert asked_for(module, given).replace("_", "-") == given.split()[0]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -37,4 +47,13 @@ def test_docstring_of_a_module_names_its_commands_which_start_without_options(na
     commands = [each.__name__.replace("_", "-") for each in commands_of(name)]
     assert f"`python -m benchmarks.{name} COMMAND`. Commands: {', '.join(commands)}." in text
     for each in commands:
-        assert parser_of(None, commands_of(name)).parse_args([each]).command in commands_of(name)
+        assert asked_for(name, each).replace("_", "-") == each
+
+
+def test_values_without_a_name_are_taken_and_unknown_ones_refused(capsys):
+    assert asked_for("speed", "first-shield ncs_gym/CartPole-v0 ncs_gym/CSTR-v0") == "first_shield"
+    for module, given in (("shield", "cost --modes nope"), ("speed", "nonsense"), ("silence", "back --idss Pendulum")):
+        with pytest.raises(SystemExit) as ended:
+            asked_for(module, given)
+        assert ended.value.code == 2
+    assert "nope" in capsys.readouterr().err
