@@ -21,7 +21,12 @@ def size_of(recorded: dict[str, Any]) -> str:
     other = _text(
         recorded.get("share_with_gain_of_ellipsoid"), " ({:.3g} % with the gain of the largest ellipsoid)", 100.0
     )
-    polytope = "{:.3g} % of the safe box's volume" + other + "; the ellipsoid "
+    past = _text(
+        recorded.get("share_of_last_input"),
+        " where past inputs are the operating one, while in the set the last input has {:.3g} % of its range",
+        100.0,
+    )
+    polytope = "{:.3g} % of the safe box's volume" + past + other + "; the ellipsoid "
     of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
     at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
     shares = (

@@ -40,10 +40,11 @@ class _Promise(NamedTuple):
 def channel(settings: ChannelSettings) -> None:
     """Runs `ncs channel`."""
     require_place(settings.out)
-    promise, least = _promise(settings), settings.least_safe_steps
-    step = settings.sampling_period or (1.0 if promise is None else promise.dt)
-    log = PacketLog.load(settings.file, settings.ping_period, step)
-    dt = settings.sampling_period or (log.period if promise is None else promise.dt)
+    plant = None if settings.plant is None else LinearPlant.load(settings.plant)
+    promise, least = _promise(settings, plant), settings.least_safe_steps
+    known = settings.sampling_period or (plant.dt if plant is not None else promise.dt if promise is not None else None)
+    log = PacketLog.load(settings.file, settings.ping_period, known or 1.0)
+    dt = known or log.period
     contract = None if promise is None else promise.contract
     oldest = None if promise is None else promise.oldest
     asked = () if contract is None else (contract.max_age, contract.max_age + least)
@@ -60,9 +61,9 @@ def channel(settings: ChannelSettings) -> None:
         write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
 
 
-def _promise(settings: ChannelSettings) -> _Promise | None:
-    if settings.certificate is not None and settings.plant is not None:
-        certificate, plant = Certificate.load(settings.certificate), LinearPlant.load(settings.plant)
+def _promise(settings: ChannelSettings, plant: LinearPlant | None) -> _Promise | None:
+    if settings.certificate is not None and plant is not None:
+        certificate = Certificate.load(settings.certificate)
         silence = silence_of(certificate, plant)
         return _Promise("certificate", plant.dt, certificate.contract, silence and silence.max_age + silence.anywhere)
     if settings.env is None:

@@ -83,6 +83,7 @@ def requirements(settings: RequirementsSettings) -> None:
         cheapest = found.cheapest(settings.keep / 100.0)
         summary = found.document | {
             "command": "requirements",
+            "log": None if log is None else log.read_as,
             "plant_fingerprint": plant.fingerprint,
             "today": None if today is None else _index_of(found, today),
             "cheapest": None if cheapest is None else found.points.index(cheapest),
@@ -348,7 +349,9 @@ def _boundary_text(largest: LargestAge) -> str:
 
 
 def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant: LinearPlant) -> Iterator[str]:
-    """Yields how often a record would have broken the contract of today, and the widest ones that are certified."""
+    """Yields how a record was read, and how often it would have broken the contract of today and the widest ones."""
+    yield log.read_as
+    yield log.disagreement
     asked = [("The widest contract with a certificate", each.network, each.certified) for each in found.largest_ages]
     if today is not None and today.contract is not None:
         asked.insert(0, ("Today's contract", today, today.contract.max_age))

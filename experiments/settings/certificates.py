@@ -284,7 +284,7 @@ class ChannelSettings:
             default that of ping's summary, or 1.
         env: Id of an environment whose contract is compared with the record.
         certificate: File of a certificate whose contract is compared with the record, in place of an environment's.
-        plant: File of the plant that it is for (`LinearPlant.save`).
+        plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
         least_safe_steps: Steps that a shield of it in mode "lookahead" promises while the contract is kept: the command
             counts longer silences. Whether it promises them is to be seen in `info["shield_safe_steps"]`.
         out: File for the numbers (JSON).
@@ -301,9 +301,9 @@ class ChannelSettings:
 
     def __post_init__(self) -> None:
         require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1))
-        if (self.certificate is None) != (self.plant is None) or (self.env and self.plant):
+        if (self.certificate and not self.plant) or (self.env and self.plant):
             raise ValueError("give --certificate and --plant, or --env, whose contract and certificate are known")
-        if self.least_safe_steps and self.env is None and self.plant is None:
+        if self.least_safe_steps and self.env is None and self.certificate is None:
             raise ValueError("--least-safe-steps are those of a shield of --env, or of --certificate: give one")
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):

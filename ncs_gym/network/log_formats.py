@@ -322,7 +322,8 @@ _ROLES = {
     "delay": "delay latency rtt owd one_way_delay round_trip round_trip_time roundtrip roundtrip_time",
     "number": "seq seqno seq_no sequence sequence_number sequence_no number packet packet_number packet_id icmp_seq",
     "episode": "episode",
-    "lost": "lost dropped",
+    "lost": "lost dropped drop loss is_lost was_lost lost_flag packet_lost packet_loss timeout timed_out missing",
+    "kept": "ok success successful delivered acked ack answered",
 }
 # Columns of these names say when something happened, but not what.
 _MOMENTS = {"time", "t", "ts", "timestamp", "time_stamp", "stamp", "date", "datetime", "epoch", "unix_time", "clock"}
@@ -347,6 +348,12 @@ _LARGEST_COUNT = 2**53
 _LARGEST = Decimal(10) ** 305
 _LOST = {"", "na", "n/a", "nan", "none", "null", "-", "--", "*", "lost", "timeout"}
 _YES, _NO = {"1", "1.0", "true", "yes", "y"}, {"0", "0.0", "false", "no", "n", ""}
+# Words of the names of columns, and cells, that may tell of lost packets where nobody knows how.
+_OF_LOSS = re.compile(
+    r"(?:^|_)(?:lost|loss|losses|drop|drops|dropped|miss|missed|missing|timeout|ok|status|success|fail|failed|failure|error|ack|"
+    r"acked|delivered|arrived|received)(?:_|$)"
+)
+_SAYS_LOST = {"lost", "loss", "dropped", "drop", "timeout", "timed out", "missing", "missed", "fail", "failed"}
 _SINCE = datetime(1970, 1, 1, tzinfo=UTC)
 # The years 2000 and 2100 [s since 1970].
 _YEARS = 946_684_800, 4_102_444_800
@@ -379,27 +386,40 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     separator = next((each for each in ",;\t|" if each in line), " ")
     if separator == " ":
         line = re.sub(r"\s+(?=[(\[])", "", line)  # a unit in brackets belongs to the name before it
-    names = next(_rows([line], separator, 1, with_empty=True))[1]
+    names = next((cells for _, cells in _rows([line], separator, 1, with_empty=True)), [])
     if all(_is_number(name) for name in names):
         if len(names) == 1:
-            return _of_list(_with_decimals(_rows(lines, separator, 1, with_empty=True), [0]), period)
+            _require_decimals(_rows(lines, separator, 1, with_empty=True), [0])
+            return _of_list(_rows(lines, separator, 1, with_empty=True), period)
         raise ValueError(
             "its columns have no names, and neither their order nor their unit can be guessed safely: write them into "
             "the first line, as in sent_ms,received_ms"
         )
     columns = _columns(names)
     first = len(lines) - len(rest) + 1
-    is_list = set(columns) - {"lost"} == {"delay"}
-    rows = _rows(rest, separator, first, len(names), with_empty=is_list)
-    rows = _with_decimals(rows, [each.index for role, each in columns.items() if role in ("sent", "received", "delay")])
+    is_list = set(columns) - {"lost", "kept"} == {"delay"}
+
+    def rows() -> Iterator[tuple[int, list[str]]]:
+        return _rows(rest, separator, first, len(names), with_empty=is_list)
+
+    cells = _different_cells(rows(), len(names))
+    if (
+        {"received", "delay"} <= columns.keys()
+        and "kept" not in columns
+        and _are_flags(cells[columns["received"].index])
+    ):
+        columns["kept"] = columns.pop("received")
+    used = {each.index for each in columns.values()}
+    unused = {index: name for index, name in enumerate(names) if index not in used}
+    _require_decimals(rows(), [each.index for role, each in columns.items() if role in ("sent", "received", "delay")])
     if {"episode", "sent", "received"} <= columns.keys():
-        return _of_steps(rows, columns, step)
+        return _of_steps(rows(), columns, step)
+    for index, name in unused.items() if "delay" in columns or {"sent", "received"} <= columns.keys() else ():
+        _require_no_loss(name, cells[index])
     if "sent" in columns and ("received" in columns or "delay" in columns):
-        return _of_times(rows, columns, names)
-    if set(columns) - {"number", "lost"} == {"delay"}:
-        used = {each.index for each in columns.values()}
-        unused = {name: _plain(name) for index, name in enumerate(names) if index not in used}
-        if moments := [name for name, plain in unused.items() if _SUFFIX.sub("", plain) in _MOMENTS]:
+        return _of_times(rows(), columns, names)
+    if set(columns) - {"number", "lost", "kept"} == {"delay"}:
+        if moments := [name for name in unused.values() if _SUFFIX.sub("", _plain(name)) in _MOMENTS]:
             unit = "" if columns["delay"].unit else f", and {shown(columns['delay'].name)} by its unit, as in rtt_ms"
             raise ValueError(
                 f"the column {shown(moments[0])} may say when packets were sent or when they came back: name it sent_s "
@@ -407,8 +427,8 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
             )
         if not columns["delay"].unit:
             raise ValueError(f"the column {shown(names[columns['delay'].index])} has no unit: name it rtt_ms or rtt_s")
-        found = _of_list(rows, period, columns)
-        more = f" Not used: {', '.join(map(shown, unused))}." if unused else ""
+        found = _of_list(rows(), period, columns)
+        more = f" Not used: {', '.join(map(shown, unused.values()))}." if unused else ""
         return found._replace(read_as=found.read_as + more)
     raise ValueError(
         f"it has the columns {shown(names)[1:-1]}; a log needs sent and received, or sent and delay, or one "
@@ -448,8 +468,32 @@ _GROUPS = re.compile(r"[+-]?[1-9]\d{0,2}(?:([.,])\d{3})?")
 _NO_GROUPS = re.compile(r"[+-]?(?:\d+([.,])\d+|\d{4,})")
 
 
-def _with_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]) -> Iterator[tuple[int, list[str]]]:
-    """Yields the rows, and raises ValueError after the last one if commas or points may separate thousands.
+def _different_cells(rows: Iterator[tuple[int, list[str]]], width: int) -> list[set[str]]:
+    """Returns the different cells of each column in small letters: some of them, and every one that says a loss."""
+    found: list[set[str]] = [set() for _ in range(width)]
+    for _, cells in rows:
+        for column, cell in zip(found, cells, strict=False):
+            if len(column) <= len(_YES | _NO) or cell.lower() in _SAYS_LOST:
+                column.add(cell.lower())
+    return found
+
+
+def _are_flags(cells: set[str]) -> bool:
+    """Returns whether different cells of a column are flags, some yes and some no."""
+    return cells <= _YES | _NO and not cells.isdisjoint(_YES) and not cells.isdisjoint(_NO)
+
+
+def _require_no_loss(name: str, cells: set[str]) -> None:
+    """Raises ValueError if a column that is not understood may say which packets were lost."""
+    if len(cells) > 1 and (_OF_LOSS.search(_plain(name)) or not cells.isdisjoint(_SAYS_LOST) or _are_flags(cells)):
+        raise ValueError(
+            f"the column {shown(name)} may say which packets were lost: name it lost if 1 stands for a lost one, ok if "
+            "0 does, or leave it out"
+        )
+
+
+def _require_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]) -> None:
+    """Raises ValueError if commas or points may separate thousands.
 
     All commas may, and points in a column whose numbers below 1000 have none, unless larger ones have none, either.
     """
@@ -457,7 +501,7 @@ def _with_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]
     decimal, small, large = set[str](), set[int](), set[int]()
     for line, cells in rows:
         for index in indices:
-            if index >= len(cells) or ("." in decimal and "," not in cells[index]):
+            if index >= len(cells) or cells[index] == "-1" or ("." in decimal and "," not in cells[index]):
                 continue
             if found := _GROUPS.fullmatch(cells[index]):
                 if found[1]:
@@ -466,7 +510,6 @@ def _with_decimals(rows: Iterator[tuple[int, list[str]]], indices: Sequence[int]
                     small.add(index)
             elif found := _NO_GROUPS.fullmatch(cells[index]):
                 decimal.add(found[1]) if found[1] else large.add(index)
-        yield line, cells
     for (index, separator), (line, cell) in doubtful.items():
         if separator not in decimal and (separator == "," or index in small - large):
             name, way = ("comma", "decimal points") if separator == "," else ("point", "numbers without those")
@@ -540,13 +583,14 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
             start, end = _number(cells[sent_at.index]), _number(cells[until.index])
             if "number" in columns:
                 numbers.append(_count(cells[columns["number"].index]))
-            if "lost" in columns:
-                flagged.append(_flag(cells[columns["lost"].index]))
         except ValueError:
             _refuse_line(line, by)
+        flagged.append(_says_lost(line, cells, columns))
         if start is None:
             _refuse_line(line, by)
         if not sent:
+            if by == "delay":
+                _require_units(sent_at, until, start)
             unit, until_unit = _units(sent_at, until, by, start)
             scale, until_scale = _UNITS[unit], _UNITS[until_unit]
             origin = start * scale
@@ -573,21 +617,18 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
     marked += at_zero if marked else []
     delays[marked] = np.nan
     _require_order(moments, np.where(np.isnan(delays), np.nan, arrived), places)
-    if flagged:
-        delays[flagged] = np.nan
+    delays[flagged] = np.nan
     if (delays < 0.0).any():
         raise ValueError(f"line {places[int(np.argmax(delays < 0.0))]}: {_BEFORE}")
     order = np.argsort(moments, kind="stable")
     moments, delays = moments[order], delays[order]
     _require_receiver(moments, delays, np.array(places)[order])
     guessed = not sent_at.unit and unit == "s" and not until.unit
-    missing = 0
+    delay_is_guessed = not until.unit and (by == "delay" or guessed)
+    missing, absent, usual = 0, 0, _median_gap(moments)
     if "number" in columns:
-        before = len(moments)
-        moments, delays = _with_missing(moments, delays, np.array(numbers)[order])
-        missing = len(moments) - before
-    absent, usual = 0, _median_gap(moments)
-    if "number" not in columns:
+        moments, delays, missing = _with_missing(moments, delays, np.array(numbers)[order])
+    else:
         before = len(moments)
         moments, delays = _with_absent(moments, delays)
         absent = len(moments) - before
@@ -596,7 +637,7 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
             f"its packets would be sent every {_median_gap(moments):.3g} s, if times were seconds: write the unit into "
             "the names of the columns (sent_ms), and the days of a spreadsheet as seconds"
         )
-    if guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0:
+    if delay_is_guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0:
         raise ValueError(
             "the names of the columns say no unit, and most packets would take more than a second: name it, as in "
             "sent_ms and received_ms, or sent_s and received_s"
@@ -617,6 +658,23 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
     if unused:
         read_as += f" Not used: {', '.join(unused)}."
     return Record(moments, delays, read_as)
+
+
+def _require_units(sent: _Column, delay: _Column, first: Decimal) -> None:
+    """Raises ValueError if one of two columns, a time and a delay, has a unit from which nothing follows for the other.
+
+    Times since 1970 in seconds, as those of a calendar, need no unit.
+    """
+    of_sent = sent.unit or next((unit for above, unit in reversed(_EPOCHS) if abs(first) >= above), "")
+    no_unit = delay if of_sent not in ("", "s") and not delay.unit else None
+    if delay.unit and not of_sent and abs(first) < 10**8:
+        no_unit = sent
+    if no_unit is not None:
+        other, unit = (sent, of_sent) if no_unit is delay else (delay, delay.unit)
+        name = _plain(no_unit.name)
+        raise ValueError(
+            f"{shown(other.name)} is in {unit} and {shown(no_unit.name)} has no unit: name it {name}_{unit} or {name}_s"
+        )
 
 
 def _units(sent: _Column, until: _Column, by: str, first: Decimal) -> tuple[str, str]:
@@ -694,12 +752,16 @@ def _count(cell: str) -> int:
     return value
 
 
-def _flag(cell: str) -> bool:
-    if cell.lower() in _YES:
-        return True
-    if cell.lower() in _NO:
-        return False
-    raise ValueError("not a flag")
+def _says_lost(line: int, cells: list[str], columns: dict[str, _Column]) -> bool:
+    """Returns whether a row has the mark of a lost packet, or not that of one that arrived."""
+    marks = {}
+    for role in {"lost", "kept"} & columns.keys():
+        index, name = columns[role][:2]
+        cell = cells[index].lower() if index < len(cells) else ""
+        if cell not in _YES | _NO:
+            raise ValueError(f"line {line}: {shown(name)} has to be 0 or 1, yes or no, got {shown(cell)}")
+        marks[role] = cell in _YES
+    return marks.get("lost", False) or not marks.get("kept", True)
 
 
 def _refuse_line(number: int, by: str) -> NoReturn:
@@ -707,10 +769,11 @@ def _refuse_line(number: int, by: str) -> NoReturn:
     raise ValueError(f"line {number} is not a time sent and {second}")
 
 
-def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Returns the packets with those whose numbers are missing, evenly between their neighbors, and without duplicates.
 
-    What comes twice arrived when it came first. Numbers that go back begin anew, and nothing is missing there.
+    The last value is how many were missing. What comes twice arrived when it came first. Numbers that go back begin
+    anew, and nothing is missing there.
     """
     order = np.lexsort((np.where(np.isnan(delays), np.inf, delays), numbers, sent))
     sent, delays, numbers = sent[order], delays[order], numbers[order]
@@ -726,7 +789,7 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
     steps = np.diff(numbers)
     gaps = np.where(steps > 1, steps - 1, 0)
     require_packets(len(sent) + int(np.minimum(gaps, 10**9).sum()))
-    return _with_lost(sent, delays, gaps)
+    return *_with_lost(sent, delays, gaps), int(gaps.sum())
 
 
 def _with_absent(sent: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -795,9 +858,9 @@ def _of_list(
             value = _number(cells[column.index] if column.index < len(cells) else "")
             if "number" in known:
                 numbers.append(_count(cells[known["number"].index]))
-            lost = not cells or ("lost" in known and _flag(cells[known["lost"].index]))
         except (ValueError, IndexError):
             raise ValueError(f"line {line} is not a delay") from None
+        lost = not cells or _says_lost(line, cells, known)
         marked += not cells or value in _MARKS
         delays.append(np.nan if value is None or value in _MARKS or lost else float(value * _UNITS[column.unit]))
     if len(delays) < 2:
@@ -811,7 +874,7 @@ def _of_list(
     if numbers:
         if (np.diff(numbers) <= 0).any():
             raise ValueError("the numbers of its packets do not ascend")
-        sent, arrived = _with_missing(every * (np.array(numbers) - numbers[0]), arrived, np.array(numbers))
+        sent, arrived, _ = _with_missing(every * (np.array(numbers) - numbers[0]), arrived, np.array(numbers))
     name = "one number per line" if columns is None else shown(column.name)
     read_as = f"Read as a list of delays: {name}, in {column.unit}, packets sent every {1000.0 * every:.4g} ms"
     read_as += " (the file does not say)." if period is None else "."

@@ -128,15 +128,18 @@ class SafetyFilter(ReadOnlyArrays):
         """Returns the input to apply; never raises.
 
         Args:
-            estimate: x_hat, shape (n,), float64.
+            estimate: x_hat, shape (n,), or a number if n = 1, float64.
             error_shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k). Or what `errors_of` says of it.
-            input_proposed: Shape (m,) [physical units]; the very float64 value that would be applied.
+            input_proposed: Shape (m,), or a number if m = 1 [physical units]; the very float64 value that would be
+                applied.
             stored: In mode "lookahead" the `plan` of the last decision, shape (k, m), if its input was applied and one
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
         errors = error_shape if isinstance(error_shape, PredictedErrors) else self.errors_of(error_shape)
         if (x_hat.shape, proposed.shape) != self._single:
+            if 0 in (x_hat.ndim, proposed.ndim) and (x_hat.size, proposed.size) == (self.plant.n, self.plant.m):
+                return self.decide(x_hat.reshape(-1), errors, proposed.reshape(-1), stored)
             self._tell_of_shapes(estimate, input_proposed)
         elif self.mode != "boundary":
             try:
@@ -255,12 +258,13 @@ class SafetyFilter(ReadOnlyArrays):
         )
 
     def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
-        """Warns the caller of `decide` that estimate or input is not a single one, for which it decides K x_hat."""
-        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self._single, strict=True):
+        """Warns the caller of `decide` that estimate or input is not a single one, and what it decides then."""
+        answers = {"estimate": "it returns the operating input", "input": "it falls back to K x_hat"}
+        for (name, answer), value, (size,) in zip(answers.items(), (estimate, proposed), self._single, strict=True):
             if (array := _as_array(value)).shape != (size,):
                 got = f"shape {array.shape}" if array.size else shown(value)
                 warn_caller(
-                    f"decide takes one {name}, numbers of shape ({size},), got {got}: it falls back to K x_hat "
+                    f"decide takes one {name}, numbers of shape ({size},), got {got}: {answer} "
                     "(decide_many takes batches, shields.torch.SafeLayer tensors)",
                     UserWarning,
                 )

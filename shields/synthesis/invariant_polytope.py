@@ -213,6 +213,19 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
     return None if points is None else float((polytope.gauge(points) <= 1.0).mean())
 
 
+def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
+    """Returns what part of its range the last input has in a polytope, the least one of several inputs.
+
+    None where the last states are no past inputs (`LinearPlant.with_rate_limits`).
+    """
+    if not inputs_under_way(plant):
+        return None
+    m, axes = plant.m, np.eye(plant.n)[-plant.m :]
+    ends = polytope.support(np.concatenate([axes, -axes]))
+    least, most = np.maximum(-ends[m:], plant.input_low), np.minimum(ends[:m], plant.input_high)
+    return float(((most - least) / (plant.input_high - plant.input_low)).min())
+
+
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
     """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`."""
     rows, n = plant.box, plant.n - inputs_under_way(plant)

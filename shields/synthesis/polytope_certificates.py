@@ -35,6 +35,7 @@ from shields.synthesis.invariant_polytope import (
     is_too_large,
     points_of_box,
     share_in_polytope,
+    share_of_last_input,
     share_of_points,
 )
 from shields.synthesis.max_margin_gain import max_margin_gain
@@ -333,9 +334,12 @@ def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: P
         failed = next(condition for condition in report.conditions if not condition.holds)
         reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {MORE_DIGITS}"
         raise Infeasible(reason, "P", -failed.margin)
-    share = share_in_polytope(certificate.polytope, plant)
-    size = {} if share is None else {"polytope_share_of_box": float(exact.rounded(share, 3))}
-    return replace(certificate, provenance=certificate.provenance | size)
+    shares = {
+        "polytope_share_of_box": share_in_polytope(certificate.polytope, plant),
+        "share_of_last_input": share_of_last_input(certificate.polytope, plant),
+    }
+    sizes = {name: float(exact.rounded(share, 3)) for name, share in shares.items() if share is not None}
+    return replace(certificate, provenance=certificate.provenance | sizes)
 
 
 def polytope_share(certificate: Certificate) -> float:

@@ -50,7 +50,7 @@ SETTINGS = [
     (CompareSettings, {"horizon": 0, "mode": "lookahead"}, f"{HORIZON} 0"),
     (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
     *((ChannelSettings, {"file": "f"} | given, "give --certificate and --plant, or --env")
-      for given in ({"plant": "p"}, {"certificate": "c"}, {"certificate": "c", "plant": "p", "env": "e"})),
+      for given in ({"plant": "p", "env": "e"}, {"certificate": "c"}, {"certificate": "c", "plant": "p", "env": "e"})),
     (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield of --env"),
     *((LoopSettings, given, f"--least-safe-steps {message}")
       for given, message in [({"least_safe_steps": 50}, "must be at least 0 and at most 49"),

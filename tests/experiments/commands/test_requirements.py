@@ -59,6 +59,8 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     assert found.returncode == 0, found.stderr
     assert "may be 10 steps (1000 ms) old" in (said := " ".join(found.stdout.split()))
     assert "The widest contract with a certificate, 10 steps of 0.1 s, the record breaks 3 times, " in said
+    assert "Read as a table: 'sent' in s, 'received' in s." in said
+    assert json.loads((tmp_path / "r/summary.json").read_text())["log"].startswith("Read as a table")
     (tmp_path / "packets.csv").write_text("0,1\n1,2\n")
     refused = ncs("requirements", "--plant", plant_file, *asked, "--force")
     assert refused.returncode != 0

@@ -303,6 +303,34 @@ def test_first_packet_that_both_times_say_0_is_lost_where_zeros_mark_what_is_los
     assert PacketLog.load(written("sent,received\n0,0\n1,1.1\n2,2.1\n")).delays[0] == 0.0
 
 
+@pytest.mark.parametrize("name", ["lost", "Loss", "is_lost", "dropped", "timeout", "missing"])
+@pytest.mark.parametrize("table", ["sent_ms,delay_ms,{}\n0,5,0\n20,3,1\n40,5,0\n", "rtt_ms,{}\n5,no\n3,yes\n5,no\n"])
+def test_column_marks_what_is_lost(table, name, written):
+    assert np.isnan(PacketLog.load(written(table.format(name))).delays).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("name", ["ok", "Success", "acked", "received", "arrived"])
+def test_column_marks_what_arrived(name, written):
+    log = PacketLog.load(written(f"sent_ms,delay_ms,{name}\n0,5,1\n20,3,0\n40,5,1\n"))
+    assert np.isnan(log.delays).tolist() == [False, True, False]
+    assert name not in log.read_as
+
+
+def test_columns_of_other_things_are_left_out(written):
+    log = PacketLog.load(written("sent_ms,delay_ms,size,version,lossless\n0,5,64,1,a\n20,3,60,1,b\n"))
+    assert "Not used: 'size', 'version', 'lossless'" in log.read_as
+
+
+def test_duplicates_are_not_taken_off_the_number_of_lost_packets(written):
+    log = PacketLog.load(written("seq,sent_ms,delay_ms\n1,0,5\n1,0,6\n2,20,5\n2,20,7\n5,80,5\n"))
+    assert "stands for a lost packet (2 numbers)" in log.read_as
+    assert np.isnan(log.delays).tolist() == [False, False, True, True, False]
+
+
+def test_list_with_three_decimals_may_mark_what_is_lost_by_a_number(written):
+    assert np.isnan(PacketLog.load(written("rtt_ms\n18.124\n5.188\n-1\n")).delays).tolist() == [False, False, True]
+
+
 def test_sample_that_is_later_than_any_channel_allows_counts_as_lost():
     log = PacketLog(np.arange(1500.0), np.array([*2 * [np.nan], 1000.0, 1001.0, *1496 * [np.nan]]))
     assert log.trace(1.0)[:4] == (-1, -1, 1000, -1)
@@ -341,6 +369,7 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("0.0,0.1\n0.2,0.3\n", "no names"),
         ("1 2\n3 4\n", "no names"),
         (",\n0,1\n1,2\n", "no names"),
+        ('"#sent";"received"\n0;1\n1;2\n', "no names"),
         ("time,value\n0,1\n1,2\n", "columns 'time', 'value'; a log needs sent and received"),
         ("sent,arrives\n0,1\n1,2\n", "columns 'sent', 'arrives'"),
         ("sent,tx_time,received\n0,0,1\n", "both be what was sent"),
@@ -348,6 +377,15 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent received size\n0 60\n1 2 60\n", "line 2 has 2 columns instead of 3"),
         ("sent,received,lost\n0,1,perhaps\n1,2,no\n", "line 2"),
         ("rtt\n1\n2\n", "'rtt' has no unit"),
+        ("sent_ms,delay\n0,5\n20,6\n", "'sent_ms' is in ms and 'delay' has no unit: name it delay_ms or delay_s"),
+        ("sent,delay_ms\n0,5\n20,6\n", "'delay_ms' is in ms and 'sent' has no unit: name it sent_ms or sent_s"),
+        ("sent,delay\n1700000000000,5\n1700000000020,6\n", "'sent' is in ms and 'delay' has no unit"),
+        ("sent_s,latency\n0,5.5\n0.02,6\n", "most packets would take more than a second"),
+        *(
+            (f"sent_ms,delay_ms,{name}\n0,5,0\n20,6,{cell}\n", f"'{name}' may say which packets were lost")
+            for name, cell in {"flag": 1, "X": "lost", "loss_pct": 33, "status": "failed", "acked?x": 2}.items()
+        ),
+        ("sent_ms,delay_ms,lost\n0,5,0\n20,6,3\n", "line 3: 'lost' has to be 0 or 1, yes or no, got '3'"),
         ("time,rtt_ms\n0,10\n0.1,11\n60,12\n", "'time' may say when packets were sent or when they came back"),
         ("Time_s;latency\n0;10\n0.1;11\n", "name it sent_s or received_s, and 'latency' by its unit"),
         ("0.3\n0.4\n", "seconds or milliseconds"),

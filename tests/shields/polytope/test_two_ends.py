@@ -10,6 +10,7 @@ from unittest import mock
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from experiments.published.plants import channel_of, contract_of_plant, plant_of, published
 from ncs_gym import (
@@ -90,6 +91,24 @@ def test_share_of_the_box_is_that_of_random_points(name):
     inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
     assert found.provenance["polytope_share_of_box"] == pytest.approx(inside.mean(), abs=0.02)
     assert inside.mean() > 0.5
+
+
+def test_share_of_the_last_input_is_what_linear_programs_find():
+    plant = LinearPlant(
+        A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, box=[10.0, 10.0], u_max=5.0, du_max=1.0,
+        disturbance_bound=[0.1, 0.05], sensor_bound=0.1, initial_bound=[0.3, 0.2],
+    )  # fmt: skip
+    found = synthesize(plant)
+    P = found.polytope
+    faces, ends = np.concatenate([P.rows, -P.rows]), np.concatenate([P.high, -P.low])
+    bounds = [*(plant.n - 1) * [(None, None)], (plant.input_low.item(), plant.input_high.item())]
+    last = np.eye(plant.n)[-1]
+    least, most = (
+        linprog(sign * last, faces[np.isfinite(ends)], ends[np.isfinite(ends)], bounds=bounds) for sign in (1.0, -1.0)
+    )
+    share = (-most.fun - least.fun) / np.ptp(plant.input_ends)
+    assert found.provenance["share_of_last_input"] == pytest.approx(share, abs=0.002)
+    assert f"the last input has {100.0 * share:.3g} % of its range" in " ".join(str(found).split())
 
 
 def changed(found, **fields):

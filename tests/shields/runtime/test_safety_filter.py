@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid
+from ncs_gym import Ellipsoid, LinearPlant
 from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
@@ -200,6 +200,18 @@ def test_huge_estimates_never_give_a_nan_input(size, plant):
         decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(plant.n), np.zeros(plant.m))
         assert np.isfinite(decision.input).all()
         assert not decision.passed
+
+
+def test_decide_takes_numbers_where_there_is_one_state_or_one_input():
+    plant = LinearPlant(A=[[0.9]], B=[[0.5]], dt=0.1, box=[1.0], u_max=1.0, disturbance_bound=0.05, initial_bound=0.1)
+    shield = SafetyFilter(certificate_of(plant), plant)
+    for u in (0.3, 1.0):
+        one = shield.decide(0.2, 1e-4 * np.eye(1), u)
+        assert one.input == shield.decide(np.array([0.2]), 1e-4 * np.eye(1), np.array([u])).input
+        assert one.reason != "invalid"
+    for bad, answer in ((np.zeros(2), "it returns the operating input"), (np.zeros((1, 2)), "the operating input")):
+        with pytest.warns(UserWarning, match=answer):
+            assert not shield.decide(bad, 1e-4 * np.eye(1), 1.0).input.any()
 
 
 class Contrary:
