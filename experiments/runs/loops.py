@@ -37,8 +37,10 @@ def registered_env(env_id: str) -> NCSEnv:
         if name not in gym.registry:
             raise ValueError(f"module {module!r} registers no environment {name!r}")
     elif name not in registered_ids() and name not in needing_extras():
-        if near := get_close_matches(f"ncs_gym/{name.removeprefix('ncs_gym/')}", registered_ids(), 1, 0.95):
-            raise ValueError(f"unknown environment {env_id!r}; did you mean {near[0]!r}?")
+        whole = f"ncs_gym/{name.removeprefix('ncs_gym/')}"
+        for meant in (f"{whole}-v0", whole):
+            if near := get_close_matches(meant, registered_ids(), 1, 0.95):
+                raise ValueError(f"unknown environment {env_id!r}; did you mean {near[0]!r}?")
         if name in gym.registry and gym.spec(name).namespace == "ncs_gym":
             raise ValueError(f"{env_id} has no plant of its own: give the file of one by --plant, or register_plant it")
         raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -148,7 +149,8 @@ def as_channel(value: Any, name: str) -> Channel | None:
     channel = from_json(value, (Channel,), name)
     if channel is None or isinstance(channel, Channel):
         return channel
-    raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}")
+    hint = f": PacketLog.load({shown(value)}).channel(dt) replays a record" if isinstance(value, str | PathLike) else ""
+    raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}{hint}")
 
 
 def _one_of(value: Any, known: tuple[str, ...], name: str) -> str:

@@ -89,7 +89,9 @@ class SafetyFilter(ReadOnlyArrays):
         horizon, least = plan_horizon(self.mode, self.horizon, self.least_safe_steps), int(self.least_safe_steps)
         if not isinstance(self.certificate, Certificate) or not isinstance(self.plant, LinearPlant):
             kinds = f"{type(self.certificate).__name__} and {type(self.plant).__name__}"
-            raise ValueError(f"SafetyFilter takes a Certificate and a LinearPlant, got {kinds}")
+            raise ValueError(
+                f"a shield takes a Certificate (Certificate.load reads one) and a LinearPlant, got {kinds}"
+            )
         if self.mode == "boundary" and self.plant.m > MOST_INPUTS_WITH_VERTICES:
             raise ValueError(f'mode "boundary" takes at most {MOST_INPUTS_WITH_VERTICES} inputs, got {self.plant.m}')
         require_valid(self.certificate, self.plant)

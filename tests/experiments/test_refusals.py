@@ -145,6 +145,7 @@ ONE_SENTENCE = [
     ("compare --env ncs_gym/CartPol-v0", "'ncs_gym/CartPol-v0'; did you mean 'ncs_gym/CartPole-v0'?"),
     ("compare --arms shieled", "unknown arm 'shieled' (did you mean 'shielded'?)"),
     ("compare --env CSTR-v0", "unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"),
+    ("compare --env ncs_gym/CartPole", "unknown environment 'ncs_gym/CartPole'; did you mean 'ncs_gym/CartPole-v0'?"),
     ("compare --arms shielded hope", "unknown arm 'hope'", "shielded:MODE"),
     ("compare --arms shielded shielded", "--arms must be different"),
     ("compare --arms unshielded,shielded", "'unshielded,shielded' (several are separated by spaces)"),

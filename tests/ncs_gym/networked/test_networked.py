@@ -320,6 +320,7 @@ def test_time_limits_stand_inside_and_outside():
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
+        ({"channel": "a.csv"}, "got 'a.csv': PacketLog.load"),
         ({"channel": 3}, "channel must be a Channel, or a dictionary of its fields, got 3"),
         ({"channel": {"los": 1}}, "channel has the key 'los', which neither channels nor observations have"),
         (

@@ -181,9 +181,17 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Filters.
     (lambda: SafetyFilter(replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), CertificateError, r"\(S\)"),
     (lambda: SafetyFilter(CERTIFICATE, OTHER), CertificateError, "another plant"),
-    (lambda: SafetyFilter(PLANT, CERTIFICATE), ValueError, "SafetyFilter takes a Certificate"),
-    (lambda: SafetyFilter(CERTIFICATE, "plant"), ValueError, "SafetyFilter takes a Certificate"),
-    (lambda: SafetyFilter("certificate", PLANT), ValueError, "SafetyFilter takes a Certificate"),
+    (lambda: SafetyFilter(PLANT, CERTIFICATE), ValueError, "a shield takes a Certificate"),
+    (
+        lambda: SafetyFilter(CERTIFICATE, "plant"),
+        ValueError,
+        "a shield takes a Certificate",
+    ),
+    (
+        lambda: SafetyFilter("certificate", PLANT),
+        ValueError,
+        "a shield takes a Certificate",
+    ),
     (lambda: SafetyFilter(CERTIFICATE, PLANT, "hope"), ValueError, "mode must be one of"),
     (lambda: SafetyFilter(CERTIFICATE, PLANT, "project", 3), ValueError, 'horizon is for mode "lookahead"'),
     (lambda: SafetyFilter(CERTIFICATE, THIRTEEN, "boundary"), ValueError, "at most 12 inputs, got 13"),
