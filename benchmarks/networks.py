@@ -585,8 +585,8 @@ def kind_of(gain: np.ndarray, statistics: ErrorStatistics, recursion: ErrorRecur
         return "Kalman"
     if np.array_equal(gain, recursion.sets.gain(shape)):
         return "set-membership"
-    ages = recursion.error_set.ages
-    if ages is not None and 1 <= age <= len(ages.gains) and np.array_equal(gain, ages.gains[age - 1]):
+    certified = recursion.error_set.gains
+    if 1 <= age <= len(certified) and np.array_equal(gain, certified[age - 1]):
         return "certified"
     assert not gain.any()
     return "skipped"

@@ -5,7 +5,8 @@ from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
 from ncs_gym.envs.request_actions import RequestActions, VectorRequestActions
 from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
+from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError, certified_error_set
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.installation import warn_of_overwritten_packages
 from ncs_gym.network.actuator import Actuator, Command, Echo

@@ -67,6 +67,8 @@ def agent_named(name: str, env_id: str | None, vec_normalize: Path | None = None
     from agents.agent import Agent, is_sb3_zip, load_sb3_zip  # imports torch
 
     path = _only_agent(Path(name))
+    if name != PRETRAINED and not path.exists():
+        raise ValueError(f"no agent in {name}: there is no such file or folder")
     if env_id is None and (name == PRETRAINED or is_sb3_zip(path)):
         raise ValueError(f"{name} does not say of which environment the agent is: give --env")
     if env_id is not None and name == PRETRAINED:

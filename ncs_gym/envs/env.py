@@ -23,7 +23,7 @@ from ncs_gym.envs.settings import (
 )
 from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
 from ncs_gym.estimation.arrival_histories import arrival_histories
-from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract

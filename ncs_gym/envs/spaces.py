@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.envs.info import Known
-from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.network.downlink import Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
@@ -60,9 +60,7 @@ def observation_space(
     unforced = np.array(powers)
     added = np.abs(unforced[:-1] @ plant.B) @ plant.largest_input + plant.disturbance.support(unforced[:-1])
     reach = np.vstack([np.zeros(plant.n), added.cumsum(axis=0)]) + initial_set.support(unforced)
-    ages = error_set.ages
-    shapes = error_set.Sigma[None] if ages is None else ages.shapes
-    errors = np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
+    errors = np.sqrt(np.diagonal(error_set.shapes, axis1=1, axis2=2).max(axis=0))
     estimate = reach.max(axis=0) + errors
     if plant.spectral_radius >= 1.0:
         known = np.maximum(plant.half_widths, initial_set.support(np.eye(plant.n)))

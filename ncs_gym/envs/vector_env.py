@@ -17,7 +17,7 @@ from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.settings import CHANNELS, channel_setting, vector_reset_options
 from ncs_gym.envs.spaces import Observer, actions_of, read_actions
 from ncs_gym.estimation.arrival_histories import arrival_histories
-from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel, widest
 from ncs_gym.network.contract import ChannelContract

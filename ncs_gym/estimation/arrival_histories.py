@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.innovation import common_axes, quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.network.channel import Channel
@@ -264,9 +265,9 @@ class ArrivalHistories:
         self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None, coarsens: bool = False
     ) -> None:
         self.recursion, self.channel, self.coarsens = recursion, channel, coarsens
-        self.buffer, ages, size = channel.longest_delay, recursion.error_set.ages, _FIRST_CAPACITY
+        self.buffer, size = channel.longest_delay, _FIRST_CAPACITY
         # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
-        oldest = max(self.buffer + 1, 0 if ages is None else len(ages.shapes))
+        oldest = max(self.buffer + 1, recursion.error_set.oldest + 1)
         self.table = ErrorTable(recursion, oldest) if table is None else table
         held_ages = self.buffer + 1
         self._key = f"{held_ages + 2}q{held_ages}?"

@@ -1,20 +1,21 @@
-"""The certified error set: an ellipsoid the estimation error never leaves, whatever the channel does."""
+"""Finds the certified error set of a plant: what the estimation error never leaves, whatever the channel does."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Literal, overload
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, congruence_sum, error_sets_by_age
+from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age, in_round_numbers
+from ncs_gym.estimation.error_sets import ErrorSet, InvariantErrorSet
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import ReadOnlyArrays, own_error_state
+from ncs_gym.validation import own_error_state
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (docs/shield_proof.md).
 GROWTH = 1.1
@@ -36,42 +37,6 @@ class UnstablePlantError(ValueError):
 
 class ErrorSetError(ValueError):
     """No error set could be computed accurately enough."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ErrorSet(ReadOnlyArrays):
-    """What the estimation error never leaves: one set for every age, or one per age under a contract.
-
-    Without a contract, E(Sigma) with (E0) Sigma >= r0^2 I and (E1) Sigma >= A Sigma A'/rate + D/(1 - rate).
-
-    Attributes:
-        Sigma: Shape (n, n) [squares of the units of the state]; under a contract that of the largest age promised.
-        rate: lam_e in (0, 1); under a contract that of the largest age.
-        ages: The sets by age; None without a contract.
-    """
-
-    Sigma: np.ndarray
-    rate: float
-    ages: ErrorSetsByAge | None = None
-
-    def __post_init__(self) -> None:
-        self._make_arrays_read_only()
-
-    @overload
-    def shape_at(self, age: Literal[0]) -> np.ndarray: ...
-
-    @overload
-    def shape_at(self, age: int) -> np.ndarray | None: ...
-
-    def shape_at(self, age: int) -> np.ndarray | None:
-        """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""
-        if self.ages is None:
-            return self.Sigma
-        return self.ages.shapes[age] if age < len(self.ages.shapes) else None
-
-    def rate_at(self, age: int) -> float:
-        """Returns the rate that carries the set of one age into that of the next."""
-        return self.rate if self.ages is None else float(self.ages.rates[age])
 
 
 @own_error_state
@@ -102,12 +67,8 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )
-    rounded, found = (
-        ErrorSet(Sigma=each.shapes[contract.max_age], rate=float(each.rates[-1]), ages=each)
-        for each in (sets.in_round_numbers(), sets)
-    )
-    require_error_set(found, plant)
-    return _round_if_it_holds(rounded, found, plant)
+    require_error_set(sets, plant)
+    return _round_if_it_holds(in_round_numbers(sets), sets, plant)
 
 
 def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -> ErrorSet:
@@ -153,17 +114,7 @@ def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
     Raises:
         ErrorSetError: Naming the condition.
     """
-    Sigma, rate, ages = error_set.Sigma, error_set.rate, error_set.ages
-    if ages is None:
-        identity = np.eye(plant.n)
-        first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
-        grown = congruence_sum(
-            (plant.A, Sigma, 1.0 / rate), (identity, plant.disturbance.shape_matrix, 1.0 / (1.0 - rate))
-        )
-        needs = {"(E0)": [(Sigma, *first)], "(E1)": [(Sigma, *grown)]}
-    else:
-        needs = ages.needs(plant)
-    for name, triples in needs.items():
+    for name, triples in error_set.needs(plant).items():
         if not all(_holds(*triple) for triple in triples):
             raise ErrorSetError(
                 f"no error set found: the plant is too ill-conditioned for {name} to hold in float64; give states "
@@ -226,7 +177,7 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     best: Any = minimize_scalar(size, bounds=bounds, method="bounded", options=options)
     rate = 1.0 - float(exact.rounded(1.0 - best.x, RATE_DIGITS))
     Sigma = T @ (GROWTH * _smallest_solution(A, D, first, rate)) @ T.T
-    found = ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+    found = InvariantErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
     require_error_set(found, plant)
     return _round_if_it_holds(replace(found, Sigma=rounded_up(found.Sigma, DIGITS)), found, plant)
 

@@ -1,17 +1,17 @@
-"""Error sets by age: how far an estimate may be off when its newest sample is j steps old."""
+"""Finds error sets by age: how far an estimate may be off when its newest sample is j steps old."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.estimation.error_sets import ErrorSetsByAge, congruence_sum
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH, LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
-from ncs_gym.validation import ReadOnlyArrays
 
 # Digits of sets, relative to their extents, of gains and of rates: what differs between processors beyond them is cut
 # off. It is less than the margin below.
@@ -38,91 +38,6 @@ REGULATOR_DIGITS = 6
 LARGEST = 1e6
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ErrorSetsByAge(ReadOnlyArrays):
-    """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/shield_proof.md, "Channel contracts").
-
-        (C0) Sigma_0 >= r0^2 I
-        (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
-        (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
-
-    (C2) holds with room for the rounding of an estimate that is updated (docs/shield_proof.md, "Rounding").
-
-    Attributes:
-        contract: The promise they rest on.
-        shapes: Sigma_j, shape (h+2, n, n).
-        rates: lam_j, shape (h+1,).
-        gains: T_1 .. T_{h+1}, shape (h+1, n, p).
-        multipliers: mu_1 .. mu_{h+1}, shape (h+1,).
-        noise: N of the contract's quantizer, shape (p, p).
-    """
-
-    contract: ChannelContract
-    shapes: np.ndarray
-    rates: np.ndarray
-    gains: np.ndarray
-    multipliers: np.ndarray
-    noise: np.ndarray
-
-    def __post_init__(self) -> None:
-        self._make_arrays_read_only()
-
-    def in_round_numbers(self) -> ErrorSetsByAge:
-        """Returns the sets, a little larger, in numbers that hardly depend on the processor; they are to be checked."""
-        return replace(
-            self,
-            shapes=np.stack([rounded_up(shape, DIGITS) for shape in self.shapes]),
-            rates=np.round(self.rates, DIGITS),
-            gains=np.stack([exact.rounded(gain, DIGITS, axis=1) for gain in self.gains]),
-        )
-
-    def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-        """Returns, per condition, triples (outer, inner, size): each outer must hold the inner one, computed to `size`.
-
-        In (C2) the inner one includes the rounding of the estimate that is updated with T_j.
-        """
-        D, identity = plant.disturbance.shape_matrix, np.eye(plant.n)
-        first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
-        grown = [
-            congruence_sum((plant.A, self.shapes[j], 1.0 / rate), (identity, D, 1.0 / (1.0 - rate)))
-            for j, rate in enumerate(self.rates)
-        ]
-        kept = [identity - gain @ plant.H for gain in self.gains]
-        updated = [
-            congruence_sum(
-                (kept[j], self.shapes[j + 1], INFLATION / self.multipliers[j]),
-                (self.gains[j], self.noise, INFLATION / (1.0 - self.multipliers[j])),
-                (identity, self.rounding_of_update(plant, j), 1.0),
-            )
-            for j in range(len(self.gains))
-        ]
-        return {
-            "(C0)": [(self.shapes[0], *first)],
-            "(C1)": [(self.shapes[j + 1], *inner) for j, inner in enumerate(grown)],
-            "(C2)": [(self.shapes[0], *inner) for inner in updated],
-        }
-
-    def rounding_of_update(self, plant: LinearPlant, j: int) -> np.ndarray:
-        """Returns F for an update with T_{j+1}, shape (n, n): at least the plant's `estimate_rounding`.
-
-        With x_hat up to SIMULATED_REACH half-widths out, and a residual that an error in E(Sigma_{j+1}) and noise in
-        E(N) leave, x_hat + T (y - H x_hat) is rounded by at most half of r (docs/shield_proof.md, "What the room
-        covers").
-        """
-        gain, H, reach = np.abs(self.gains[j]), np.abs(plant.H), SIMULATED_REACH * plant.half_widths
-        residual = H @ np.sqrt(self.shapes[j + 1].diagonal()) + np.sqrt(self.noise.diagonal())
-        r = np.finfo(float).eps * (plant.n * gain @ (H @ reach) + (plant.p + 1) * gain @ residual + reach)
-        room = 2.0 * plant.n / (INFLATION - 1.0) * r**2
-        return np.diag(np.maximum(room, plant.estimate_rounding.diagonal()))
-
-
-def congruence_sum(*terms: tuple[np.ndarray, np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the sum of w F P F' over terms (F, P, w), and that of w |F| |P| |F|', with which its rounding grows."""
-    total = sum(weight * factor @ shape @ factor.T for factor, shape, weight in terms)
-    size = sum(weight * np.abs(factor) @ np.abs(shape) @ np.abs(factor).T for factor, shape, weight in terms)
-    return np.asarray(total), np.asarray(size)
-
-
 def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
     """Returns error sets by age, without a solver; None if the iteration finds none, or none that float64 can hold."""
     with np.errstate(all="ignore"):
@@ -130,6 +45,16 @@ def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSet
             return _iterated_sets(plant, contract)
         except np.linalg.LinAlgError:
             return None
+
+
+def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
+    """Returns the sets, a little larger, in numbers that hardly depend on the processor; they are to be checked."""
+    return replace(
+        sets,
+        shapes=np.stack([rounded_up(shape, DIGITS) for shape in sets.shapes]),
+        rates=np.round(sets.rates, DIGITS),
+        gains=np.stack([exact.rounded(gain, DIGITS, axis=1) for gain in sets.gains]),
+    )
 
 
 def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:

@@ -17,7 +17,8 @@ from ncs_gym.estimation.arrival_histories import (
     arrival_histories,
     histories_of,
 )
-from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
+from ncs_gym.estimation.error_bound import require_error_set
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
@@ -92,9 +93,9 @@ class Estimator(CopiedWhole):
                 histories = histories_of(plant, channel, error_set)
         self._histories = self._usual = histories
         self._error_set = self._histories.recursion.error_set
-        ages = self._error_set.ages
-        if ages is not None and not ages.contract.is_fine_enough_for(channel):
-            raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
+        contract = self._error_set.contract
+        if contract is not None and not contract.is_fine_enough_for(channel):
+            raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {contract}")
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
         self.episode, self._is_new = (0, True) if after is None else (after.episode, after._is_new)
         self._begin(np.zeros(plant.n))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 

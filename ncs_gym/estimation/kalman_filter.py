@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.set_membership import COARSER, COARSEST_STEP, SHAPE_STEP, SetMembership
 from ncs_gym.plants.linear_plant import FLAT_INFLATION, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import is_inside
@@ -91,7 +91,6 @@ class ErrorRecursion:
         self._quantization_step = quantization_step
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
-        self._oldest = 0 if error_set.ages is None else len(error_set.ages.shapes) - 1
         if first is None:
             shape = plant.initial_error.shape_matrix
             first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shape_at(0)))
@@ -117,10 +116,7 @@ class ErrorRecursion:
         if np.vdot(self.plant.weight, grown) < LARGEST_COVARIANCE:
             covariance = grown
         predicted = self.sets.predicted(shape, age)
-        if self.error_set.ages is not None:
-            certified = certified and age < self._oldest  # by (C1)
-        elif not certified:  # whatever lies inside stays there, by (E1)
-            certified = is_inside(predicted, self.error_set.Sigma)
+        certified = self.error_set.remains_certified(certified, age, predicted)
         return ErrorStatistics(self._rounded(covariance), predicted, age + 1, certified)
 
     def updated(self, statistics: ErrorStatistics) -> tuple[np.ndarray, ErrorStatistics] | None:
@@ -132,7 +128,8 @@ class ErrorRecursion:
         at first, and the gain is chosen for the way back.
         """
         covariance, shape, age, _ = statistics
-        newest, ages = self.error_set.shape_at(0), self.error_set.ages
+        sets = self.error_set
+        newest = sets.shape_at(0)
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
         if kalman is not None and is_inside(updated := self.sets.updated(shape, kalman[0]), newest):
@@ -140,12 +137,12 @@ class ErrorRecursion:
         gain = self.sets.gain(shape)
         updated = self.sets.updated(shape, gain)
         if not is_inside(updated, newest):
-            if ages is None:
+            if sets.contract is None:
                 return None
             assert age > 0  # every update follows a prediction
-            last = min(age, self._oldest)  # whatever lies in a set is led back by its gain
-            if is_inside(shape, ages.shapes[last]):
-                gain, updated = ages.gains[last - 1], newest  # by (C2)
+            last = min(age, sets.oldest)  # whatever lies in a set is led back by its gain
+            if is_inside(shape, sets.shapes[last]):
+                gain, updated = sets.gains[last - 1], newest  # by (C2)
             else:
                 gain, updated = self.sets.on_the_way_back(shape)
         return gain, ErrorStatistics(covariance, updated, 0, is_inside(updated, newest))
@@ -155,7 +152,7 @@ class ErrorRecursion:
 
         Under a contract the sets depend on the age, and a newer sample must count.
         """
-        if self.error_set.ages is not None and replayed.age < present.age:
+        if self.error_set.contract is not None and replayed.age < present.age:
             return True
         weight = self.plant.weight
         return bool(np.vdot(weight, replayed.shape) <= np.vdot(weight, present.shape))

@@ -216,7 +216,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             seen = [_where(each.is_new(self._steps), sample, zero_of(part.space)) for sample, part, each in pairs]
         elif callable(settings.fill):
             filled = settings.fill(seen[0], self._steps - arrivals[0].stamp, self._decided)
-            seen = [_where(arrivals[0].is_new(self._steps), seen[0], filled)]
+            seen = [_where(arrivals[0].stamp == self._steps, seen[0], filled)]
         if not settings.entries.names:
             return joined(settings.parts, seen)
         ages = np.stack([self._steps - each.stamp for each in arrivals], axis=1)

@@ -62,9 +62,10 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         observe: Entries that are added to observations: "age" of the newest sample [steps, at most 1,000], "arrived",
             and "pending_actions", the last ones decided. A flat observation of floats becomes longer, a `Dict` gets
             keys and a `Tuple` entries of these names; another one becomes a `Dict` with the key "observation".
-        fill: What is seen where nothing new arrived: "last", the newest sample that did; "zero"; or a function
-            (last, age, actions) -> observation, which is given that sample, its age and the last `pending` actions
-            decided, oldest first, of which those of the last `age` steps came after the sample.
+        fill: What is seen where nothing new arrived: "last", the newest sample that did, or "zero". Or a function
+            (last, age, actions) -> observation that predicts the present one wherever the newest sample is older: it
+            is given that sample, its age and the last `pending` actions decided, oldest first, of which those of the
+            last `age` steps came after the sample.
         late: "apply" lets the newest command that has arrived act. "drop" does not wait for commands that take longer
             than `downlink.delay`. "queue" lets all commands act in the order of their arrival, one in each step.
         idle: What acts where no command arrived: "hold", the one before, or "neutral".
@@ -73,7 +74,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         pending: How many of the last actions are kept; by default as many as the contracts of both channels allow the
             newest sample to lack, or the delays where there is no contract.
         delay_reward: Whether rewards travel with samples: the agent gets what was earned until the newest one was
-            taken, and at the end of an episode the rest.
+            taken, and at the end of an episode the rest. A `TimeLimit` belongs inside: of an end outside nobody knows.
 
     Attributes:
         channel: The channel of the observations; with several a dictionary of them.
@@ -82,7 +83,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             its option "channel" (and "downlink"), or what draws one (`RandomChannel`).
 
     Warns:
-        UserWarning: Once in an episode, where the channel takes samples on request and nobody asks (`RequestActions`).
+        UserWarning: Once in an episode, where the channel takes samples on request and nobody asks (`RequestActions`);
+            at `reset`, where the rest of delayed rewards was not paid.
 
     Raises:
         ValueError: If a setting is wrong, or does not fit the environment's spaces.
@@ -117,6 +119,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         on_request = settings.channels[0].on_request
         self._requests = Requests(settings.channels[0], None) if on_request else None
         self._snapshots, self._rng = Snapshots(), None
+        self._earned = self._told = 0.0
         self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
         self._keys = [part.key for part in settings.parts] if settings.parts[0].key is not None else None
@@ -148,6 +151,12 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             options: {"channel": c}, {"downlink": c} give this episode another channel, or a function (rng) -> Channel
                 that draws one; with several channels a dictionary of these. The rest is the environment's.
         """
+        if self._earned != self._told:
+            warn_caller(
+                f"rewards of {self._earned - self._told:.6g} were on their way when the episode was left: with "
+                "delay_reward a TimeLimit belongs inside Networked",
+                UserWarning,
+            )
         own = dict(options or {})
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
@@ -251,7 +260,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         if settings.fill == "zero":
             pairs = zip(seen, settings.parts, self._arrivals, strict=True)
             seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
-        elif callable(settings.fill) and not self._arrivals[0].is_new(step):
+        elif callable(settings.fill) and self._arrivals[0].stamp < step:
             seen = [settings.fill(seen[0], step - self._arrivals[0].stamp, np.array(self._decided))]
         observation = joined(settings.parts, seen)
         if not settings.entries.names:

@@ -164,8 +164,8 @@ class LinearPlant(ReadOnlyArrays):
             `family`); None if nothing.
         continuous_model: [Ac, Bc] of the model x' = Ac x + Bc u in continuous time that A and B were sampled from,
             shape (n, n + m) [1/s]; None if it is unknown.
-        between_samples: Number N of times per step, 2 to 64, at which the box counts; with a bound on what is between
-            them it then counts at all times, for environments and certificates (docs/shield_proof.md), if what
+        between_samples: Number N of times per step, 2 to 64, at which the box counts: environments look there, and
+            certificates, with a bound on what is between them, keep it at all times (docs/shield_proof.md), if what
             disturbances have done by any time of a step respects the bound of a whole step. None, or 1: at the sampling
             instants alone. Needs a continuous model without remainder and a box that bounds every state.
         error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import ErrorSet, LinearPlant, exact
+from ncs_gym.estimation.error_sets import ErrorSetsByAge
 from ncs_gym.plants.linear_plant import inflated
 from shields.certificate import Certificate, Proof, Updates
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
@@ -41,13 +42,10 @@ def proofs_of(
     errors: ErrorSet, problem: DesignProblem | None = None, design: CandidateDesign | None = None
 ) -> tuple[Proof, ...]:
     """Returns a proof per error set, with the multipliers of an ellipsoid that suit it best if a design is given."""
-    if errors.ages is None:
-        sets, designs = [(errors.Sigma, errors.rate)], [design]
-    else:
-        sets = list(zip(errors.ages.shapes[:-1], errors.ages.rates.tolist(), strict=True))
-        designs = [None] * len(sets)
-        if problem is not None and design is not None:
-            designs = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
+    sets = list(zip(errors.promised, errors.rates.tolist(), strict=True))
+    designs: list[CandidateDesign | None] = len(sets) * [design]
+    if len(sets) > 1 and problem is not None and design is not None:
+        designs = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
     return tuple(
         Proof(Sigma=Sigma, rate=rate)
         if each is None
@@ -58,11 +56,14 @@ def proofs_of(
 
 def _updates(errors: ErrorSet) -> Updates | None:
     """Returns what a channel contract adds to the proofs; None without one."""
-    sets = errors.ages
-    if sets is None:
+    if not isinstance(errors, ErrorSetsByAge):
         return None
     return Updates(
-        contract=sets.contract, last=sets.shapes[-1], gains=sets.gains, shares=sets.multipliers, noise=sets.noise
+        contract=errors.contract,
+        last=errors.shapes[-1],
+        gains=errors.gains,
+        shares=errors.multipliers,
+        noise=errors.noise,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from typing import NamedTuple
 
@@ -195,7 +195,7 @@ def design_problem(
             flatness,
         )
     try:
-        errors = _inflated(certified_error_set(plant, contract))
+        errors = certified_error_set(plant, contract).larger(INFLATION)
     except UnstablePlantError as error:
         raise Infeasible(
             "(E1) cannot hold: without packets the estimation error grows for ever, because the spectral radius of A "
@@ -207,14 +207,7 @@ def design_problem(
         ) from error
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
-    shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
-    return _scaled(plant, shapes, limits), errors
-
-
-def _inflated(errors: ErrorSet) -> ErrorSet:
-    """Returns an error set with every shape larger by INFLATION; (E0), (E1) and (C0) to (C2) keep holding."""
-    ages = errors.ages and replace(errors.ages, shapes=INFLATION * errors.ages.shapes)
-    return replace(errors, Sigma=INFLATION * errors.Sigma, ages=ages)
+    return _scaled(plant, errors.promised, limits), errors
 
 
 def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimits) -> DesignProblem:

@@ -560,10 +560,9 @@ def _tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enou
     """
     rest = farthest_from_limits(plant)
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
-    shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
 
     def tolerance(K: np.ndarray, at_least: float = 0.0) -> _Tolerance:
-        needs = needs_of(Feedback(K, shapes, plant.disturbance.shape_matrix, rest), plant)
+        needs = needs_of(Feedback(K, errors.promised, plant.disturbance.shape_matrix, rest), plant)
         if needs is None:
             return _Tolerance(at_least)
         farthest = farthest_equilibrium(plant, needs)

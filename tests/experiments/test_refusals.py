@@ -179,6 +179,7 @@ ONE_SENTENCE = [
     ("render --env CartPole-v1", "unknown environment 'CartPole-v1'"),
     ("render --out nowhere/a.gif", "No such file or directory"),
     ("render --policy nowhere", "no agent in nowhere"),
+    ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
     ("requirements --env nothing", "unknown environment"),
     (f"loop --env {CRUISE} --channel lag=3", "--channel lag: a channel has no such setting"),
     (f"loop --env {CRUISE} --downlink delay=0", "--downlink: what is sent at each step arrives at the next at best"),

@@ -56,7 +56,7 @@ SETTINGS = [
     PLANT.disturbance,
     truck_trailer().process_noise,
     ERRORS,
-    ERRORS.ages,
+    certified_error_set(truck_trailer()),
     Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5)),
     GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5),
     TraceChannel(trace=(0, -1)),

@@ -110,7 +110,7 @@ def test_certificates_rest_on_both_contracts():
     env = gym.make("ncs_gym/CartPole-v0", downlink=Channel(loss=0.2, delay=1, max_consecutive_losses=1)).unwrapped
     assert env.contract == ChannelContract(4, 1e-4)
     assert env.downlink_protocol.contract == ChannelContract(2)
-    assert env.certificate_contract == env.error_set.ages.contract == ChannelContract(6, 1e-4)
+    assert env.certificate_contract == env.error_set.contract == ChannelContract(6, 1e-4)
     assert NCSEnv(downlink=Channel(delay=2), **CRUISE).certificate_contract is None
 
 

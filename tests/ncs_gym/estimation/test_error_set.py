@@ -5,7 +5,6 @@ import pytest
 
 from ncs_gym import (
     Ellipsoid,
-    ErrorSet,
     ErrorSetError,
     LinearPlant,
     UnstablePlantError,
@@ -13,6 +12,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.estimation.error_bound import require_error_set
+from ncs_gym.estimation.error_sets import InvariantErrorSet
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 
@@ -111,7 +111,7 @@ def test_set_that_holds_by_no_more_than_rounding_is_an_error(growth):
     settings = {"disturbance_bound": 0.1, "sensor_bound": 0.1, "initial_bound": 0.0}
     plant = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
     Sigma = growth * 4.0 * plant.disturbance.shape_matrix
-    errors = ErrorSet(Sigma=Sigma, rate=0.5)
+    errors = InvariantErrorSet(Sigma=Sigma, rate=0.5)
     if growth > 1.0 + 1e-12:
         require_error_set(errors, plant)
     else:
@@ -126,7 +126,7 @@ def test_set_that_fails_a_condition_in_one_direction_is_an_error():
     def check(Sigma, first):
         initial = Ellipsoid(np.diag(first))
         plant = LinearPlant(A=0.5 * np.eye(2), B=np.eye(2), box=1.0, u_max=1.0, dt=0.1, initial_bound=initial, **bounds)
-        require_error_set(ErrorSet(Sigma=Sigma, rate=0.5), plant)
+        require_error_set(InvariantErrorSet(Sigma=Sigma, rate=0.5), plant)
 
     check(4.01 * np.eye(2), [2.0, 1.0])
     with pytest.raises(ErrorSetError, match=r"\(E1\)"):

@@ -11,7 +11,6 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     Ellipsoid,
-    ErrorSet,
     Estimator,
     LinearPlant,
     Packet,
@@ -21,6 +20,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.estimation.arrival_histories import histories_of
+from ncs_gym.estimation.error_sets import InvariantErrorSet
 from ncs_gym.estimation.innovation import quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covariance, updated_covariance
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
@@ -37,7 +37,7 @@ FINE = {"covariance_bits": 45, "shape_step": 2.0**-45}
 def roomy(plant, factor=1e4):
     """An error set so large that the guard accepts every Kalman update."""
     errors = certified_error_set(plant)
-    return ErrorSet(Sigma=factor * errors.Sigma, rate=errors.rate)
+    return InvariantErrorSet(Sigma=factor * errors.Sigma, rate=errors.rate)
 
 
 def sets_of(plant, channel=None):
@@ -264,7 +264,7 @@ def test_a_shape_outside_the_certified_one_of_its_age_is_not_brought_back_by_a_p
 def test_a_long_thin_shape_is_moved_without_loss(size):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
-    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=1e2 * np.eye(2), rate=0.9), shape_step=2.0**-90)
+    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=1e2 * np.eye(2), rate=0.9), shape_step=2.0**-90)
     rng = np.random.default_rng(0)
     for _ in range(60):
         long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
@@ -276,7 +276,7 @@ def test_a_long_thin_shape_is_moved_without_loss(size):
 def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_their_differences():
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = LinearPlant(A=np.diag([1.5, 1.1]), B=np.ones((2, 1)), box=[1.0, 3.0], **settings)
-    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.eye(2), rate=0.5))
+    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.eye(2), rate=0.5))
     farthest = 2.0 * plant.state_limit  # between states at opposite ends of where a simulation stops them
     for grown in (np.diag([9.0 * farthest[0] ** 2, 1.0]), np.diag([1.0, 9.0 * farthest[1] ** 2])):
         shape = sets.predicted(grown, 0)
@@ -292,7 +292,7 @@ def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditione
     n, rng = 44, np.random.default_rng(0)
     factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
     plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
-    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=factor @ factor.T, rate=0.5))
+    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=factor @ factor.T, rate=0.5))
     for root in rng.standard_normal((8, n, n)):
         shape = size * factor @ root @ root.T @ factor.T
         shape = 0.5 * (shape + shape.T)

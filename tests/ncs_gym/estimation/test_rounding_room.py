@@ -6,8 +6,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, ErrorSet, LinearPlant, certified_error_set
-from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, certified_error_set
+from ncs_gym.estimation.error_sets import ErrorSetsByAge, InvariantErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
@@ -43,7 +43,7 @@ def sets_for_age_zero(plant, newest, older, rate, gain, mu, noise=None):
         multipliers=np.array([mu]),
         noise=plant.sensor_error_with(0.0).shape_matrix if noise is None else noise,
     )
-    return ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
+    return sets
 
 
 def rounded_away(gain, matched, estimate, sample):
@@ -71,7 +71,7 @@ def sets_that_just_hold(room):
 
 def largest_gauge_after_an_update(plant, error_set):
     """How far out of E(Sigma_0) updates in float64 take errors, 1 is its boundary, with error and noise at theirs."""
-    error, noise = (Fraction(float(shape[0, 0]) ** 0.5) for shape in (error_set.ages.shapes[1], error_set.ages.noise))
+    error, noise = (Fraction(float(shape[0, 0]) ** 0.5) for shape in (error_set.shapes[1], error_set.noise))
     largest, rng = 0.0, np.random.default_rng(0)
     for _ in range(500):
         estimate = SIMULATED_REACH * plant.half_widths[0] * rng.uniform(0.7, 1.0)
@@ -84,7 +84,7 @@ def largest_gauge_after_an_update(plant, error_set):
 
 def test_without_room_an_updated_estimate_leaves_its_set_and_an_estimator_refuses_such_sets():
     plant, error_set = sets_that_just_hold(room=False)
-    sets = error_set.ages
+    sets = error_set
     kept = (1.0 - GAIN) ** 2 * sets.shapes[1] / sets.multipliers[0]
     plain = kept + GAIN**2 * sets.noise / (1.0 - sets.multipliers[0])
     assert is_inside(plain, sets.shapes[0])  # (C2) as it stands in docs/contracts.md holds
@@ -103,7 +103,7 @@ def test_with_room_an_updated_estimate_stays_in_its_set():
 def test_a_gain_chosen_at_run_time_has_the_room_where_shapes_are_hardly_rounded_up(radius, gain):
     """The inflation covers what rounding takes of a large error, and what the plant adds that of a small one."""
     plant, rng, largest, H = replace(plant_with(radius), H=np.array([[0.9]])), np.random.default_rng(0), 0.0, 0.9
-    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
     error, noise = Fraction(radius), Fraction(float(sets.noise[0, 0] ** 0.5)) * (1 - Fraction(1, 10**15))
     limit = sets.updated(np.array([[radius**2]]), np.array([[gain]])).item() ** 0.5
     for _ in range(500):
@@ -123,7 +123,7 @@ def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
         noise = Ellipsoid(1e4 * rng.uniform(0.5, 1.0) * np.array([[1.0, 0.7], [0.7, 0.49]]) + 1e-12 * np.eye(2))
         settings = {"disturbance_bound": 0.0, "sensor_bound": noise, "initial_bound": 0.0}
         plant = LinearPlant(A=[[RATE]], B=[[1.0]], H=[[1.0], [0.7]], box=[1.0], u_max=1.0, dt=0.1, **settings)
-        sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+        sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
         gain, shape = np.array([[70.0, -100.0]]) * rng.uniform(0.5, 1.0), np.array([[1e-26]])
         N = congruence(rational(gain), rational(sets.noise))
         assert sets.updated(shape, gain).item() >= N[0][0]
@@ -132,7 +132,7 @@ def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_inflation_and_the_room(gain):
     plant = plant_with(1.0)
-    sets = sets_for_age_zero(plant, 1.0, 1.0, 0.5, [[gain]], 0.5, noise=np.ones((1, 1))).ages
+    sets = sets_for_age_zero(plant, 1.0, 1.0, 0.5, [[gain]], 0.5, noise=np.ones((1, 1)))
     ((_, inner, _),) = sets.needs(plant)["(C2)"]
     assert inner.item() == pytest.approx(2.0 * INFLATION, rel=1e-10)
     room = sets.rounding_of_update(plant, 0)
@@ -155,7 +155,7 @@ def test_sets_that_are_found_have_the_room():
         )
         error_set = certified_error_set(plant, ChannelContract(2))
         assert Estimator(plant, Channel(), error_set).error_set is error_set
-        outer, inner, _ = zip(*error_set.ages.needs(plant)["(C2)"], strict=True)
+        outer, inner, _ = zip(*error_set.needs(plant)["(C2)"], strict=True)
         for held, needed in zip(outer, inner, strict=True):
             assert is_inside(needed, held)
 
@@ -186,7 +186,7 @@ def sets_of_two_sensors_whose_noise_is_nearly_common():
 
 def test_room_grows_with_the_gain_and_sets_without_it_are_refused():
     plant, error_set = sets_of_two_sensors_whose_noise_is_nearly_common()
-    sets = error_set.ages
+    sets = error_set
     gain, mu = sets.gains[0], sets.multipliers[0]
     assert np.abs(gain).min() > 100.0
     kept = (1.0 - (gain @ plant.H).item()) ** 2 * sets.shapes[1] / mu
@@ -214,7 +214,7 @@ def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(
     own = Ellipsoid(noise**2 * matched @ matched.T + 1e-12 * np.eye(2))  # the gain does not see what is common to both
     settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "initial_bound": 0.0}
     plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)
-    sets = sets_for_age_zero(plant, 1.0, error**2, 0.5, gain, 0.5).ages
+    sets = sets_for_age_zero(plant, 1.0, error**2, 0.5, gain, 0.5)
     rng, moved = np.random.default_rng(0), 0.0
     for _ in range(300):
         estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 1.0)])

@@ -85,7 +85,7 @@ def test_contract_knows_who_keeps_it():
 @pytest.mark.parametrize("name", PLANTS)
 def test_error_sets_meet_their_conditions_exactly(name):
     plant, contract = PLANTS[name]
-    sets = certified_error_set(plant, contract).ages
+    sets = certified_error_set(plant, contract)
     A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, plant.disturbance.shape_matrix, sets.noise))
     shapes = [rational(shape) for shape in sets.shapes]
     assert len(shapes) == contract.max_age + 2
@@ -205,10 +205,10 @@ def test_prediction_falls_back_to_the_certified_set(monkeypatch):
     membership = SetMembership(plant, 0.0, sets)
     monkeypatch.setattr(set_membership, "outer_sum", lambda first, second, weight: 1e3 * (first + second))
     monkeypatch.setattr(type(sets), "rate_at", lambda self, age: 1e-6)
-    shape = membership.predicted(sets.ages.shapes[1], 1)
-    np.testing.assert_array_equal(shape, sets.ages.shapes[2])
-    outside = 2.0 * sets.ages.shapes[1]  # a broken contract: no certified set applies
-    assert not is_inside(membership.predicted(outside, 1), sets.ages.shapes[2])
+    shape = membership.predicted(sets.shapes[1], 1)
+    np.testing.assert_array_equal(shape, sets.shapes[2])
+    outside = 2.0 * sets.shapes[1]  # a broken contract: no certified set applies
+    assert not is_inside(membership.predicted(outside, 1), sets.shapes[2])
 
 
 def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(monkeypatch):
@@ -223,18 +223,18 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
 
     oldest = contract.max_age + 1
     for age in (1, oldest):
-        gain, inside = updated(sets.ages.shapes[age], age)
-        np.testing.assert_array_equal(gain, sets.ages.gains[age - 1])
-        np.testing.assert_array_equal(inside.shape, sets.ages.shapes[0])
-        _, outside = updated(1.1 * sets.ages.shapes[age], age)
-        assert not is_inside(outside.shape, sets.ages.shapes[0])
-    gain, late = updated(sets.ages.shapes[oldest], oldest + 9)  # the last set counts, whatever the age
-    np.testing.assert_array_equal(gain, sets.ages.gains[-1])
+        gain, inside = updated(sets.shapes[age], age)
+        np.testing.assert_array_equal(gain, sets.gains[age - 1])
+        np.testing.assert_array_equal(inside.shape, sets.shapes[0])
+        _, outside = updated(1.1 * sets.shapes[age], age)
+        assert not is_inside(outside.shape, sets.shapes[0])
+    gain, late = updated(sets.shapes[oldest], oldest + 9)  # the last set counts, whatever the age
+    np.testing.assert_array_equal(gain, sets.gains[-1])
     assert late.certified
-    np.testing.assert_array_equal(late.shape, sets.ages.shapes[0])
-    _, late = updated(1.1 * sets.ages.shapes[oldest], oldest + 9)
+    np.testing.assert_array_equal(late.shape, sets.shapes[0])
+    _, late = updated(1.1 * sets.shapes[oldest], oldest + 9)
     assert not late.certified
-    assert not is_inside(late.shape, sets.ages.shapes[0])
+    assert not is_inside(late.shape, sets.shapes[0])
 
 
 def test_sets_by_age_that_fail_a_condition_are_an_error():
@@ -244,10 +244,10 @@ def test_sets_by_age_that_fail_a_condition_are_an_error():
     require_error_set(errors, plant)
     # The first set would hold no update, and the last not what the one before it moves into.
     for age, name in ((0, r"\(C2\)"), (contract.max_age + 1, r"\(C1\)")):
-        shapes = errors.ages.shapes.copy()
+        shapes = errors.shapes.copy()
         shapes[age] *= 0.5
         with pytest.raises(ErrorSetError, match=name):
-            require_error_set(replace(errors, ages=replace(errors.ages, shapes=shapes)), plant)
+            require_error_set(replace(errors, shapes=shapes), plant)
     worse = replace(plant, initial_cov=np.eye(4))
     with pytest.raises(ErrorSetError, match=r"\(C0\)"):
         require_error_set(errors, worse)
@@ -255,7 +255,7 @@ def test_sets_by_age_that_fail_a_condition_are_an_error():
 
 def test_every_age_has_a_set_and_a_rate_of_its_own():
     errors = certified_error_set(*PLANTS["batch reactor"])
-    rates = [errors.rate_at(age) for age in range(len(errors.ages.rates))]
-    assert rates == errors.ages.rates.tolist()
+    rates = [errors.rate_at(age) for age in range(len(errors.rates))]
+    assert rates == errors.rates.tolist()
     assert len(set(rates)) == len(rates)
-    assert errors.shape_at(len(errors.ages.shapes)) is None
+    assert errors.shape_at(len(errors.shapes)) is None

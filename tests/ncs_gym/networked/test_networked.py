@@ -146,6 +146,30 @@ def test_what_is_seen_where_nothing_arrived():
     assert counts(run(Networked(Counter(), lost, fill=predicted), 7)) == [0, 1, 2, 3, 4, 5, 6, 7]
 
 
+@pytest.mark.parametrize("channel", [Channel(delay=3), Channel(delay=1, jitter=3, loss=0.3, send_period=2)])
+def test_exact_prediction_makes_up_for_delays(channel):
+    def predicted(last, age, actions):
+        return last + np.reshape(age, (-1, 1)) if np.ndim(age) else last + age
+
+    one = run(Networked(Counter(length=50), channel, fill=predicted), 40)
+    assert counts(one) == list(range(41))
+    assert max(each[-1]["measurement_age"] for each in one) >= 3
+    envs = VectorNetworked(gym.vector.SyncVectorEnv([lambda: Counter(length=50)] * 5), channel, fill=predicted)
+    assert (envs.reset(seed=0)[0] == 0).all()
+    for k in range(1, 41):
+        assert (envs.step(np.full((5, 1), k + 0.0))[0] == k).all()
+
+
+def test_rest_of_delayed_rewards_that_nobody_pays_is_told_of():
+    inside = Networked(TimeLimit(Counter(length=99), 9), Channel(delay=4), delay_reward=True)
+    outside = TimeLimit(Networked(Counter(length=99), Channel(delay=4), delay_reward=True), 9)
+    paid = [sum(float(each[1]) for each in run(env, 9)[1:]) for env in (inside, outside)]
+    assert paid[0] > paid[1]
+    inside.reset()
+    with pytest.warns(UserWarning, match=f"rewards of {paid[0] - paid[1]:g} were on their way"):
+        outside.reset()
+
+
 def test_entries_are_what_infos_say_and_actions_are_those_decided():
     env = Networked(gym.make("CartPole-v1"), LATE, LATE, ("age", "arrived", "pending_actions"), neutral=1, pending=3)
     assert env.observation_space.shape == (4 + 1 + 1 + 2 * 3,)
