@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 # Instructions of processors that numpy chooses when it starts.
 WIDE := AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3
 PACKAGES := ncs_gym shields agents experiments
-# Modules are compiled once, not in every process that tests start.
+# Modules are compiled once, when they are first imported: not all of them by pip, nor in every process that tests start.
 export PYTHONDONTWRITEBYTECODE :=
 INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
@@ -121,25 +121,25 @@ address: $(INSTALLED) ## writes the public address everywhere (ADDRESS=https://.
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,contrib,render,video,zmq,live,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[train,contrib,render,video,zmq,live,dev]'
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[docs]'
 	touch $@
 
 $(AUDIT_INSTALLED): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[audit]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[audit]'
 	touch $@
 
 $(RAY_INSTALLED): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ray]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[ray]'
 	touch $@
 
 # rl-zoo3 declares older versions than it runs with (docs/integrations.md).
 $(ZOO_INSTALLED): examples/rl_zoo/requirements.txt $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r examples/rl_zoo/requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps -r examples/rl_zoo/requirements.txt
 	touch $@
 
 clean: ## removes the environment and the site
