@@ -327,6 +327,22 @@ def test_duplicates_are_not_taken_off_the_number_of_lost_packets(written):
     assert np.isnan(log.delays).tolist() == [False, False, True, True, False]
 
 
+def test_summary_of_windows_adds_no_packet_that_has_a_line(written):
+    lines = "".join(f"Reply from 192.0.2.1: bytes=32 time={ms}ms TTL=57\n" for ms in (12, 14, 13))
+    text = "Pinging 192.0.2.1 with 32 bytes of data:\n" + lines + "    Packets: Sent = {}, Received = 3, Lost = 0,\n"
+    assert len(PacketLog.load(written(text.format(3))).sent) == 3
+    assert len(PacketLog.load(written(text.format(5))).sent) == 5
+
+
+def test_numbers_of_a_list_of_delays_ascend(written):
+    log = PacketLog.load(written("seq,rtt_ms\n1,5\n2,6\n4,7\n"), period=0.1)
+    assert np.isnan(log.delays).tolist() == [False, False, True, False]
+    assert np.allclose(log.sent, [0.0, 0.1, 0.2, 0.3])
+    for numbers in ((1, 1, 2), (2, 1, 3)):
+        with pytest.raises(ValueError, match="do not ascend"):
+            PacketLog.load(written("seq,rtt_ms\n" + "".join(f"{number},5\n" for number in numbers)))
+
+
 def test_list_with_three_decimals_may_mark_what_is_lost_by_a_number(written):
     assert np.isnan(PacketLog.load(written("rtt_ms\n18.124\n5.188\n-1\n")).delays).tolist() == [False, False, True]
 
