@@ -330,6 +330,7 @@ def test_duplicates_are_not_taken_off_the_number_of_lost_packets(written):
 def test_summary_of_windows_adds_no_packet_that_has_a_line(written):
     lines = "".join(f"Reply from 192.0.2.1: bytes=32 time={ms}ms TTL=57\n" for ms in (12, 14, 13))
     text = "Pinging 192.0.2.1 with 32 bytes of data:\n" + lines + "    Packets: Sent = {}, Received = 3, Lost = 0,\n"
+    assert len(PacketLog.load(written(text.partition("    Packets")[0])).sent) == 3
     assert len(PacketLog.load(written(text.format(3))).sent) == 3
     assert len(PacketLog.load(written(text.format(5))).sent) == 5
 
