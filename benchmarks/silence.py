@@ -127,7 +127,8 @@ def back(ids: Sequence[str] = ()) -> None:
     row = "{:20} {:>8} {:>6} {:>6} {:>6}" + 3 * " {:>6} {:>6}"
     print(row.format("[steps]", *columns))
     for name, env, contract in with_contracts(ids):
-        found = silence_of(certificate_for(env.plant, contract), env.plant)
+        input_delay = env.downlink_protocol.input_delay
+        found = silence_of(certificate_for(env.plant, contract), env.plant, input_delay)
         assert found is not None
         kept = [found.max_age + steps for steps in (0, found.anywhere, found.at_half, found.at_rest)]
         print(row.format(name, *kept, *(steps for way in found.ways_back for steps in way[1:])), flush=True)
@@ -149,19 +150,19 @@ def ways(ids: Sequence[str] = ()) -> None:
     print(f"{'':20} {'update for it':>15} {'samples alone':>15} {'ladder':>15}")
     show = table("[steps]", *("each", "rarely") * 3, first=20, width=8)
 
-    def steps_of(plant: LinearPlant, contract: ChannelContract) -> list[float]:
+    def steps_of(plant: LinearPlant, contract: ChannelContract, input_delay: int = 0) -> list[float]:
         errors, age = certified_error_set(plant, contract), contract.max_age
-        recursion = ErrorRecursion(plant, contract.quantization_step, errors)
-        chosen = [way_back(recursion, 10 * age, gap) for gap in (1, age + 1)]
-        alone = [by_newest_samples(plant, contract, errors, gap) for gap in (1, age + 1)]
-        ladder = [by_ladder(recursion, 10 * age, gap) for gap in (1, age + 1)]
+        recursion, gaps = ErrorRecursion(plant, contract.quantization_step, errors), (1, age - input_delay + 1)
+        chosen = [way_back(recursion, 10 * age, gap) for gap in gaps]
+        alone = [by_newest_samples(plant, contract, errors, gap) for gap in gaps]
+        ladder = [by_ladder(recursion, 10 * age, gap) for gap in gaps]
         return [np.inf if each is None else each for each in chosen] + alone + ladder
 
     def texts(columns: Sequence[float]) -> list[str]:
         return ["never" if np.isinf(each) else f"{each:.0f}" for each in columns]
 
     for name, env, contract in with_contracts(ids):
-        show(name, *texts(steps_of(env.plant, contract)))
+        show(name, *texts(steps_of(env.plant, contract, env.downlink_protocol.input_delay)))
     steps = np.array([steps_of(*each) for each in under_contracts(30)])
     show("30 random, at most", *texts(np.where(np.isfinite(steps), steps, -np.inf).max(axis=0).tolist()))
     show("  of these never", *np.isinf(steps).sum(axis=0))

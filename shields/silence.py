@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant, certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
-from ncs_gym.validation import own_error_state
+from ncs_gym.validation import as_count, own_error_state
 from shields.certificate import Certificate
 from shields.certificate_text import counted, labeled
 from shields.polytope import Polytope
@@ -89,15 +89,17 @@ class Silence:
         return labeled("  silence     ", kept) + "\n" + labeled("  way back    ", back)
 
 
-def silence_of(certificate: Certificate, plant: LinearPlant) -> Silence | None:
+def silence_of(certificate: Certificate, plant: LinearPlant, input_delay: int = 0) -> Silence | None:
     """Returns what is known of silences that exceed a certificate's contract; None without a contract.
 
     Args:
         certificate: Verified exactly here.
         plant: The plant it was made for.
+        input_delay: What a downlink takes of the contract's age [steps], as `NCSEnv.downlink_protocol` says.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
+        ValueError: If the input delay is beyond the contract's age.
     """
     require_valid(certificate, plant)
     contract = certificate.contract
@@ -105,7 +107,8 @@ def silence_of(certificate: Certificate, plant: LinearPlant) -> Silence | None:
         return None
     fallbacks = _Fallbacks(certificate, plant)
     recursion = ErrorRecursion(plant, contract.quantization_step, certified_error_set(plant, contract))
-    rarest = contract.max_age + 1  # steps from one sample to the next, if they arrive at once
+    input_delay = as_count(input_delay, "input_delay", low=0, high=contract.max_age)
+    rarest = contract.max_age - input_delay + 1  # steps from one sample to the next, if they arrive at once
     outages = [many * max(contract.max_age, 1) for many in OUTAGES]
     ways = [WayBack(steps, *(way_back(recursion, steps, gap) for gap in (1, rarest))) for steps in outages]
     at_half, at_rest = fallbacks.kept_from(0.5), fallbacks.kept_from(0.0)

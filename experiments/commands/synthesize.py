@@ -20,7 +20,7 @@ _DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"
 def synthesize(settings: SynthesizeSettings) -> None:
     """Runs `ncs synthesize`."""
     require_place(settings.out)
-    plant, contract = _plant_and_contract(settings)
+    plant, contract, input_delay = _problem(settings)
     try:
         with synthesis_status() as show:
             certificate = shields.synthesize(
@@ -40,18 +40,22 @@ def synthesize(settings: SynthesizeSettings) -> None:
         ) from interrupt
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")
-    if (silence := shields.silence_of(certificate, plant)) is not None:
+    if (silence := shields.silence_of(certificate, plant, input_delay)) is not None:
         print(f"Beyond the contract:\n{silence}")
     print(f"saved to {settings.out}")
 
 
-def _plant_and_contract(settings: SynthesizeSettings) -> tuple[LinearPlant, ChannelContract | None]:
-    """Returns the plant of a file or an environment, and the contract of the environment with the changes asked for."""
+def _problem(settings: SynthesizeSettings) -> tuple[LinearPlant, ChannelContract | None, int]:
+    """Returns the plant of a file or an environment, the contract with the changes asked for, and the downlink's part.
+
+    That is 0 under another contract than the environment's.
+    """
     if settings.plant is None:
         env = registered_env(settings.env or _DEFAULT_ENV)
-        plant, contract = env.plant, env.certificate_contract
+        plant, own, input_delay = env.plant, env.certificate_contract, env.downlink_protocol.input_delay
     else:
-        plant, contract = LinearPlant.load(settings.plant), None
+        plant, own, input_delay = LinearPlant.load(settings.plant), None, 0
     if settings.between_samples is not None:
         plant = replace(plant, between_samples=settings.between_samples)
-    return plant, changed_contract(contract, settings.max_age, settings.quantization_step)
+    contract = changed_contract(own, settings.max_age, settings.quantization_step)
+    return plant, contract, input_delay if contract == own else 0

@@ -19,9 +19,13 @@ def verify(settings: VerifySettings) -> None:
     """Runs `ncs verify`."""
     require_place(settings.out)
     certificate = Certificate.load(settings.file)
+    input_delay = 0
     if settings.plant is None:
         origin = settings.env or _matching_env(certificate)
-        plant = registered_env(origin).plant
+        env = registered_env(origin)
+        plant = env.plant
+        if certificate.contract == env.certificate_contract:
+            input_delay = env.downlink_protocol.input_delay
     else:
         origin, plant = str(settings.plant), LinearPlant.load(settings.plant)
     report = shields.verify(certificate, plant)
@@ -41,16 +45,18 @@ def verify(settings: VerifySettings) -> None:
             f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
         )
     print(certificate)
-    if (silence := shields.silence_of(certificate, plant)) is not None:
+    if (silence := shields.silence_of(certificate, plant, input_delay)) is not None:
         print(f"Beyond the contract:\n{silence}")
     print(f"{settings.file} verifies")
 
 
 def _matching_env(certificate: Certificate) -> str:
-    for env_id in registered_ids():
-        if registered_env(env_id).plant.fingerprint == certificate.fingerprint:
-            return env_id
-    raise CertificateError(
-        "the certificate belongs to no registered environment's plant; "
-        "for one of your own give --env module:id or --plant FILE, or call shields.verify(certificate, plant)"
-    )
+    """Returns the registered environment with the plant of a certificate, of several one with its contract."""
+    envs = {env_id: registered_env(env_id) for env_id in registered_ids()}
+    found = [env_id for env_id, env in envs.items() if env.plant.fingerprint == certificate.fingerprint]
+    if not found:
+        raise CertificateError(
+            "the certificate belongs to no registered environment's plant; "
+            "for one of your own give --env module:id or --plant FILE, or call shields.verify(certificate, plant)"
+        )
+    return next((each for each in found if envs[each].certificate_contract == certificate.contract), found[0])

@@ -343,10 +343,10 @@ _SUFFIX = re.compile(rf"_({'|'.join(_UNITS)})$")
 # Times since 1970 of these decades, by the number before the point: a column without a unit is in this one.
 _EPOCHS = ((Decimal(10) ** 11, "ms"), (Decimal(10) ** 14, "us"), (Decimal(10) ** 17, "ns"), (Decimal(10) ** 20, ""))
 # Numbers that mark what is lost, and a limit of all others.
-_MARKS = {Decimal(0), Decimal(-1)}
+_MARKS, _MARKS_OF_DATES = {Decimal(0), Decimal(-1)}, {"0", "-1"}
 _LARGEST_COUNT = 2**53
 _LARGEST = Decimal(10) ** 305
-_LOST = {"", "na", "n/a", "nan", "none", "null", "-", "--", "*", "lost", "timeout"}
+_LOST = {"", "na", "n/a", "nan", "nat", "inf", "infinity", "none", "null", "-", "--", "*", "lost", "timeout"}
 _YES, _NO = {"1", "1.0", "true", "yes", "y"}, {"0", "0.0", "false", "no", "n", ""}
 # Words of the names of columns, and cells, that may tell of lost packets where nobody knows how.
 _OF_LOSS = re.compile(
@@ -413,6 +413,7 @@ def _of_table(lines: Sequence[str], period: float | None, step: float) -> Record
     unused = {index: name for index, name in enumerate(names) if index not in used}
     _require_decimals(rows(), [each.index for role, each in columns.items() if role in ("sent", "received", "delay")])
     if {"episode", "sent", "received"} <= columns.keys():
+        _require_steps(columns, unused)
         return _of_steps(rows(), columns, step)
     for index, name in unused.items() if "delay" in columns or {"sent", "received"} <= columns.keys() else ():
         _require_no_loss(name, cells[index])
@@ -542,18 +543,36 @@ def _is_number(cell: str) -> bool:
     try:
         _number(cell)
     except ValueError:
-        return False
+        return _is_date(cell)
     return True
 
 
-def _number(cell: str) -> Decimal | None:
-    """Returns the number or the time of day in a cell, None for a mark of what is lost; raises ValueError otherwise."""
+def _is_date(cell: str) -> bool:
+    """Returns whether a cell has a date and a time of day."""
+    try:
+        return len(cell) <= _LONGEST_CELL and _date(cell) is not None
+    except ValueError:
+        return False
+
+
+def _number(cell: str, *, is_date: bool = False) -> Decimal | None:
+    """Returns the number in a cell, or seconds since 1970 if it is a date, None for a mark of what is lost.
+
+    Raises:
+        ValueError: If it is neither, or a number where a date should be.
+    """
     if len(cell) > _LONGEST_CELL:
         raise ValueError("too long")
+    if cell.lower() in _LOST:
+        return None
+    if is_date:
+        return Decimal(cell) if cell in _MARKS_OF_DATES else _date(cell)
     try:
         value = Decimal(cell)
     except InvalidOperation:
-        return _no_plain_number(cell)
+        if not re.fullmatch(r"[+-]?\d+,\d+", cell):
+            raise ValueError("no number") from None
+        return Decimal(cell.replace(",", "."))  # a decimal comma, where commas do not separate
     if value.is_nan() or value == Decimal("Infinity"):  # it never arrived
         return None
     if not -_LARGEST < value < _LARGEST:
@@ -561,11 +580,10 @@ def _number(cell: str) -> Decimal | None:
     return value
 
 
-def _no_plain_number(cell: str) -> Decimal | None:
-    if cell.lower() in _LOST:
-        return None
-    if re.fullmatch(r"[+-]?\d+,\d+", cell):  # a decimal comma, where commas do not separate
-        return Decimal(cell.replace(",", "."))
+def _date(cell: str) -> Decimal:
+    """Returns the seconds since 1970 of a date in ISO 8601, in UTC if it names no zone."""
+    if re.fullmatch(r"[+-]?[\d.,]+", cell):
+        raise ValueError("a number")
     moment = datetime.fromisoformat(cell)
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     return Decimal((moment - _SINCE) // timedelta(microseconds=1)) / 10**6
@@ -577,10 +595,14 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
     until = columns[by]
     sent, arrived, delays, marked, at_zero, numbers, flagged, places = [], [], [], [], [], [], [], []
     origin, unit, until_unit, scale, until_scale = Decimal(0), "", "", Decimal(1), Decimal(1)
+    dated = False
     for line, cells in rows:
         cells += (len(names) - len(cells)) * [""]
+        if not sent and (dated := _is_date(cells[sent_at.index])):
+            _require_no_unit([sent_at, until] if by == "received" else [sent_at])
         try:
-            start, end = _number(cells[sent_at.index]), _number(cells[until.index])
+            start = _number(cells[sent_at.index], is_date=dated)
+            end = _number(cells[until.index], is_date=dated and by == "received")
             if "number" in columns:
                 numbers.append(_count(cells[columns["number"].index]))
         except ValueError:
@@ -632,7 +654,7 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
         before = len(moments)
         moments, delays = _with_absent(moments, delays)
         absent = len(moments) - before
-    if guessed and abs(origin) < 10**8 and 0.0 < _median_gap(moments) < _CLOSEST:
+    if guessed and abs(origin) < _YEARS[0] and 0.0 < _median_gap(moments) < _CLOSEST:
         raise ValueError(
             f"its packets would be sent every {_median_gap(moments):.3g} s, if times were seconds: write the unit into "
             "the names of the columns (sent_ms), and the days of a spreadsheet as seconds"
@@ -642,7 +664,7 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column]
             "the names of the columns say no unit, and most packets would take more than a second: name it, as in "
             "sent_ms and received_ms, or sent_s and received_s"
         )
-    epoch = "" if origin < 10**8 else ", times since 1970"
+    epoch = "" if origin < _YEARS[0] else ", times since 1970"
     used = {each.index for each in columns.values()}
     unused = [shown(name) for index, name in enumerate(names) if index not in used]
     read_as = f"Read as a table: {shown(sent_at.name)} in {unit}, {shown(until.name)} in {until_unit}{epoch}."
@@ -667,14 +689,23 @@ def _require_units(sent: _Column, delay: _Column, first: Decimal) -> None:
     """
     of_sent = sent.unit or next((unit for above, unit in reversed(_EPOCHS) if abs(first) >= above), "")
     no_unit = delay if of_sent not in ("", "s") and not delay.unit else None
-    if delay.unit and not of_sent and abs(first) < 10**8:
+    if delay.unit and not of_sent and abs(first) < _YEARS[0]:
         no_unit = sent
     if no_unit is not None:
         other, unit = (sent, of_sent) if no_unit is delay else (delay, delay.unit)
         name = _plain(no_unit.name)
         raise ValueError(
-            f"{shown(other.name)} is in {unit} and {shown(no_unit.name)} has no unit: name it {name}_{unit} or {name}_s"
+            f"{shown(other.name)} is in {unit} and {shown(no_unit.name)} has no unit: name it "
+            + " or ".join(f"{name}_{each}" for each in dict.fromkeys((unit, "s", "ms")))
         )
+
+
+def _require_no_unit(columns: Sequence[_Column]) -> None:
+    """Raises ValueError if a column of dates has another unit than seconds."""
+    for column in columns:
+        if column.unit not in ("", "s"):
+            name = _SUFFIX.sub("", _plain(column.name))
+            raise ValueError(f"times are dates, and {shown(column.name)} has the unit {column.unit}: name it {name}")
 
 
 def _units(sent: _Column, until: _Column, by: str, first: Decimal) -> tuple[str, str]:
@@ -777,8 +808,14 @@ def _with_missing(sent: np.ndarray, delays: np.ndarray, numbers: np.ndarray) -> 
     """
     order = np.lexsort((np.where(np.isnan(delays), np.inf, delays), numbers, sent))
     sent, delays, numbers = sent[order], delays[order], numbers[order]
-    once = np.append(True, (np.diff(numbers) != 0) | (np.diff(sent) > 0.0))
-    sent, delays, numbers = sent[once], delays[once], numbers[once]
+    same = np.diff(numbers) == 0
+    again = np.flatnonzero(same & (np.diff(sent) > 0.0))
+    if len(again):
+        raise ValueError(
+            f"packet {numbers[again[0]]} was sent at two times, as what is sent again until it arrives: log the time "
+            "at which its sample was taken"
+        )
+    sent, delays, numbers = (each[np.append(True, ~same)] for each in (sent, delays, numbers))
     back = np.flatnonzero((numbers[1:-1] < numbers[:-2]) & (numbers[:-2] < numbers[2:]))
     if len(back):
         raise ValueError(
@@ -819,6 +856,18 @@ def _with_lost(sent: np.ndarray, delays: np.ndarray, counts: np.ndarray) -> tupl
     sent, delays = np.append(sent, added), np.append(delays, np.full(len(added), np.nan))
     order = np.argsort(sent, kind="stable")
     return sent[order], delays[order]
+
+
+def _require_steps(columns: dict[str, _Column], unused: dict[int, str]) -> None:
+    """Raises ValueError if a table with episodes is no log of `ncs loop`, which has steps and what arrived alone."""
+    others = [
+        column.name for role, column in columns.items() if role not in ("episode", "sent", "received") or column.unit
+    ]
+    if others := [*others, *unused.values()]:
+        raise ValueError(
+            f"a table with the column episode is a log of ncs loop, in steps, and has no {shown(others[0])}: put the "
+            "times of each episode into a file of its own, without that column"
+        )
 
 
 def _of_steps(rows: Iterator[tuple[int, list[str]]], columns: dict[str, _Column], dt: float) -> Record:

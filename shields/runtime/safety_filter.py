@@ -140,8 +140,10 @@ class SafetyFilter(ReadOnlyArrays):
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
         errors = error_shape if isinstance(error_shape, PredictedErrors) else self.errors_of(error_shape)
         if (x_hat.shape, proposed.shape) != self._single:
-            if 0 in (x_hat.ndim, proposed.ndim) and (x_hat.size, proposed.size) == (self.plant.n, self.plant.m):
-                return self.decide(x_hat.reshape(-1), errors, proposed.reshape(-1), stored)
+            if 0 in (x_hat.ndim, proposed.ndim):  # numbers are vectors of one entry
+                pairs = (estimate, x_hat), (input_proposed, proposed)
+                one, other = (given if array.ndim else array[None] for given, array in pairs)
+                return self.decide(one, errors, other, stored)
             self._tell_of_shapes(estimate, input_proposed)
         elif self.mode != "boundary":
             try:

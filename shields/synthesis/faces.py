@@ -130,6 +130,7 @@ class Extremes:
 
     def _bound_by(self, row: np.ndarray, reach: np.ndarray, multipliers: np.ndarray) -> float:
         ends = np.where(multipliers > 0.0, self._faces.high, self._faces.low)
+        multipliers = np.where(np.isfinite(ends), multipliers, 0.0)  # an open end proves nothing
         used = multipliers != 0.0
         return float(multipliers[used] @ ends[used] + np.abs(row - multipliers @ self._faces.rows) @ reach)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import copy
+import datetime
 import json
 import math
 import pickle
@@ -321,6 +322,15 @@ def test_columns_of_other_things_are_left_out(written):
     assert "Not used: 'size', 'version', 'lossless'" in log.read_as
 
 
+def test_dates_say_what_is_lost_as_numbers_do(written):
+    start = datetime.datetime(2026, 1, 1)
+    ends = ["{}", "NaT", "0", "", "inf", "-1", "{}"]
+    times = [((start + datetime.timedelta(seconds=k)).isoformat(), end) for k, end in enumerate(ends)]
+    log = PacketLog.load(written("sent,received\n" + "".join(f"{sent},{end.format(sent)}\n" for sent, end in times)))
+    assert np.isnan(log.delays).tolist() == [False, *5 * [True], False]
+    assert log.sent.tolist() == list(range(7))
+
+
 def test_duplicates_are_not_taken_off_the_number_of_lost_packets(written):
     log = PacketLog.load(written("seq,sent_ms,delay_ms\n1,0,5\n1,0,6\n2,20,5\n2,20,7\n5,80,5\n"))
     assert "stands for a lost packet (2 numbers)" in log.read_as
@@ -402,6 +412,28 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
             (f"sent_ms,delay_ms,{name}\n0,5,0\n20,6,{cell}\n", f"'{name}' may say which packets were lost")
             for name, cell in {"flag": 1, "X": "lost", "loss_pct": 33, "status": "failed", "acked?x": 2}.items()
         ),
+        *(
+            (f"{names}\n2026-01-01T10:00:00,{end}\n2026-01-01T10:00:01,{end}\n", f"'{wrong}' has the unit")
+            for names, end, wrong in (
+                ("sent_ms,delay_ms", 7, "sent_ms"),
+                ("sent,received_ms", "2026-01-01T10:00:02", "received_ms"),
+                ("sent_us,received", "2026-01-01T10:00:02", "sent_us"),
+            )
+        ),
+        (
+            "sent,received\n2026-01-01T10:00:00,1\n2026-01-01T10:00:01,2\n",
+            "line 2 is not a time sent and a time received",
+        ),
+        ("sent,received\n1,2\n2026-01-01T10:00:01,2\n", "line 3 is not a time sent and a time received"),
+        ("sent,delay_s\n0,2026-01-01T10:00:01\n", "line 2 is not a time sent and a delay"),
+        *(
+            (f"episode,sent{unit},received,{name}\n0,1,1,0\n0,2,2,1\n", f"has no '{wrong}': put the times of each")
+            for unit, name, wrong in (("", "lost", "lost"), ("", "status", "status"), ("_s", "ok", "sent_s"))
+        ),
+        ("seq,sent,delay\n1,0,0.1\n2,1,0.1\n2,2,0.1\n", "packet 2 was sent at two times"),
+        ("sent_ms,delay\n120000000,5\n120000020,6\n", "'delay' has no unit: name it delay_ms or delay_s"),
+        ("sent,delay_ms\n120000000,5\n120000020,6\n", "'sent' has no unit: name it sent_ms or sent_s"),
+        ("sent,rtt_s\n1,5\n2,6\n", "'sent' has no unit: name it sent_s or sent_ms"),
         ("sent_ms,delay_ms,lost\n0,5,0\n20,6,3\n", "line 3: 'lost' has to be 0 or 1, yes or no, got '3'"),
         ("time,rtt_ms\n0,10\n0.1,11\n60,12\n", "'time' may say when packets were sent or when they came back"),
         ("Time_s;latency\n0;10\n0.1;11\n", "name it sent_s or received_s, and 'latency' by its unit"),
