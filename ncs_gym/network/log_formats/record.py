@@ -1,0 +1,39 @@
+"""What a file of recorded packets says, and what readers of several formats share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Repeated or late numbers are few in a row, unless something began anew.
+MOST_LATE = 16
+WAY_AND_BACK = "delays are those of the whole way and back"
+
+
+class Record(NamedTuple):
+    """What a file says.
+
+    Attributes:
+        sent: When each packet was sent, shape (k,), ascending [s].
+        delays: How long each was on its way, shape (k,); NaN for a lost one [s].
+        read_as: How the file was read, in sentences.
+    """
+
+    sent: np.ndarray
+    delays: np.ndarray
+    read_as: str
+
+
+def require_time(numbers: np.ndarray, sent: np.ndarray) -> None:
+    """Raises ValueError if there is too little time between two packets for those that are missing between them."""
+    steps, gaps = np.diff(numbers), np.diff(sent)
+    if not (steps == 1).any():
+        return
+    expected = steps * np.quantile(gaps[steps == 1], 0.05)
+    hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
+    if len(hurried):
+        raise ValueError(
+            f"between the packets {numbers[hurried[0]]} and {numbers[hurried[0] + 1]} its stamps leave too little time "
+            "for the lost ones: the clock was set back there, cut the record"
+        )
