@@ -12,7 +12,7 @@ import tyro
 from experiments.settings.arguments import Assignments, StepCount, require_horizon, require_limits
 from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
-from ncs_gym.plants.linear_plant import SMALLEST_DELTA
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA
 from shields.runtime.safety_filter import LONGEST_HORIZON
 
 

@@ -9,7 +9,8 @@ from typing import Literal, Self, overload
 import numpy as np
 
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH, LinearPlant
+from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from ncs_gym.validation import ReadOnlyArrays
 

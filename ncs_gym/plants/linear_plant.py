@@ -1,7 +1,4 @@
-"""The linear plant: its equations, its limits, what is declared of everything uncertain about it, and its hard bounds.
-
-Proofs take the bounds, so they are the same numbers on every machine (`ncs_gym.exact`).
-"""
+"""The linear plant: its equations, its limits, and what is declared of everything uncertain about it."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +20,8 @@ from ncs_gym.plants import between_samples, limits, plant_file, statespace
 from ncs_gym.plants.assumptions import assumptions_of, warn_of_no_noise
 from ncs_gym.plants.description import described
 from ncs_gym.plants.family import plant_of_middle
+from ncs_gym.plants.hard_bounds import HardBounds
+from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import LONGEST_INPUT_DELAY, inputs_under_way, storing
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
@@ -32,14 +30,10 @@ from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.truncated_gaussian import (
     SMALLEST_DELTA,
     SMALLEST_KEPT,
-    TruncatedGaussian,
-    truncation_energy,
 )
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     SMALLEST_NUMBER,
-    ReadOnlyArrays,
-    again_if_interrupted,
     as_count,
     as_covariance,
     as_matrix,
@@ -56,14 +50,6 @@ if TYPE_CHECKING:
 
     from ncs_gym.uncertainty.declared_bound import Bound
 
-# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
-INFLATION = 1.0 + 1e-9
-# The same for directions in which a bound is flat: growth of its diagonal alone.
-FLAT_INFLATION = 1e-12
-# No disturbance set is thinner than this, in squared half-widths of the safe box.
-THINNEST = 1e-19
-# Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
-SIMULATED_REACH = 100.0
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
 # Disturbances of a step of a model whose response to a constant is worse conditioned are not traced back to its cause.
@@ -110,7 +96,7 @@ def with_limits_as_published(kind: Kind) -> Kind:
 
 @with_limits_as_published
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinearPlant(ReadOnlyArrays):
+class LinearPlant(LimitValues, HardBounds):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
     All of it is in deviations from an operating point, (0, 0) unless given, except the limits of the constructor, which
@@ -519,16 +505,6 @@ class LinearPlant(ReadOnlyArrays):
         """The same plant without its remainder: what is declared beside it."""
         return self if self.remainder is None else replace(self, remainder=None)
 
-    @property
-    def box_low(self) -> np.ndarray:
-        """The low ends of c_j x, shape (k,); infinite where there is none."""
-        return self.box_ends[0]
-
-    @property
-    def box_high(self) -> np.ndarray:
-        """The high ends of c_j x, shape (k,); infinite where there is none."""
-        return self.box_ends[1]
-
     @cached_property
     def is_symmetric(self) -> bool:
         """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
@@ -587,76 +563,10 @@ class LinearPlant(ReadOnlyArrays):
         """Rows c_j of the largest box |c_j x| <= 1 inside the safe box, shape (k, n)."""
         return read_only(self.box / np.minimum(-self.box_low, self.box_high)[:, None])
 
-    @cached_property
-    def input_low(self) -> np.ndarray:
-        """The low ends of the inputs, shape (m,)."""
-        return read_only(self.input_ends[0])
-
-    @cached_property
-    def input_high(self) -> np.ndarray:
-        """The high ends of the inputs, shape (m,)."""
-        return read_only(self.input_ends[1])
-
-    @cached_property
-    def input_middle(self) -> np.ndarray:
-        """The input that action 0 stands for, shape (m,): the middle of the limits."""
-        return read_only(0.5 * (self.input_low + self.input_high))
-
-    @cached_property
-    def input_half(self) -> np.ndarray:
-        """Half the range of each input, shape (m,): input_middle +- input_half is within the limits, as floats add."""
-        half = 0.5 * (self.input_high - self.input_low)
-        while True:
-            beyond = (self.input_middle + half > self.input_high) | (self.input_middle - half < self.input_low)
-            if not beyond.any():
-                return read_only(half)
-            half = np.where(beyond, np.nextafter(half, 0.0), half)
-
-    @cached_property
-    def input_scales(self) -> tuple[tuple[float, float], ...]:
-        """`input_middle` and `input_half` of each input as numbers."""
-        return tuple(zip(self.input_middle.tolist(), self.input_half.tolist(), strict=True))
-
-    @cached_property
-    def largest_input(self) -> np.ndarray:
-        """The largest |u_i| within the limits, shape (m,)."""
-        return read_only(np.maximum(-self.input_low, self.input_high))
-
     @property
     def members(self) -> Family | None:
         """The members of which it is the middle (`family`); None for a plant that stands for itself."""
         return None if self.remainder is None else self.remainder.family
-
-    @cached_property
-    def reach(self) -> np.ndarray:
-        """The largest |x_j| in the safe box and |u_i| within the limits, shape (n + m,); infinite for a free state.
-
-        Of states that are past inputs those are the inputs' limits, which they never leave.
-        """
-        two_ends = np.isfinite(self.box_ends).all(axis=0)
-        limited, reach = self.box[two_ends].any(axis=0), np.full(self.n, np.inf)
-        with suppress(ZeroDivisionError):  # rows that limit a sum alone
-            reach[limited] = between_samples.widest(self.box[:, limited], self.box_ends)
-        for row, ends in zip(self.box, self.box_ends.T, strict=True):
-            if np.count_nonzero(row) == 1:
-                j = int(np.flatnonzero(row)[0])
-                reach[j] = min(reach[j], np.abs(ends / row[j]).max())
-        past = inputs_under_way(self)
-        reach[self.n - past :] = np.tile(self.largest_input, past // self.m)
-        return read_only(np.concatenate([reach, self.largest_input]))
-
-    @cached_property
-    def grid_rows(self) -> between_samples.GridRows | None:
-        """What the box says of states and inputs between samples; None if only the sampling instants count.
-
-        Raises:
-            OverflowError: If it is out of reach of float64, which the message says.
-        """
-        if self.between_samples is None or self.continuous_model is None:
-            return None
-        return between_samples.grid_rows(
-            self.continuous_model, (self.box, self.box_ends), self.largest_input, self.dt, self.between_samples
-        )
 
     @cached_property
     def spectral_radius(self) -> float:
@@ -704,61 +614,6 @@ class LinearPlant(ReadOnlyArrays):
             digest.update(self.continuous_model.astype("<f8").tobytes())
         return digest.hexdigest()
 
-    @again_if_interrupted
-    def constraint_values(self, state: np.ndarray) -> np.ndarray:
-        """Returns how far c_j x is beyond the nearer end, in units of half the range, for each row of the safe box.
-
-        Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
-        """
-        values, (low, high) = self.box.dot(state), self._ends[state.ndim - 1]
-        return np.maximum(values - high, low - values)
-
-    @cached_property
-    def _ends(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """The low and the high ends, shape (k,), and as columns, (k, 1)."""
-        low, high = read_only(self.box_low), read_only(self.box_high)
-        return (low, high), (low[:, None], high[:, None])
-
-    @again_if_interrupted
-    def mixed_values(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns how far the rows of `mixed_rows` are beyond the nearer end, in units of half their range.
-
-        Shape (q,) or (q, N), for states of shape (n,) or (n, N) and inputs of shape (m,) or (m, N).
-        """
-        values = self.mixed_rows[:, : self.n].dot(state) + self.mixed_rows[:, self.n :].dot(u)
-        low, high = self.mixed_ends if values.ndim == 1 else self.mixed_ends[:, :, None]
-        return np.maximum(values - high, low - values)
-
-    def values_at_start(self, state: np.ndarray) -> np.ndarray:
-        """Returns `worst_constraint_values` where no step has been: those of a state at which the operating input acts.
-
-        Shape (k + q,) or (k + q, N), for a state of shape (n,) or (n, N).
-        """
-        values = self.constraint_values(state)
-        if not len(self.mixed_rows):
-            return values
-        return np.concatenate([values, self.mixed_values(state, np.zeros((self.m, *state.shape[1:])))])
-
-    @cached_property
-    def _grid_values(self) -> between_samples.GridValues | None:
-        rows = self.grid_rows
-        return None if rows is None else between_samples.GridValues(rows, (self.box, self.box_ends), self.A, self.B)
-
-    def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
-        """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
-
-        Shape (k + q,) or (k + q, N). With `between_samples` at these times of the step, what moved x+ away from A x + B
-        u in proportion to the time; else at its end alone.
-
-        Args:
-            state: x at the beginning, shape (n,) or (n, N).
-            u: Input that was held, shape (m,) or (m, N).
-            x_next: x+, of the shape of x.
-        """
-        values, grid = self.constraint_values(x_next), self._grid_values
-        values = values if grid is None else grid.worst(state, u, x_next, values)
-        return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
-
     def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns a physical state, input or output as its deviation from the operating point.
 
@@ -783,168 +638,8 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(f"of must be one of {list(values)}, got {shown(of)}")
         return values[of]
 
-    @property
-    def remainder_bound(self) -> Ellipsoid | None:
-        """What holds the remainder of a model, shape (n, n); None if there is none."""
-        return None if self.remainder is None else self.remainder.bound
-
-    @cached_property
-    def weight(self) -> np.ndarray:
-        """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
-        return read_only(weight_of(self.box))
-
-    @cached_property
-    def _box_shape(self) -> np.ndarray:
-        """The inverse of `weight`, shape (n, n): that of the ellipsoid {x : x'Wx <= 1}."""
-        return exact.inverse(self.weight)
-
-    @cached_property
-    def relative_weight(self) -> np.ndarray:
-        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
-        return read_only(self.weight / self.weight.max())
-
-    @cached_property
-    def half_widths(self) -> np.ndarray:
-        """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
-        return read_only(np.sqrt(np.diag(self._box_shape)))
-
-    @cached_property
-    def process_noise(self) -> TruncatedGaussian:
-        """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
-        return TruncatedGaussian(self.process_noise_cov, truncation_energy(self.delta, self.n))
-
-    @cached_property
-    def sensor_noise(self) -> TruncatedGaussian:
-        """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
-        return TruncatedGaussian(self.measurement_noise_cov, truncation_energy(self.delta, self.p))
-
-    @cached_property
-    def initial_noise(self) -> TruncatedGaussian:
-        """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
-        return TruncatedGaussian(self.initial_cov, truncation_energy(self.delta, self.n))
-
-    @cached_property
-    def disturbance(self) -> Ellipsoid:
-        """D, shape (n, n): holds declared disturbances, truncated process noise, remainder, rounding of a simulation.
-
-        It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
-        A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
-        """
-        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_margin)
-
-    @cached_property
-    def allowed_disturbance(self) -> Ellipsoid:
-        """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
-        nominal = self.nominal_disturbance.shape_matrix
-        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_margin)
-
-    @cached_property
-    def _rounding_margin(self) -> np.ndarray:
-        """What D gains for rounding, shape (n, n)."""
-        reach = SIMULATED_REACH * self.half_widths
-        rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.largest_input) + reach
-        rounding *= (self.n + self.m + 2) * np.finfo(float).eps
-        return THINNEST * self._box_shape + 10.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding))
-
-    @cached_property
-    def nominal_disturbance(self) -> Ellipsoid:
-        """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
-        ball = Ellipsoid(self.gamma * np.eye(self.n))
-        others = self.process_noise.bound, self.disturbance_bound, self.remainder_bound
-        return ellipsoid_around_sum(self.relative_weight, ball, *others)
-
-    @cached_property
-    def nominal_sensor_error(self) -> Ellipsoid:
-        """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
-
-    @cached_property
-    def sensor_error(self) -> Ellipsoid:
-        """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
-        return Ellipsoid(inflated(self.nominal_sensor_error.shape_matrix))
-
-    @own_error_state
-    def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
-        """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
-        ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(inflated(ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
-
-    @cached_property
-    def initial_radius_squared(self) -> float:
-        """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
-        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape_matrix), 0.0)
-
-    @cached_property
-    def nominal_initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
-        ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
-        return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
-
-    @cached_property
-    def initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
-        return Ellipsoid(inflated(self.nominal_initial_error.shape_matrix) + self.estimate_rounding)
-
-    @cached_property
-    def estimate_rounding(self) -> np.ndarray:
-        """Room for the rounding of x_hat up to SIMULATED_REACH half-widths out, shape (n, n), next to an inflation."""
-        rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
-        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding)))
-
-    @cached_property
-    def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Covariances (Q, R, P0) from which a Kalman filter picks its gains, shapes (n, n), (p, p), (n, n).
-
-        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
-        noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
-        """
-        Q = self.process_noise_cov + self.gamma * np.eye(self.n)
-        R, P0 = self.measurement_noise_cov, self.initial_cov
-        if self.disturbance_bound is not None:
-            Q = Q + self.disturbance_bound.shape_matrix
-        if self.remainder is not None:
-            Q = Q + self.remainder.bound.shape_matrix
-        if self.sensor_bound is not None:
-            R = R + self.sensor_bound.shape_matrix / (self.p + 2)
-        if self.initial_bound is not None:
-            P0 = P0 + self.initial_bound.shape_matrix / (self.n + 2)
-        return read_only(Q), read_only(R), read_only(P0)
-
-    @own_error_state
-    def sample_sensor_noise(
-        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
-    ) -> np.ndarray:
-        """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
-        return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
-
-    @own_error_state
-    def sample_initial_error(
-        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
-    ) -> np.ndarray:
-        """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
-        return _plus_uniform(self.initial_noise.sample(rng, count, truncated=truncated), self.initial_bound, rng, count)
-
-
-def _plus_uniform(
-    samples: np.ndarray, bound: Ellipsoid | None, rng: np.random.Generator, count: int | None
-) -> np.ndarray:
-    """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
-    return samples if bound is None or not np.any(bound.shape_matrix) else samples + bound.sample(rng, count)
-
-
-def inflated(shape: np.ndarray) -> np.ndarray:
-    """Returns a slightly larger bound, also in directions in which it is flat: room for the rounding of its entries."""
-    return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
-
 
 def _symmetric_product(G: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Returns G P G'."""
     product = exact.product(G, shape, G.T)
     return 0.5 * (product + product.T)
-
-
-def weight_of(rows: np.ndarray) -> np.ndarray:
-    """Returns positive definite W, shape (n, n), of rows c_j, (k, n): C'C, regularized."""
-    gram = exact.product(rows.T, rows)
-    squares = np.diag(gram)
-    return gram + 1e-6 * np.diag(squares + exact.total(squares) / len(gram) * (squares == 0.0))

@@ -8,8 +8,7 @@ from fractions import Fraction
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.plants.linear_plant import SMALLEST_DELTA
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, truncation_energy
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, truncation_energy
 from ncs_gym.validation import as_covariance, as_matrix, as_number
 
 # Where kappa rho is nearer to 1 than this, the error bound is infinite for practical purposes.

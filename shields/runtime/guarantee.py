@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
-from ncs_gym.plants.linear_plant import SIMULATED_REACH
+from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.validation import shown, warn_caller
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning

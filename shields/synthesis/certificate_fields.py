@@ -10,7 +10,7 @@ import numpy as np
 
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.estimation.error_sets import ErrorSetsByAge
-from ncs_gym.plants.linear_plant import inflated
+from ncs_gym.plants.hard_bounds import inflated
 from shields.certificate import Certificate, Proof, Updates
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.multipliers import with_best_multipliers

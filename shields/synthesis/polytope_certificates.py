@@ -10,7 +10,7 @@ import numpy as np
 
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import inflated
+from ncs_gym.plants.hard_bounds import inflated
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted

@@ -26,7 +26,7 @@ from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covarianc
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.linear_plant import FLAT_INFLATION
+from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 

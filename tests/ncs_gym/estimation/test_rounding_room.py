@@ -10,7 +10,7 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, certified_
 from ncs_gym.estimation.error_sets import ErrorSetsByAge, InvariantErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership
-from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
+from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields.verification.rational_matrix import congruence, rational
 

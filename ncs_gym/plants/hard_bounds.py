@@ -1,0 +1,206 @@
+"""Hard bounds of what is declared of a plant's uncertainties: what proofs take, and simulations draw from.
+
+They are the same numbers on every machine (`ncs_gym.exact`).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ncs_gym import exact
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
+from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
+from ncs_gym.validation import ReadOnlyArrays, own_error_state, read_only
+
+# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
+INFLATION = 1.0 + 1e-9
+# The same for directions in which a bound is flat: growth of its diagonal alone.
+FLAT_INFLATION = 1e-12
+# No disturbance set is thinner than this, in squared half-widths of the safe box.
+THINNEST = 1e-19
+# Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
+SIMULATED_REACH = 100.0
+
+
+class HardBounds(ReadOnlyArrays):
+    """The bounds of disturbances, sensor noise and first estimates of a `LinearPlant`, by what is declared of them."""
+
+    A: np.ndarray
+    B: np.ndarray
+    box: np.ndarray
+    n: int
+    m: int
+    p: int
+    largest_input: np.ndarray
+    gamma: float
+    delta: float
+    process_noise_cov: np.ndarray
+    measurement_noise_cov: np.ndarray
+    initial_cov: np.ndarray
+    disturbance_bound: Ellipsoid | None
+    sensor_bound: Ellipsoid | None
+    initial_bound: Ellipsoid | None
+    remainder: Remainder | None
+
+    @property
+    def remainder_bound(self) -> Ellipsoid | None:
+        """What holds the remainder of a model, shape (n, n); None if there is none."""
+        return None if self.remainder is None else self.remainder.bound
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
+        return read_only(weight_of(self.box))
+
+    @cached_property
+    def _box_shape(self) -> np.ndarray:
+        """The inverse of `weight`, shape (n, n): that of the ellipsoid {x : x'Wx <= 1}."""
+        return exact.inverse(self.weight)
+
+    @cached_property
+    def relative_weight(self) -> np.ndarray:
+        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
+        return read_only(self.weight / self.weight.max())
+
+    @cached_property
+    def half_widths(self) -> np.ndarray:
+        """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
+        return read_only(np.sqrt(np.diag(self._box_shape)))
+
+    @cached_property
+    def process_noise(self) -> TruncatedGaussian:
+        """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
+        return TruncatedGaussian(self.process_noise_cov, truncation_energy(self.delta, self.n))
+
+    @cached_property
+    def sensor_noise(self) -> TruncatedGaussian:
+        """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
+        return TruncatedGaussian(self.measurement_noise_cov, truncation_energy(self.delta, self.p))
+
+    @cached_property
+    def initial_noise(self) -> TruncatedGaussian:
+        """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
+        return TruncatedGaussian(self.initial_cov, truncation_energy(self.delta, self.n))
+
+    @cached_property
+    def disturbance(self) -> Ellipsoid:
+        """D, shape (n, n): holds declared disturbances, truncated process noise, remainder, rounding of a simulation.
+
+        It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
+        A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
+        """
+        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_margin)
+
+    @cached_property
+    def allowed_disturbance(self) -> Ellipsoid:
+        """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
+        nominal = self.nominal_disturbance.shape_matrix
+        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_margin)
+
+    @cached_property
+    def _rounding_margin(self) -> np.ndarray:
+        """What D gains for rounding, shape (n, n)."""
+        reach = SIMULATED_REACH * self.half_widths
+        rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.largest_input) + reach
+        rounding *= (self.n + self.m + 2) * np.finfo(float).eps
+        return THINNEST * self._box_shape + 10.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding))
+
+    @cached_property
+    def nominal_disturbance(self) -> Ellipsoid:
+        """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
+        ball = Ellipsoid(self.gamma * np.eye(self.n))
+        others = self.process_noise.bound, self.disturbance_bound, self.remainder_bound
+        return ellipsoid_around_sum(self.relative_weight, ball, *others)
+
+    @cached_property
+    def nominal_sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
+        return ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
+
+    @cached_property
+    def sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
+        return Ellipsoid(inflated(self.nominal_sensor_error.shape_matrix))
+
+    @own_error_state
+    def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
+        """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
+        ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
+        return Ellipsoid(inflated(ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
+
+    @cached_property
+    def initial_radius_squared(self) -> float:
+        """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
+        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape_matrix), 0.0)
+
+    @cached_property
+    def nominal_initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
+        ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
+        return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
+
+    @cached_property
+    def initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
+        return Ellipsoid(inflated(self.nominal_initial_error.shape_matrix) + self.estimate_rounding)
+
+    @cached_property
+    def estimate_rounding(self) -> np.ndarray:
+        """Room for the rounding of x_hat up to SIMULATED_REACH half-widths out, shape (n, n), next to an inflation."""
+        rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
+        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding)))
+
+    @cached_property
+    def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Covariances (Q, R, P0) from which a Kalman filter picks its gains, shapes (n, n), (p, p), (n, n).
+
+        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
+        noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
+        """
+        Q = self.process_noise_cov + self.gamma * np.eye(self.n)
+        R, P0 = self.measurement_noise_cov, self.initial_cov
+        if self.disturbance_bound is not None:
+            Q = Q + self.disturbance_bound.shape_matrix
+        if self.remainder is not None:
+            Q = Q + self.remainder.bound.shape_matrix
+        if self.sensor_bound is not None:
+            R = R + self.sensor_bound.shape_matrix / (self.p + 2)
+        if self.initial_bound is not None:
+            P0 = P0 + self.initial_bound.shape_matrix / (self.n + 2)
+        return read_only(Q), read_only(R), read_only(P0)
+
+    @own_error_state
+    def sample_sensor_noise(
+        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
+    ) -> np.ndarray:
+        """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
+        return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
+
+    @own_error_state
+    def sample_initial_error(
+        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
+    ) -> np.ndarray:
+        """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
+        return _plus_uniform(self.initial_noise.sample(rng, count, truncated=truncated), self.initial_bound, rng, count)
+
+
+def _plus_uniform(
+    samples: np.ndarray, bound: Ellipsoid | None, rng: np.random.Generator, count: int | None
+) -> np.ndarray:
+    """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
+    return samples if bound is None or not np.any(bound.shape_matrix) else samples + bound.sample(rng, count)
+
+
+def inflated(shape: np.ndarray) -> np.ndarray:
+    """Returns a slightly larger bound, also in directions in which it is flat: room for the rounding of its entries."""
+    return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
+
+
+def weight_of(rows: np.ndarray) -> np.ndarray:
+    """Returns positive definite W, shape (n, n), of rows c_j, (k, n): C'C, regularized."""
+    gram = exact.product(rows.T, rows)
+    squares = np.diag(gram)
+    return gram + 1e-6 * np.diag(squares + exact.total(squares) / len(gram) * (squares == 0.0))
