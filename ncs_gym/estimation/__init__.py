@@ -2,8 +2,8 @@
 
 `error_sets` says what certified error sets are, `error_bound` and `error_bounds_by_age` find them offline;
 `kalman_filter` and `set_membership` move covariance and running ellipsoid through predictions and updates;
-`arrival_histories` looks up whatever depends only on when packets arrive; `estimator` and `vector_estimator` carry the
-means, and `innovation` raises an alarm where a measurement contradicts the assumed bounds.
+`arrival_histories` looks up whatever depends only on when packets arrive, in an `error_table`; `estimator` and
+`vector_estimator` carry the means, and `innovation` raises an alarm where a measurement contradicts the assumed bounds.
 """
 
 from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError, certified_error_set

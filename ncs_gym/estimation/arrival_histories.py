@@ -3,9 +3,7 @@
 Covariances, gains, error shapes and the choice between two replays depend only on when packets arrive, never on what
 they say. Histories form a graph: its nodes are what arrived when, as far as it still matters, its edges are steps in
 time and arrivals. The scalar estimator follows it one node at a time, the vectorized one for all environments at once.
-
-Everything is kept by number in a few large arrays. A graph of many small objects would keep the garbage collector busy
-for tens of milliseconds at a time, and would take several times the memory.
+Error statistics are kept by number beside it (`error_table`).
 """
 
 from __future__ import annotations
@@ -13,24 +11,20 @@ from __future__ import annotations
 import struct
 import threading
 import weakref
-from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.innovation import common_axes, quick_test
-from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
+from ncs_gym.estimation.error_table import BYTES_PER_KEY, FIRST_CAPACITY, NO_SAMPLE, UNKNOWN, ErrorTable, with_room
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import frozen
 
-# Number of what is not worked out yet; also the age at which a history without new samples begins its replay.
-UNKNOWN = NO_REPLAY = -1
-# Number of the statistics that stand for "no sample is used here": their gain is zero.
-NO_SAMPLE = 0
+# In place of the age at which a replay begins, where there are no new samples.
+NO_REPLAY = -1
 # Histories are forgotten but for those in use when there are this many, or when all takes about this much memory.
 MAX_HISTORIES, MAX_BYTES = 1 << 17, 20 << 20
 # A graph takes at least this many times the histories it began with, or it would be forgotten at every step.
@@ -39,193 +33,11 @@ SMALLEST_GROWTH = 4
 FIRST_STEPS, SMALLEST_SHARE = 50, 0.01
 # Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
 MAX_GRAPHS = 32
-# Numbers that arrays have room for to begin with; the room doubles when it is used up.
-_FIRST_CAPACITY = 256
-# What a dictionary takes for a key of bytes and its number, without those bytes.
-_BYTES_PER_KEY = 150
-# Bytes of the hash that statistics are found by: that two of them ever have the same one is out of the question.
-_HASH_SIZE = 16
-
-# The arrays of a table, whose last or first axis is the number.
-_BY_NUMBER_LAST = "gains", "quick_tests"
-_BY_NUMBER = (
-    *("_gains", "_by_columns", "_quick_tests", "_covariances", "_shapes"),
-    *("_after_step", "_after_update", "_certified", "_recurs", "_ages"),
-)
-# Those of a graph, whose last axis is the history.
+# The arrays of a graph, whose last axis is the history.
 _BY_HISTORY = (
     *("present", "replay_from", "target", "new_age", "accepted", "arrival", "used"),
     *("_priors", "_held", "_recurs", "next"),
 )
-
-
-class ErrorTable:
-    """The distinct error statistics met so far, and what a prediction and an update make of each, worked out once.
-
-    The recursion rounds statistics, so that they recur; equal ones have one number. Reading what is there needs no
-    lock; whoever adds to the table holds that of the graph it belongs to.
-
-    Args:
-        recursion: Moves the error statistics.
-        oldest: Ages above this make no difference.
-
-    Attributes:
-        recursion, oldest: The same.
-        gains: Of an update, by number, shape (n, p, capacity); zero until it is worked out.
-        quick_tests: W of the quick innovation test, by number, shape (p, p, capacity); zero until it is worked out.
-    """
-
-    def __init__(self, recursion: ErrorRecursion, oldest: int) -> None:
-        n, p, size = recursion.plant.n, recursion.plant.p, _FIRST_CAPACITY
-        self.recursion, self.oldest = recursion, oldest
-        self._count = 0
-        self._numbers: dict[bytes, int] = {}
-        self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self.gains, self.quick_tests = np.zeros((n, p, size)), np.zeros((p, p, size))
-        self._ages, self._after_step, self._after_update = np.zeros((3, size), np.int64)
-        # The same once more, for one at a time. Gains in the order in memory in which they were made: the last bit of a
-        # product depends on it, and who runs an experiment again expects the same numbers.
-        self._gains, self._by_columns = np.zeros((size, n * p)), np.zeros(size, np.bool_)
-        self._quick_tests = np.zeros((size, p, p))
-        self._covariances, self._shapes = np.zeros((2, size, n, n))
-        self._certified = np.zeros(size, np.bool_)
-        self._recurs = np.zeros(size, np.bool_)  # whether statistics were met more than once
-        self._after_update[self._add(recursion.first)] = NO_SAMPLE  # which no other statistics are equal to
-
-    def __len__(self) -> int:
-        return self._count
-
-    @property
-    def bytes_each(self) -> int:
-        """What the statistics of one number take, about."""
-        n, p = self.recursion.plant.n, self.recursion.plant.p
-        return _BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 3
-
-    @property
-    def shapes(self) -> np.ndarray:
-        """The error shapes Sigma_k by number, shape (count, n, n), read-only: many estimators share them."""
-        return frozen(self._shapes[: self._count])
-
-    @property
-    def certified(self) -> np.ndarray:
-        """`ErrorStatistics.certified` by number, shape (count,), read-only."""
-        return frozen(self._certified[: self._count])
-
-    def is_certified(self, number: int) -> bool:
-        """Returns `ErrorStatistics.certified` of a number."""
-        return self._certified.item(number)
-
-    def shape(self, number: int) -> np.ndarray:
-        """Returns an error shape Sigma_k, shape (n, n), read-only."""
-        return frozen(self._shapes[number])
-
-    def statistics(self, number: int) -> ErrorStatistics:
-        """Returns statistics by their number, read-only.
-
-        They are copies: on some processors the last bit of a sum depends on where in memory its terms lie.
-        """
-        covariance, shape = self._covariances[number].copy(), self._shapes[number].copy()
-        return ErrorStatistics(frozen(covariance), frozen(shape), self._ages.item(number), self._certified.item(number))
-
-    def number_of(self, statistics: ErrorStatistics) -> int:
-        """Returns the number of statistics, a new one if they have not occurred."""
-        age = min(statistics.age, self.oldest)
-        small = age.to_bytes(4, "little") + bytes([statistics.certified])
-        whole = b"".join((statistics.covariance.tobytes(), statistics.shape.tobytes(), small))
-        key = blake2b(whole, digest_size=_HASH_SIZE).digest()
-        number = self._numbers.get(key)
-        if number is None:
-            number = self._add(statistics._replace(age=age))
-            self._numbers[key] = number  # last: if this is interrupted, the statistics have not occurred
-        else:
-            self._recurs[number] = True
-        return number
-
-    def after_step(self, number: int) -> int:
-        """Returns the number of the statistics one step later."""
-        after = self._after_step.item(number)
-        if after == UNKNOWN:
-            after = self.number_of(self.recursion.predicted(self.statistics(number)))
-            self._after_step[number] = after
-        else:
-            self._recurs[after] = True
-        return after
-
-    def after_update(self, number: int) -> int:
-        """Returns the number of the statistics after an update; the same where the sample must not be used."""
-        after = self._after_update.item(number)
-        if after == UNKNOWN:
-            statistics, after = self.statistics(number), number
-            weight = quick_test(self._spread(statistics.shape), self.recursion.sets.noise)
-            if (update := self.recursion.updated(statistics)) is not None:
-                gain, updated = update
-                after = self.number_of(updated)
-                self.gains[..., number], self._gains[number] = gain, gain.ravel(order="K")
-                self._by_columns[number] = not gain.flags.c_contiguous
-            self.quick_tests[..., number] = self._quick_tests[number] = weight
-            self._after_update[number] = after  # last: another thread may look it up, and then wants the rest too
-        else:
-            self._recurs[after] = True
-        return after
-
-    def update(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the gain of an update that is worked out, shape (n, p), and W of its quick test, (p, p).
-
-        The gain is zero where the sample must not be used.
-        """
-        gain, (n, p, _) = self._gains[number], self.gains.shape
-        gain = gain.reshape(p, n).T if self._by_columns[number] else gain.reshape(n, p)
-        return gain, self._quick_tests[number]
-
-    def mark(self, numbers: np.ndarray) -> None:
-        """Notes that statistics, shape (k,), and what updates make of them recur."""
-        self._recurs[numbers] = True
-        after = self._after_update[numbers]
-        self._recurs[after[after != UNKNOWN]] = True
-
-    def recurring(self, most: int) -> ErrorTable:
-        """Returns a table of the statistics that were met more than once, at most some number of them.
-
-        Those met longest ago come first: what recurs in one table after the other stays.
-        """
-        table = ErrorTable(self.recursion, self.oldest)
-        kept = np.flatnonzero(self._recurs[1 : self._count])[:most] + 1
-        numbers = np.full(self._count + 1, UNKNOWN)  # in the new table; that of UNKNOWN, the last one, is UNKNOWN
-        numbers[NO_SAMPLE], numbers[kept] = NO_SAMPLE, np.arange(1, len(kept) + 1)
-        kept = np.append(NO_SAMPLE, kept)
-        room = np.zeros(_FIRST_CAPACITY, np.int64)
-        for name in (*_BY_NUMBER_LAST, *_BY_NUMBER):
-            axis = -1 if name in _BY_NUMBER_LAST else 0
-            setattr(table, name, np.concatenate([getattr(self, name).take(part, axis) for part in (kept, room)], axis))
-        table._after_step, table._after_update = numbers[table._after_step], numbers[table._after_update]
-        table._recurs[:], table._count = False, len(kept)
-        renumbered = numbers.tolist()
-        table._numbers = {key: renumbered[old] for key, old in self._numbers.items() if renumbered[old] != UNKNOWN}
-        return table
-
-    def innovation_axes(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the axes in which residuals before an update of some statistics are tested exactly."""
-        if number not in self._axes:
-            self._axes[number] = common_axes(self._spread(self.shape(number)), self.recursion.sets.noise)
-        return self._axes[number]
-
-    def _spread(self, shape: np.ndarray) -> np.ndarray:
-        H = self.recursion.plant.H
-        return H @ shape @ H.T
-
-    def _add(self, statistics: ErrorStatistics) -> int:
-        number = self._count
-        if number == len(self._ages):
-            for name in _BY_NUMBER_LAST:
-                setattr(self, name, _with_room(getattr(self, name), number))
-            for name in _BY_NUMBER:  # the last one tells how much
-                setattr(self, name, _with_room(getattr(self, name), number, axis=0))
-        self._covariances[number], self._shapes[number], self._ages[number], self._certified[number] = statistics
-        self._after_step[number] = self._after_update[number] = UNKNOWN
-        self._gains[number], self._by_columns[number], self._recurs[number] = 0.0, False, False
-        self.gains[..., number] = 0.0
-        self._count = number + 1
-        return number
 
 
 class ArrivalHistories:
@@ -265,7 +77,7 @@ class ArrivalHistories:
         self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None, coarsens: bool = False
     ) -> None:
         self.recursion, self.channel, self.coarsens = recursion, channel, coarsens
-        self.buffer, size = channel.longest_delay, _FIRST_CAPACITY
+        self.buffer, size = channel.longest_delay, FIRST_CAPACITY
         # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
         oldest = max(self.buffer + 1, recursion.error_set.oldest + 1)
         self.table = ErrorTable(recursion, oldest) if table is None else table
@@ -273,7 +85,7 @@ class ArrivalHistories:
         self._key = f"{held_ages + 2}q{held_ages}?"
         self._count = 0
         self._numbers: dict[bytes, int] = {}
-        self._bytes_each = _BYTES_PER_KEY + struct.calcsize(self._key) + 8 * (6 + 3 * held_ages) + 1 + held_ages
+        self._bytes_each = BYTES_PER_KEY + struct.calcsize(self._key) + 8 * (6 + 3 * held_ages) + 1 + held_ages
         self.present, self.replay_from, self.next, self.target, self.new_age = np.zeros((5, size), np.int64)
         self.arrival, self.used, self._priors = np.zeros((3, held_ages, size), np.int64)
         self._held, self.accepted = np.zeros((held_ages, size), np.bool_), np.zeros(size, np.bool_)
@@ -424,7 +236,7 @@ class ArrivalHistories:
             number = self._count
             if number == len(self.next):
                 for name in _BY_HISTORY:  # the last one tells how much
-                    setattr(self, name, _with_room(getattr(self, name), number))
+                    setattr(self, name, with_room(getattr(self, name), number))
             self.present[number], self.replay_from[number] = present, replay_from
             self._priors[:, number], self._held[:, number] = priors, held
             self.next[number] = self.arrival[:, number] = self.new_age[number] = UNKNOWN
@@ -457,13 +269,6 @@ class ArrivalHistories:
         self.accepted[history], self.used[: oldest + 1, history] = accepted, used
         self.target[history] = target  # last: another thread may look it up, and then wants the rest too
         return target
-
-
-def _with_room(array: np.ndarray, count: int, axis: int = -1) -> np.ndarray:
-    """Returns an array with room for twice as many numbers along an axis; the same if it has it already."""
-    if array.shape[axis] > count:  # growing was interrupted before
-        return array
-    return np.concatenate([array, np.zeros_like(array)], axis=axis)
 
 
 _shared: dict[tuple[str, Channel, ChannelContract | None, bool], ArrivalHistories] = {}

@@ -9,16 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_histories import (
-    NO_SAMPLE,
-    UNKNOWN,
-    ArrivalHistories,
-    ErrorTable,
-    arrival_histories,
-    histories_of,
-)
+from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories, histories_of
 from ncs_gym.estimation.error_bound import require_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN, ErrorTable
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet

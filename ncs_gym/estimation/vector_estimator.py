@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_histories import NO_REPLAY, NO_SAMPLE, UNKNOWN, ArrivalHistories
+from ncs_gym.estimation.arrival_histories import NO_REPLAY, ArrivalHistories
+from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum_in_axes
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import CopiedWhole, frozen, own_error_state

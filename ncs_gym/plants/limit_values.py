@@ -1,4 +1,4 @@
-"""How states and inputs lie to a plant's limits: their ends, what they allow, and how far something is beyond them."""
+"""What the limits of a plant say: their ends, what they allow, and how far a state or an input is beyond them."""
 
 from __future__ import annotations
 

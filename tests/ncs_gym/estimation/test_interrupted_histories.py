@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Estimator, Packet, certified_error_set, truck_trailer
-from ncs_gym.estimation import arrival_histories
+from ncs_gym.estimation import arrival_histories, error_table
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from tests.interruptions import interrupt, places
@@ -15,13 +15,14 @@ PLANT = truck_trailer(mass=4000.0)
 CHANNEL = Channel(delay=1, jitter=1)
 STEPS = 12
 # Where what is shared is written.
-SHARED = ("arrival_histories.py",)
+SHARED = ("arrival_histories.py", "error_table.py")
 
 
 @pytest.fixture(autouse=True)
 def _small_tables(monkeypatch):
     """Tables that have to grow soon."""
-    monkeypatch.setattr(arrival_histories, "_FIRST_CAPACITY", 8)
+    for module in (arrival_histories, error_table):
+        monkeypatch.setattr(module, "FIRST_CAPACITY", 8)
 
 
 def graph():

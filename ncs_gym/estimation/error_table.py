@@ -1,0 +1,207 @@
+"""The distinct error statistics that estimators meet, by number, and what predictions and updates make of each.
+
+Everything is kept by number in a few large arrays. A graph of many small objects would keep the garbage collector busy
+for tens of milliseconds at a time, and would take several times the memory.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+
+import numpy as np
+
+from ncs_gym.estimation.innovation import common_axes, quick_test
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
+from ncs_gym.validation import frozen
+
+# Number of what is not worked out yet, and of the statistics that stand for "no sample is used here": their gain is
+# zero.
+UNKNOWN, NO_SAMPLE = -1, 0
+# Numbers that arrays have room for to begin with; the room doubles when it is used up.
+FIRST_CAPACITY = 256
+# What a dictionary takes for a key of bytes and its number, without those bytes.
+BYTES_PER_KEY = 150
+# Bytes of the hash that statistics are found by: that two of them ever have the same one is out of the question.
+_HASH_SIZE = 16
+# The arrays of a table, whose last or first axis is the number.
+_BY_NUMBER_LAST = "gains", "quick_tests"
+_BY_NUMBER = (
+    *("_gains", "_by_columns", "_quick_tests", "_covariances", "_shapes"),
+    *("_after_step", "_after_update", "_certified", "_recurs", "_ages"),
+)
+
+
+class ErrorTable:
+    """The distinct error statistics met so far, and what a prediction and an update make of each, worked out once.
+
+    The recursion rounds statistics, so that they recur; equal ones have one number. Reading what is there needs no
+    lock; whoever adds to the table holds that of the graph it belongs to.
+
+    Args:
+        recursion: Moves the error statistics.
+        oldest: Ages above this make no difference.
+
+    Attributes:
+        recursion, oldest: The same.
+        gains: Of an update, by number, shape (n, p, capacity); zero until it is worked out.
+        quick_tests: W of the quick innovation test, by number, shape (p, p, capacity); zero until it is worked out.
+    """
+
+    def __init__(self, recursion: ErrorRecursion, oldest: int) -> None:
+        n, p, size = recursion.plant.n, recursion.plant.p, FIRST_CAPACITY
+        self.recursion, self.oldest = recursion, oldest
+        self._count = 0
+        self._numbers: dict[bytes, int] = {}
+        self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.gains, self.quick_tests = np.zeros((n, p, size)), np.zeros((p, p, size))
+        self._ages, self._after_step, self._after_update = np.zeros((3, size), np.int64)
+        # The same once more, for one at a time. Gains in the order in memory in which they were made: the last bit of a
+        # product depends on it, and who runs an experiment again expects the same numbers.
+        self._gains, self._by_columns = np.zeros((size, n * p)), np.zeros(size, np.bool_)
+        self._quick_tests = np.zeros((size, p, p))
+        self._covariances, self._shapes = np.zeros((2, size, n, n))
+        self._certified = np.zeros(size, np.bool_)
+        self._recurs = np.zeros(size, np.bool_)  # whether statistics were met more than once
+        self._after_update[self._add(recursion.first)] = NO_SAMPLE  # which no other statistics are equal to
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def bytes_each(self) -> int:
+        """What the statistics of one number take, about."""
+        n, p = self.recursion.plant.n, self.recursion.plant.p
+        return BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 3
+
+    @property
+    def shapes(self) -> np.ndarray:
+        """The error shapes Sigma_k by number, shape (count, n, n), read-only: many estimators share them."""
+        return frozen(self._shapes[: self._count])
+
+    @property
+    def certified(self) -> np.ndarray:
+        """`ErrorStatistics.certified` by number, shape (count,), read-only."""
+        return frozen(self._certified[: self._count])
+
+    def is_certified(self, number: int) -> bool:
+        """Returns `ErrorStatistics.certified` of a number."""
+        return self._certified.item(number)
+
+    def shape(self, number: int) -> np.ndarray:
+        """Returns an error shape Sigma_k, shape (n, n), read-only."""
+        return frozen(self._shapes[number])
+
+    def statistics(self, number: int) -> ErrorStatistics:
+        """Returns statistics by their number, read-only.
+
+        They are copies: on some processors the last bit of a sum depends on where in memory its terms lie.
+        """
+        covariance, shape = self._covariances[number].copy(), self._shapes[number].copy()
+        return ErrorStatistics(frozen(covariance), frozen(shape), self._ages.item(number), self._certified.item(number))
+
+    def number_of(self, statistics: ErrorStatistics) -> int:
+        """Returns the number of statistics, a new one if they have not occurred."""
+        age = min(statistics.age, self.oldest)
+        small = age.to_bytes(4, "little") + bytes([statistics.certified])
+        whole = b"".join((statistics.covariance.tobytes(), statistics.shape.tobytes(), small))
+        key = blake2b(whole, digest_size=_HASH_SIZE).digest()
+        number = self._numbers.get(key)
+        if number is None:
+            number = self._add(statistics._replace(age=age))
+            self._numbers[key] = number  # last: if this is interrupted, the statistics have not occurred
+        else:
+            self._recurs[number] = True
+        return number
+
+    def after_step(self, number: int) -> int:
+        """Returns the number of the statistics one step later."""
+        after = self._after_step.item(number)
+        if after == UNKNOWN:
+            after = self.number_of(self.recursion.predicted(self.statistics(number)))
+            self._after_step[number] = after
+        else:
+            self._recurs[after] = True
+        return after
+
+    def after_update(self, number: int) -> int:
+        """Returns the number of the statistics after an update; the same where the sample must not be used."""
+        after = self._after_update.item(number)
+        if after == UNKNOWN:
+            statistics, after = self.statistics(number), number
+            weight = quick_test(self._spread(statistics.shape), self.recursion.sets.noise)
+            if (update := self.recursion.updated(statistics)) is not None:
+                gain, updated = update
+                after = self.number_of(updated)
+                self.gains[..., number], self._gains[number] = gain, gain.ravel(order="K")
+                self._by_columns[number] = not gain.flags.c_contiguous
+            self.quick_tests[..., number] = self._quick_tests[number] = weight
+            self._after_update[number] = after  # last: another thread may look it up, and then wants the rest too
+        else:
+            self._recurs[after] = True
+        return after
+
+    def update(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the gain of an update that is worked out, shape (n, p), and W of its quick test, (p, p).
+
+        The gain is zero where the sample must not be used.
+        """
+        gain, (n, p, _) = self._gains[number], self.gains.shape
+        gain = gain.reshape(p, n).T if self._by_columns[number] else gain.reshape(n, p)
+        return gain, self._quick_tests[number]
+
+    def mark(self, numbers: np.ndarray) -> None:
+        """Notes that statistics, shape (k,), and what updates make of them recur."""
+        self._recurs[numbers] = True
+        after = self._after_update[numbers]
+        self._recurs[after[after != UNKNOWN]] = True
+
+    def recurring(self, most: int) -> ErrorTable:
+        """Returns a table of the statistics that were met more than once, at most some number of them.
+
+        Those met longest ago come first: what recurs in one table after the other stays.
+        """
+        table = ErrorTable(self.recursion, self.oldest)
+        kept = np.flatnonzero(self._recurs[1 : self._count])[:most] + 1
+        numbers = np.full(self._count + 1, UNKNOWN)  # in the new table; that of UNKNOWN, the last one, is UNKNOWN
+        numbers[NO_SAMPLE], numbers[kept] = NO_SAMPLE, np.arange(1, len(kept) + 1)
+        kept = np.append(NO_SAMPLE, kept)
+        room = np.zeros(FIRST_CAPACITY, np.int64)
+        for name in (*_BY_NUMBER_LAST, *_BY_NUMBER):
+            axis = -1 if name in _BY_NUMBER_LAST else 0
+            setattr(table, name, np.concatenate([getattr(self, name).take(part, axis) for part in (kept, room)], axis))
+        table._after_step, table._after_update = numbers[table._after_step], numbers[table._after_update]
+        table._recurs[:], table._count = False, len(kept)
+        renumbered = numbers.tolist()
+        table._numbers = {key: renumbered[old] for key, old in self._numbers.items() if renumbered[old] != UNKNOWN}
+        return table
+
+    def innovation_axes(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the axes in which residuals before an update of some statistics are tested exactly."""
+        if number not in self._axes:
+            self._axes[number] = common_axes(self._spread(self.shape(number)), self.recursion.sets.noise)
+        return self._axes[number]
+
+    def _spread(self, shape: np.ndarray) -> np.ndarray:
+        H = self.recursion.plant.H
+        return H @ shape @ H.T
+
+    def _add(self, statistics: ErrorStatistics) -> int:
+        number = self._count
+        if number == len(self._ages):
+            for name in _BY_NUMBER_LAST:
+                setattr(self, name, with_room(getattr(self, name), number))
+            for name in _BY_NUMBER:  # the last one tells how much
+                setattr(self, name, with_room(getattr(self, name), number, axis=0))
+        self._covariances[number], self._shapes[number], self._ages[number], self._certified[number] = statistics
+        self._after_step[number] = self._after_update[number] = UNKNOWN
+        self._gains[number], self._by_columns[number], self._recurs[number] = 0.0, False, False
+        self.gains[..., number] = 0.0
+        self._count = number + 1
+        return number
+
+
+def with_room(array: np.ndarray, count: int, axis: int = -1) -> np.ndarray:
+    """Returns an array with room for twice as many numbers along an axis; the same if it has it already."""
+    if array.shape[axis] > count:  # growing was interrupted before
+        return array
+    return np.concatenate([array, np.zeros_like(array)], axis=axis)
