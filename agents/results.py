@@ -54,7 +54,7 @@ class Episode:
         interventions: Steps in which the shield intervened, or would have in mode "monitor".
         guaranteed: Whether the shield's guarantee held at every step; False without a shield.
         largest_level: Largest x'Mx of the true state, or square of its gauge in the certificate's polytope; above 1 it
-            was out of the safe set. NaN without a certificate.
+            was out of the safe set. NaN unless `evaluate` was given a `level_matrix`.
         planned: Steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store; 0 in
             other modes.
         proved: Steps after which the shield's guarantee held; 0 without a shield.

@@ -27,6 +27,8 @@ from experiments.settings.certificates import FEWEST_ENVS
 from experiments.terminal import wrapped
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import EPISODE_STEPS
+from ncs_gym.uncertainty.disturbances import as_noise
+from ncs_gym.validation import reason_of
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
@@ -42,6 +44,8 @@ def attack(settings: AttackSettings) -> None:
     """Runs `ncs attack`."""
     settings = shortened(settings)
     cases, kinds = cases_of(settings), len(kinds_of_batches(settings))
+    if settings.noise == "gaussian":
+        cases = _with_covariances(cases)
     if not settings.unshielded:
         _require_claims(cases)
     with claim_folder("attack", settings):
@@ -88,6 +92,23 @@ def shortened(settings: AttackSettings) -> AttackSettings:
     """Returns the settings of the short version if `--smoke` is given, otherwise the same settings."""
     chosen = {"channel": settings.channel or _SMOKE_CHANNEL} if settings.env is settings.plant is None else {}
     return short_version(settings, **_SMOKE, **chosen)
+
+
+def _with_covariances(cases: dict[str, AttackCase]) -> dict[str, AttackCase]:
+    """Returns the cases whose plants have Gaussian noise; raises ValueError if there is none."""
+    kept, refusal = {}, ""
+    for name, case in cases.items():
+        try:
+            as_noise("gaussian", case.plant)
+        except ValueError as error:
+            refusal = reason_of(error)
+        else:
+            kept[name] = case
+    if not kept:
+        raise ValueError(refusal)
+    if len(kept) < len(cases):
+        print(wrapped(f"{len(cases) - len(kept)} of {len(cases)} cases have no Gaussian noise and are left out."))
+    return kept
 
 
 def _require_claims(cases: dict[str, AttackCase]) -> None:

@@ -12,7 +12,7 @@ from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
 from experiments.baselines import tuned_training
 from experiments.runs.arms import Arm
-from experiments.runs.loops import other_scenarios
+from experiments.runs.loops import other_scenarios, under
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import TrainingRun
@@ -81,6 +81,9 @@ def run_of_arm(
         folder = pretrained_folder(loop.env)
         agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
     training_loop, loop = arm.loops(loop, certificate, settings)
+    scenarios = other_scenarios(getattr(settings, "scenarios", ()))
+    for scenario in scenarios:  # what cannot be simulated is refused before anything is trained
+        under(scenario, loop).single().close()
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
     origin += "" if certificate.polytope is None else " with a polytope"
     return TrainingRun(
@@ -95,7 +98,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         certificate_basis=origin if settings.certificate is None else "",
-        scenarios=other_scenarios(getattr(settings, "scenarios", ())),
+        scenarios=scenarios,
         algorithm=settings.algo,
         settings=hyperparams,
         grid_point=grid_point,

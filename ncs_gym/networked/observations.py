@@ -226,7 +226,7 @@ class Entries:
         values = {
             "age": lambda: np.minimum(age, OLDEST_OBSERVED).astype(np.float32),
             "arrived": lambda: np.asarray(arrived, np.int8),
-            "pending_actions": lambda: pending,
+            "pending_actions": lambda: np.array(pending),  # the network goes on writing into its own
         }
         added = {name: values[name]() for name in self.names}
         if self._is_flat:

@@ -7,10 +7,11 @@ from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium import Space
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import batch_space, iterate
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
@@ -24,10 +25,12 @@ from ncs_gym.validation import require_batched_infos, shown
 class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
     """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
 
-    Each environment has a network of its own; all draw from one generator, so that N = 1 is what `Networked` does. It
-    works in all modes of autoreset. Infos are arrays (with several channels dictionaries of arrays) for all
-    environments at each step, without masks. A function for `fill` is given batches: (last, age, actions) have the
-    shapes (N, ...), (N,) and (N, pending, ...).
+    Each environment has a network of its own; all draw from one generator, so that N = 1 is what `Networked` does (with
+    NEXT_STEP until the first episode ends: the step that resets draws, too). It works in all modes of autoreset. Infos
+    are arrays (with several channels dictionaries of arrays) for all environments at each step, without masks. A
+    function for `fill` is given batches: (last, age, actions) have the shapes (N, ...), (N,) and (N, pending, ...).
+    With SAME_STEP `info["final_obs"]` holds what the agent sees last: an array for all environments, or, of
+    dictionaries and tuples, an array of objects, one for each that ended.
 
     Args:
         env: Any vector environment but an `NCSVectorEnv`, which has its own network.
@@ -200,7 +203,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         if len(rows := restarted.nonzero()[0]):
             self._begin(rows, sample, anew=True)
         if self._mode is AutoresetMode.SAME_STEP and done.any():
-            info = info | {"final_obs": self._seen()}
+            info = info | {"final_obs": _listed(self.observation_space, self._seen(), done)}
             if isinstance(info.get("final_info"), dict):
                 info["final_info"] = info["final_info"] | self._with_network({})
             self._begin(np.flatnonzero(done), self._snapshots.taken(observations), anew=True)
@@ -215,7 +218,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             pairs = zip(seen, settings.parts, arrivals, strict=True)
             seen = [_where(each.is_new(self._steps), sample, zero_of(part.space)) for sample, part, each in pairs]
         elif callable(settings.fill):
-            filled = settings.fill(seen[0], self._steps - arrivals[0].stamp, self._decided)
+            filled = settings.fill(seen[0], self._steps - arrivals[0].stamp, self._decided.copy())
             seen = [_where(arrivals[0].stamp == self._steps, seen[0], filled)]
         if not settings.entries.names:
             return joined(settings.parts, seen)
@@ -380,7 +383,21 @@ def _merged(done: np.ndarray, final: Any, observations: Any) -> Any:
             return {key: _merged(done, final[key], each) for key, each in observations.items()}
         rows = {key: [None if each is None else each[key] for each in final] for key in observations}
         return {key: _merged(done, rows[key], each) for key, each in observations.items()}
+    if isinstance(observations, tuple):
+        if not isinstance(final, tuple):
+            final = [[None if each is None else each[i] for each in final] for i in range(len(observations))]
+        return tuple(_merged(done, part, each) for part, each in zip(final, observations, strict=True))
     merged = observations.copy()
     for e in np.flatnonzero(done).tolist():
         merged[e] = final[e]
     return merged
+
+
+def _listed(space: Space[Any], observations: Any, done: np.ndarray) -> Any:
+    """Returns final observations; of dictionaries and tuples one for each environment, None where no episode ended."""
+    if isinstance(observations, np.ndarray):
+        return observations
+    listed = np.full(len(done), None, dtype=object)
+    for e, each in enumerate(iterate(space, observations)):
+        listed[e] = each if done[e] else None
+    return listed

@@ -179,6 +179,8 @@ ONE_SENTENCE = [
     ("render --env CartPole-v1", "unknown environment 'CartPole-v1'"),
     ("render --out nowhere/a.gif", "No such file or directory"),
     ("render --policy nowhere", "no agent in nowhere"),
+    ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
+    ("attack --env ncs_gym/CSTR-v0 --noise gaussian", "noise=\"gaussian\" needs a covariance"),
     ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
     ("requirements --env nothing", "unknown environment"),
     (f"loop --env {CRUISE} --channel lag=3", "--channel lag: a channel has no such setting"),

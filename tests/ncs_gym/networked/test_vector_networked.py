@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import iterate
 
 from ncs_gym import Channel, GilbertElliott, Networked, TraceChannel, VectorNetworked, VectorRandomChannel
 from tests.ncs_gym.networked.environments import Counter
@@ -38,6 +39,8 @@ def rows(value, e):
 def same(one, other):
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
     return np.array_equal(one, other)
 
 
@@ -99,6 +102,44 @@ def test_episodes_that_end_at_different_times_begin_anew_alone(mode, late):
                     (wanted, own), over[e] = env.reset(), False
             assert seen[e] == wanted, (k, e)
             assert [info[key][e] for key in KEYS] == [own[key] for key in KEYS], (k, e)
+
+
+@pytest.mark.parametrize(
+    ("make", "settings"),
+    [
+        (lambda: gym.make("Blackjack-v1"), {}),
+        (lambda: gym.make("Blackjack-v1"), {"channel": (Channel(), Channel(delay=1), Channel(send_period=3))}),
+        (lambda: gym.make("FrozenLake-v1"), {"observe": ("age", "pending_actions")}),
+        (lambda: gym.make("FrozenLake-v1"), {}),
+        (lambda: Counter("dict", length=4), {}),
+        (lambda: Counter(length=4), {}),
+    ],
+)
+def test_last_observations_are_those_of_the_single_network(make, settings):
+    settings = {"channel": Channel(delay=1)} | settings
+    one = Networked(make(), **settings)
+    many = VectorNetworked(SyncVectorEnv([make], autoreset_mode=AutoresetMode.SAME_STEP), **settings)
+    seen, seen_by_many = one.reset(seed=1)[0], many.reset(seed=1)[0]
+    one.action_space.seed(1)
+    ended = 0
+    for _ in range(40):
+        action = one.action_space.sample()
+        seen, _, terminated, truncated, _ = one.step(action)
+        seen_by_many, *_, info = many.step(np.array([action]))
+        if terminated or truncated:
+            assert same(seen, info["final_obs"][0])
+            seen, ended = one.reset()[0], ended + 1
+        assert all(same(seen, each) for each in iterate(many.observation_space, seen_by_many))
+    assert ended > 1
+
+
+def test_of_dictionaries_and_tuples_only_those_that_ended_have_a_last_observation():
+    makes = [lambda length=length: Counter("dict", length=length) for length in (2, 3)]
+    many = VectorNetworked(SyncVectorEnv(makes, autoreset_mode=AutoresetMode.SAME_STEP), Channel(delay=1))
+    many.reset(seed=0)
+    many.step(np.zeros((2, 1)))
+    first, last = many.step(np.zeros((2, 1)))[-1]["final_obs"]
+    assert (first["count"], last) == (1.0, None)
 
 
 def test_networks_of_a_batch_are_independent_and_have_the_rate_asked_for():
