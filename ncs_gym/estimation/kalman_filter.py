@@ -164,7 +164,7 @@ class ErrorRecursion:
             gain, covariance = updated_covariance(covariance, self.plant.H, self.R)
         except np.linalg.LinAlgError:
             return None
-        if not (isfinite(gain.sum()) and isfinite(covariance.sum())):
+        if not (isfinite(gain.sum()) and isfinite(covariance.sum()) and min(covariance.diagonal().tolist()) >= 0.0):
             return None
         return gain, self._rounded(covariance)
 

@@ -11,8 +11,9 @@ from scipy.optimize import linprog
 import shields
 from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, Packet, TraceChannel, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from shields import CertificateError, VectorSafetyShield, certificate_for
-from shields.silence import MOST_STEPS
+from shields.silence import MOST_STEPS, way_back
 from shields.synthesis.faces import Extremes, Faces
 from tests.certificates import certificate_of
 from tests.plants import named, small
@@ -269,6 +270,16 @@ def test_ways_back_are_those_of_an_estimator_with_as_few_samples_as_the_contract
                 assert certified or 5 * period < step < first + said
                 assert not (certified and first <= step < first + said)
     assert not contract.is_kept_by(Channel(send_period=contract.max_age + 2))
+
+
+def test_way_back_from_an_outage_after_which_the_covariance_is_no_longer_positive():
+    plant = LinearPlant.from_statespace(
+        ([[0.0, 1.0], [12.0, -0.3]], [[0.0], [4.0]], [[1.0, 0.0]], [[0.0]]), dt=0.02, box=[0.2, 1.0], u_max=3.0,
+        disturbance_bound=[2e-4, 3e-3], sensor_bound=5e-4, initial_bound=[2e-3, 1e-2],
+    )  # fmt: skip
+    recursion = ErrorRecursion(plant, 0.0, certified_error_set(plant, ChannelContract(4)))
+    with np.errstate(all="raise"):
+        assert 1 <= way_back(recursion, 400, 5) < 100
 
 
 def test_a_contract_of_age_0_is_exceeded_by_the_first_missing_sample():

@@ -48,8 +48,9 @@ _LOST = {"", "na", "n/a", "nan", "nat", "inf", "infinity", "none", "null", "-", 
 _YES, _NO = {"1", "1.0", "true", "yes", "y"}, {"0", "0.0", "false", "no", "n", ""}
 # Words of the names of columns, and cells, that may tell of lost packets where nobody knows how.
 _OF_LOSS = re.compile(
-    r"(?:^|_)(?:lost|loss|losses|drop|drops|dropped|miss|missed|missing|timeout|ok|status|success|fail|failed|failure|"
-    r"error|ack|acked|delivered|arrived|received)(?:_|$)"
+    r"(?:^|_)(?:lost|loss|losses|lossy|drop|drops|dropped|miss|missed|missing|timeout|ok|status|state|success|fail|failed|"
+    r"failure|err|errno|error|errors|rc|ret|code|exit|result|outcome|event|type|retry|retries|resent|valid|ack|nack|acked|"
+    r"delivered|arrived|received)(?:_|$)"
 )
 _SAYS_LOST = {"lost", "loss", "dropped", "drop", "timeout", "timed out", "missing", "missed", "fail", "failed"}
 _SINCE = datetime(1970, 1, 1, tzinfo=UTC)
@@ -234,7 +235,7 @@ def _date(cell: str) -> Decimal:
 
 def count_in(cell: str) -> int:
     """Returns the whole number in a cell; raises ValueError if there is none, or one that nobody counts to."""
-    value = int(cell)
+    value = int(cell.removesuffix(".0"))  # as pandas writes them beside what is missing
     if abs(value) > _LARGEST_COUNT:
         raise ValueError("too large")
     return value

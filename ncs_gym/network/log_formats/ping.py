@@ -152,6 +152,8 @@ def _of_numbers(
         between, how = _period_of(summary, period)
         sent = between * (numbers - first)
     notes = _disagreements(summary, delays)
+    if before := min(answers) - first:
+        notes += f" Its first answer has the number {min(answers)}: {before:,} before it count as lost."
     return Record(sent, delays, f"Read as the output of {program}: {WAY_AND_BACK}, packets were {how}.{notes}")
 
 

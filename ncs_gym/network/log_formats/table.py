@@ -47,6 +47,8 @@ _REGULAR_SHARE, _FEWEST, _IRREGULAR, _LONGEST_ABSENCE = 0.9, 20, 0.25, 100
 
 def of_table(lines: Sequence[str], period: float | None, step: float) -> Record:
     """Returns the packets of a table whose columns have names, or of one number per line."""
+    if lines and re.fullmatch(r"sep=.", lines[0].strip()):  # for spreadsheets
+        lines = ["", *lines[1:]]
     head = next(((n, line) for n, line in enumerate(lines) if line.strip().lstrip("#").strip()), None)
     if head is None:
         raise ValueError("a log needs at least two packets")

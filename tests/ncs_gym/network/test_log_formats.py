@@ -354,6 +354,17 @@ def test_numbers_of_a_list_of_delays_ascend(written):
             PacketLog.load(written("seq,rtt_ms\n" + "".join(f"{number},5\n" for number in numbers)))
 
 
+def test_numbers_of_pandas_and_separators_of_spreadsheets_are_read(written):
+    log = PacketLog.load(written("sep=;\nseq;sent_ms;delay_ms\n1.0;0;5\n3.0;40;5\n4;60;6\n"))
+    assert np.isnan(log.delays).tolist() == [False, True, False, False]
+
+
+def test_numbers_before_the_first_answer_of_ping_are_named(written):
+    log = PacketLog.load(written(LINUX + ping([(4, 12), (5, 13)])))
+    assert "Its first answer has the number 4: 3 before it count as lost" in log.read_as
+    assert np.isnan(log.delays).tolist() == [True, True, True, False, False]
+
+
 def test_list_with_three_decimals_may_mark_what_is_lost_by_a_number(written):
     assert np.isnan(PacketLog.load(written("rtt_ms\n18.124\n5.188\n-1\n")).delays).tolist() == [False, False, True]
 
@@ -410,7 +421,18 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent_s,latency\n0,5.5\n0.02,6\n", "most packets would take more than a second"),
         *(
             (f"sent_ms,delay_ms,{name}\n0,5,0\n20,6,{cell}\n", f"'{name}' may say which packets were lost")
-            for name, cell in {"flag": 1, "X": "lost", "loss_pct": 33, "status": "failed", "acked?x": 2}.items()
+            for name, cell in {
+                "err": 11,
+                "errno": 110,
+                "rc": -1,
+                "type": "L",
+                "retries": 3,
+                "flag": 1,
+                "X": "lost",
+                "loss_pct": 33,
+                "status": "failed",
+                "acked?x": 2,
+            }.items()
         ),
         *(
             (f"{names}\n2026-01-01T10:00:00,{end}\n2026-01-01T10:00:01,{end}\n", f"'{wrong}' has the unit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import gymnasium as gym
@@ -171,6 +172,18 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
                 assert np.abs(info["input"] - before).max() <= 0.3
             guaranteed += info["shield_guaranteed"]
     assert guaranteed > 200
+
+
+@pytest.mark.parametrize("least", [0, 1, 6])
+@pytest.mark.parametrize("name", ["rates", "rates of a late input"])
+def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it_also_where_steps_are_asked_for(name, least):
+    plant, found = PLANTS[name], certificate(name)
+    loop = SafeLoop(found, plant, Channel(), mode="lookahead", least_safe_steps=least)
+    loop.start(np.zeros(plant.n))
+    loop.receive()
+    for proposed in (plant.input_high, plant.input_low):
+        decision = copy.deepcopy(loop).decide(proposed)
+        assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
 
 
 def test_loop_without_gymnasium_knows_the_limit():
