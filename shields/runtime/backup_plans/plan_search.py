@@ -147,16 +147,16 @@ class Planner:
 
         Candidates are the projected input and then the regulator (where states and inputs have limits together, or K),
         what is stored, and either gain from the start. The solver is asked where none of them is certified; where plans
-        end in S also if nothing is stored. Plans that end in P would begin closer by it in a single step, but not in a loop
-        (docs/lookahead.md), for three times the time.
+        end in S also if nothing is stored. Plans that end in P would begin closer by it in a single step, but not in a
+        loop (docs/lookahead.md), for three times the time.
         `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
         """
         tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
         candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
-        # A regulator knows nothing of limits of states and inputs together, K keeps them. Elsewhere K's plans only bring
-        # the state closer to the edge, where less can be promised later.
+        # A regulator knows nothing of limits of states and inputs together, K keeps them. Elsewhere plans with K only
+        # bring the state closer to the edge, where less can be promised later.
         if self.enough > 1 and len(self._plant.mixed_rows):
             candidates = np.concatenate([candidates, self._continued(estimates, projected)], axis=1)
         plans = self._best(estimates, tightening, candidates, proposed)
