@@ -121,11 +121,11 @@ def rows_of(
 
 
 def different_cells(rows: Iterator[tuple[int, list[str]]], width: int) -> list[set[str]]:
-    """Returns the different cells of each column in small letters: some of them, and every one that says a loss."""
+    """Returns the different cells of each column in small letters: some of them, and all that may say a loss."""
     found: list[set[str]] = [set() for _ in range(width)]
     for _, cells in rows:
         for column, cell in zip(found, cells, strict=False):
-            if len(column) <= len(_YES | _NO) or cell.lower() in _SAYS_LOST:
+            if len(column) <= len(_YES | _NO) or cell.lower() in _SAYS_LOST | _LOST:
                 column.add(cell.lower())
     return found
 
@@ -136,8 +136,12 @@ def are_flags(cells: set[str]) -> bool:
 
 
 def require_no_loss(name: str, cells: set[str]) -> None:
-    """Raises ValueError if a column that is not understood may say which packets were lost."""
-    if len(cells) > 1 and (_OF_LOSS.search(plain(name)) or not cells.isdisjoint(_SAYS_LOST) or are_flags(cells)):
+    """Raises ValueError if a column that is not understood may say which packets were lost.
+
+    By its name or a word, or because its cells are of two kinds: two values, or some empty and others not.
+    """
+    is_divided = len(cells) == 2 or not cells.isdisjoint(_LOST)
+    if len(cells) > 1 and (is_divided or _OF_LOSS.search(plain(name)) or not cells.isdisjoint(_SAYS_LOST)):
         raise ValueError(
             f"the column {shown(name)} may say which packets were lost: name it lost if 1 stands for a lost one, ok if "
             "0 does, or leave it out"
@@ -145,8 +149,19 @@ def require_no_loss(name: str, cells: set[str]) -> None:
 
 
 def says_lost(line: int, cells: list[str], columns: dict[str, Column]) -> bool:
-    """Returns whether a row has the mark of a lost packet, or not that of one that arrived."""
+    """Returns whether a row has the mark of a lost packet, or not that of one that arrived.
+
+    Beside the time of arrival a delay may mark it, too.
+    """
     marks = {}
+    if {"received", "delay"} <= columns.keys():
+        cell = cells[columns["delay"].index]
+        try:
+            delay = number_in(cell)
+        except ValueError:
+            raise ValueError(f"line {line}: {shown(columns['delay'].name)} is no delay, got {shown(cell)}") from None
+        if delay is None or delay in MARKS:
+            return True
     for role in {"lost", "kept"} & columns.keys():
         index, name = columns[role][:2]
         cell = cells[index].lower() if index < len(cells) else ""

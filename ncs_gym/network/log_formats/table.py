@@ -92,12 +92,15 @@ def of_table(lines: Sequence[str], period: float | None, step: float) -> Record:
     if {"episode", "sent", "received"} <= columns.keys():
         _require_steps(columns, unused)
         return _of_steps(rows(), columns, step)
-    for index, name in unused.items() if "delay" in columns or {"sent", "received"} <= columns.keys() else ():
-        require_no_loss(name, cells[index])
+    moments = [name for name in unused.values() if SUFFIX.sub("", plain(name)) in MOMENTS]
+    if "delay" in columns or {"sent", "received"} <= columns.keys():
+        for index, name in unused.items():
+            if name not in moments:
+                require_no_loss(name, cells[index])
     if "sent" in columns and ("received" in columns or "delay" in columns):
         return _of_times(rows(), columns, names)
     if set(columns) - {"number", "lost", "kept"} == {"delay"}:
-        if moments := [name for name in unused.values() if SUFFIX.sub("", plain(name)) in MOMENTS]:
+        if moments:
             unit = "" if columns["delay"].unit else f", and {shown(columns['delay'].name)} by its unit, as in rtt_ms"
             raise ValueError(
                 f"the column {shown(moments[0])} may say when packets were sent or when they came back: name it sent_s "
@@ -206,6 +209,8 @@ def _of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column],
             f" {_many(absent, 'packet')} without a line, where one is usually sent every {1000.0 * usual:.4g} ms, "
             "stand for lost ones."
         )
+    if {"received", "delay"} <= columns.keys():
+        read_as += f" Of {shown(columns['delay'].name)} only what it marks as lost is used."
     if unused:
         read_as += f" Not used: {', '.join(unused)}."
     return Record(moments, delays, read_as)

@@ -318,8 +318,25 @@ def test_column_marks_what_arrived(name, written):
 
 
 def test_columns_of_other_things_are_left_out(written):
-    log = PacketLog.load(written("sent_ms,delay_ms,size,version,lossless\n0,5,64,1,a\n20,3,60,1,b\n"))
+    rows = "0,5,64,1,a\n20,3,60,1,b\n40,5,90,1,c\n"
+    log = PacketLog.load(written("sent_ms,delay_ms,size,version,lossless\n" + rows))
     assert "Not used: 'size', 'version', 'lossless'" in log.read_as
+
+
+@pytest.mark.parametrize("mark", ["-1", "", "timeout", "0"])
+def test_delay_beside_the_time_of_arrival_may_mark_what_is_lost(mark, written):
+    log = PacketLog.load(written(f"sent_ms,received_ms,delay_ms\n0,5,5\n20,24,{mark}\n40,45,5\n"))
+    assert np.isnan(log.delays).tolist() == [False, True, False]
+    assert "Of 'delay_ms' only what it marks as lost is used" in log.read_as
+
+
+@pytest.mark.parametrize(
+    "cells", [("good", "bad", "good"), ("64", "0", "64"), ("a", "", "b"), ("1.5", "nan", "1.7"), ("1", "4", "1")]
+)
+def test_column_that_divides_packets_into_two_kinds_is_refused(cells, written):
+    rows = "".join(f"{20 * n},{20 * n + 5},{cell}\n" for n, cell in enumerate(cells))
+    with pytest.raises(ValueError, match="'x' may say which packets were lost"):
+        PacketLog.load(written("sent_ms,received_ms,x\n" + rows))
 
 
 def test_dates_say_what_is_lost_as_numbers_do(written):
