@@ -184,12 +184,14 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         """Sets an attribute of environments of gymnasium's sync and async vector environments, all at once.
 
         Raises:
-            AttributeError: For any other vector environment, whose environments are not objects of their own.
+            AttributeError: For any other vector environment, whose environments are not objects of their own, and for
+                what a wrapper of vector environments around them has.
         """
         inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
             require_not_inside(attr_name, self.vector_env, "SB3VecEnv")
             raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
+        require_not_inside(attr_name, self.vector_env, "SB3VecEnv", until=inner)
         values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
         for e in chosen:
             values[e] = value

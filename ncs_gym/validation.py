@@ -152,16 +152,17 @@ class AroundEnvironment:
         object.__setattr__(self, name, value)
 
 
-def require_not_inside(name: str, inside: Any, outside: str) -> None:
+def require_not_inside(name: str, inside: Any, outside: str, until: Any = None) -> None:
     """Raises AttributeError if setting an attribute outside would have no effect, because something inside has it.
 
     Args:
         name: Of the attribute.
         inside: The outermost of the layers inside; None for none.
         outside: What it would be set on, for the message.
+        until: A layer that is not asked, nor what is inside it.
     """
     layer = inside
-    while layer is not None:
+    while layer is not until:
         own = getattr(layer, "__dict__", {})
         if name in own or hasattr(type(layer), name):
             kept = getattr(type(layer), name, None)

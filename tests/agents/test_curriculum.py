@@ -84,6 +84,20 @@ def test_what_only_something_inside_has_is_not_set_on_a_wrapper(kind):
         assert env.env.penalty == 0.0
 
 
+@pytest.mark.parametrize("name", ["channel", "downlink", "fill", "late", "draws"])
+def test_what_a_wrapper_of_vector_environments_has_is_not_set_on_the_environments_inside(name):
+    inner = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+    env = SB3VecEnv(VectorRandomChannel(VectorNetworked(inner, Channel(delay=1)), [Channel(delay=1)]))
+    if name == "draws":
+        env.set_attr(name, 3)  # nobody has it: it is the environments' own
+        assert env.get_attr(name) == [3, 3]
+        return
+    with pytest.raises(AttributeError, match=r"and cannot be changed|it would have no effect"):
+        env.set_attr(name, Channel(delay=4))
+    with pytest.raises(AttributeError):
+        env.get_attr(name)
+
+
 def test_stable_baselines3_sets_no_channel_on_a_shield_and_asks_through_its_monitor():
     shielded = DummyVecEnv([lambda: SafetyShield(gym.make(ID))])
     with pytest.raises(AttributeError, match="episodes get other ones by RandomChannel"):
