@@ -162,7 +162,7 @@ def require_not_inside(name: str, inside: Any, outside: str, until: Any = None) 
         until: A layer that is not asked, nor what is inside it.
     """
     layer = inside
-    while layer is not until:
+    while layer is not None and layer is not until:
         own = getattr(layer, "__dict__", {})
         if name in own or hasattr(type(layer), name):
             kept = getattr(type(layer), name, None)

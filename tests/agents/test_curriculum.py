@@ -1,6 +1,7 @@
 """Curricula: what would have no effect is refused, and what has one has the same one everywhere."""
 
 import pickle
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +21,7 @@ from ncs_gym import (
     VectorRandomChannel,
     VectorRequestActions,
 )
+from ncs_gym.validation import require_not_inside
 from shields import SafetyShield, VectorSafetyShield
 
 ID, CLASSIC = "ncs_gym/TruckTrailerCruise-v0", "CartPole-v1"
@@ -96,6 +98,10 @@ def test_what_a_wrapper_of_vector_environments_has_is_not_set_on_the_environment
         env.set_attr(name, Channel(delay=4))
     with pytest.raises(AttributeError):
         env.get_attr(name)
+
+
+def test_layers_that_do_not_lead_to_the_last_one_come_to_an_end():
+    require_not_inside("mark", SimpleNamespace(env=SimpleNamespace()), "outside", until=object())
 
 
 def test_stable_baselines3_sets_no_channel_on_a_shield_and_asks_through_its_monitor():

@@ -145,10 +145,10 @@ class Planner:
     ) -> Plans:
         """Returns certified plans whose first inputs are close to the proposed ones.
 
-        Candidates are the projected input and then the regulator (where states and inputs have limits together, or K),
-        what is stored, and either gain from the start. The solver is asked where none of them is certified; where plans
-        end in S also if nothing is stored. Plans that end in P would begin closer by it in a single step, but not in a
-        loop (docs/lookahead.md), for three times the time.
+        Candidates are the projected input and then the regulator, what is stored, and either gain from the start; where
+        states and inputs have limits together also the projected input and then K. The solver is asked where none of
+        them is certified; where plans end in S also if nothing is stored. Plans that end in P would begin closer by it
+        in a single step, but not in a loop (docs/lookahead.md), for three times the time.
         `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
         """
         tightening = self.test.tightenings_of(shapes)
