@@ -232,18 +232,35 @@ def _closest_on_edges(
 ) -> np.ndarray:
     """Returns `closest`, shape (2, N), with what `closest_between` finds of two inputs, many problems at once.
 
-    The closest point lies on an edge that the wanted one is beyond, and on the line of each of these it is in an
+    Nothing is closer than the edge that the wanted point is farthest beyond: if the foot on it is admissible, it is the
+    closest. Else that lies on some edge that the wanted point is beyond, and on the line of each of these it is in an
     interval. `values` are those of the rows at the wanted inputs, `beyond` says which problems are beyond which edges.
     """
-    row, problem = np.nonzero(beyond & (effect != 0.0).any(axis=1)[:, None])
-    normals = effect[row].T
-    way = np.sign(values[row, problem]) * limits[row, problem] - values[row, problem]
-    foot = normals * (way / (normals * normals).sum(axis=0))
-    line = np.stack([-normals[1], normals[0]]) / np.hypot(*normals)
+    squares = (effect * effect).sum(axis=1)
+    beyond = beyond & (squares > 0.0)[:, None]
+
+    def feet(row: np.ndarray, problem: np.ndarray) -> np.ndarray:
+        """Returns the shortest moves onto edges of problems, shape (2, k)."""
+        way = np.sign(values[row, problem]) * limits[row, problem] - values[row, problem]
+        return effect[row].T * (way / squares[row])
+
+    problem = np.flatnonzero(beyond.any(axis=0))
+    distance = (np.abs(values[:, problem]) - limits[:, problem]) / np.sqrt(squares)[:, None]
+    row = np.where(beyond[:, problem], distance, -np.inf).argmax(axis=0)
+    foot = feet(row, problem)
+    kept = np.abs(values[:, problem] + effect @ foot) <= limits[:, problem]
+    kept[row, np.arange(len(row))] = True  # the edge itself
+    found = kept.all(axis=0)
+    closest[:, problem[found]] = (wanted[:, problem] + foot)[:, found]
+    beyond[:, problem[found]] = False
+
+    row, problem = np.nonzero(beyond)
+    foot = feet(row, problem)
+    line = np.stack([-effect[row, 1], effect[row, 0]]) / np.sqrt(squares[row])
     left, along = limits[:, problem], effect @ line
-    left[row, np.arange(len(row))] = np.inf  # the edge itself
+    left[row, np.arange(len(row))] = np.inf
     # A row that is parallel to the edge does not change on its line: rounding must not decide whether it holds there.
-    parallel = along * along <= PARALLEL**2 * (effect * effect).sum(axis=1)[:, None]
+    parallel = along * along <= PARALLEL**2 * squares[:, None]
     along = np.where(parallel, 0.0, along)
     left = np.where(parallel, left * (1.0 + PARALLEL) + PARALLEL * np.abs(values[:, problem]), left)
     start = values[:, problem] + effect @ foot

@@ -27,7 +27,7 @@ MOST_INPUTS_WITH_VERTICES = 12
 # As many pairs of vertex and environment are looked at in one array.
 LARGEST_BLOCK = 100_000
 # Entries of an array that are worked on together: as many as a processor keeps near.
-BLOCK = 131_072
+BLOCK = 32_768
 # Projections onto either of two sets of inputs, in turn.
 ALTERNATIONS = 8
 # Growths of the root that are tried until it provably does not understate the norm of S.
@@ -342,13 +342,16 @@ class ReachableSets(NamedTuple):
         return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
 
     def _closest_on_rows(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        (m, count), cone = inputs.shape, self.test.cone
-        block = max(1, BLOCK // (len(self.test.joint) * m))
-        if m > 1 and count > block:
-            parts = [np.arange(start, min(start + block, count)) for start in range(0, count, block)]
-            return np.hstack([self.some(part)._closest_on_rows(inputs[:, part], margin) for part in parts])
-        offset = self.test.state_rows[cone:] @ self.estimates - self.test.middle[:, None]
-        return self.test.closest_on_rows(inputs, offset, self.row_limits - self.rounding - margin)
+        test, closest = self.test, np.empty(inputs.shape)
+        rows = test.state_rows[test.cone :]
+        block = max(1, BLOCK // len(rows))
+        for start in range(0, inputs.shape[1], block):
+            part = slice(start, start + block)
+            offset = rows @ self.estimates[:, part]
+            offset -= test.middle[:, None]
+            room = self.row_limits[:, part] - (self.rounding[part] + margin)
+            closest[:, part] = test.closest_on_rows(inputs[:, part], offset, room)
+        return closest
 
 
 class PredictedErrors(NamedTuple):
