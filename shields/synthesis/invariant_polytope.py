@@ -210,7 +210,10 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
     of the others, with past inputs at the operating one.
     """
     points = points_of_box(plant, _POINTS_LOG2)
-    return None if points is None else float((polytope.gauge(points) <= 1.0).mean())
+    if points is None:
+        return None
+    points[:, plant.n - inputs_under_way(plant) :] = 0.0
+    return float((polytope.gauge(points) <= 1.0).mean())
 
 
 def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
@@ -227,16 +230,20 @@ def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
 
 
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
-    """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`."""
-    rows, n = plant.box, plant.n - inputs_under_way(plant)
+    """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`.
+
+    Past inputs are within their limits, not in the wider rows that the box has for them.
+    """
+    rows, past = plant.box, inputs_under_way(plant)
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n
     if not is_product or not np.isfinite(plant.box_ends).all():
         return None
-    order = np.abs(rows).argmax(axis=0)[:n]  # the row of each state
-    ends, points = plant.box_ends[:, order], np.zeros((2**log2, plant.n))
-    drawn = 2.0 * qmc.Sobol(n, scramble=False).random_base2(log2) - 1.0
-    points[:, :n] = (0.5 * (ends[0] + ends[1]) + 0.5 * (ends[1] - ends[0]) * drawn) / rows.sum(axis=0)[:n]
-    return points
+    order = np.abs(rows).argmax(axis=0)  # the row of each state
+    ends, units = plant.box_ends[:, order], rows.sum(axis=0)
+    if past:
+        ends[:, -past:], units[-past:] = np.tile(plant.input_ends, past // plant.m), 1.0
+    drawn = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(log2) - 1.0
+    return (0.5 * (ends[0] + ends[1]) + 0.5 * (ends[1] - ends[0]) * drawn) / units
 
 
 def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) -> float:

@@ -28,6 +28,7 @@ from shields import (
     synthesize,
     verify,
 )
+from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
 from tests.certificates import certificate_of
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
@@ -109,6 +110,12 @@ def test_share_of_the_last_input_is_what_linear_programs_find():
     share = (-most.fun - least.fun) / np.ptp(plant.input_ends)
     assert found.provenance["share_of_last_input"] == pytest.approx(share, abs=0.002)
     assert f"the last input has {100.0 * share:.3g} % of its range" in " ".join(str(found).split())
+    # Gains are compared by points of states and of last inputs: these decide as much of the next state as those.
+    points = points_of_box(plant, 12)
+    inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
+    assert np.ptp(points[:, -1]) == pytest.approx(np.ptp(plant.input_ends), rel=0.001)
+    assert share_of_points(feedback_of(found), plant, points) == pytest.approx(inside.mean(), abs=0.002)
+    assert 0.3 < inside.mean() < found.provenance["polytope_share_of_box"]
 
 
 def changed(found, **fields):
