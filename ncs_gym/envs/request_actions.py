@@ -25,7 +25,8 @@ class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
 
     Args:
         env: An `NCSEnv` whose channel takes samples on request, or another environment in such a `Networked`, possibly
-            wrapped; actions are a vector of numbers, or a number from 0 on (`Discrete`), which becomes a pair.
+            wrapped; observations are a vector of numbers; actions are one too, or a number from 0 on (`Discrete`),
+            which becomes a pair.
         cost: Of a packet, in units of the reward, >= 0.
 
     Raises:
@@ -39,7 +40,7 @@ class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
         self._inner = _on_request(env)
         self._most = self._inner.request_limits
         self.action_space = _with_request(env.action_space)
-        self.observation_space = _wider(env.observation_space, np.zeros(2), self._most)
+        self.observation_space = _with_age(env.observation_space, self._most)
         self._packets = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -62,7 +63,7 @@ class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
 
     def _seen(self, observation: np.ndarray) -> np.ndarray:
         more = np.minimum(self._inner.request_state, self._most)
-        return np.concatenate([observation, more.astype(np.float32)])
+        return np.concatenate([observation, more]).astype(self.observation_space.dtype)
 
 
 class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
@@ -87,7 +88,7 @@ class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorAr
             raise ValueError("with SAME_STEP autoreset the age at an episode's end is not known: use NEXT_STEP")
         self._most = self._inner.single.request_limits
         self.single_action_space = _with_request(env.single_action_space)
-        self.single_observation_space = _wider(env.single_observation_space, np.zeros(2), self._most)
+        self.single_observation_space = _with_age(env.single_observation_space, self._most)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._packets = np.zeros(self.num_envs, np.int64)
@@ -117,7 +118,7 @@ class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorAr
 
     def _seen(self, observations: np.ndarray) -> np.ndarray:
         more = np.minimum(np.stack([self._inner.known.age, self._inner.outstanding], axis=1), self._most)
-        return np.concatenate([observations, more.astype(np.float32)], axis=1)
+        return np.concatenate([observations, more], axis=1).astype(self.observation_space.dtype)
 
 
 def _on_request(env: Any) -> Any:
@@ -141,8 +142,20 @@ def _with_request(actions: Any) -> Any:
 
 
 def _wider(space: Any, low: Any, high: Any) -> Box:
-    least, most = (np.concatenate(pair).astype(np.float32) for pair in ((space.low, low), (space.high, high)))
-    return Box(least, most, dtype=np.float32)
+    """Returns a space of vectors with more entries, of floats that hold the others'."""
+    kind = np.result_type(space.dtype, np.float32)
+    least, most = (np.concatenate(pair).astype(kind) for pair in ((space.low, low), (space.high, high)))
+    return Box(least, most, dtype=kind.type)
+
+
+def _with_age(observations: Any, most: np.ndarray) -> Box:
+    """Returns the space of observations with the age of the newest sample and the requests after it."""
+    if not (isinstance(observations, Box) and len(observations.shape) == 1):
+        raise ValueError(
+            f"the age of the newest sample is an entry more of a vector of numbers, got {observations}: put "
+            "FlattenObservation inside"
+        )
+    return _wider(observations, np.zeros(2), most)
 
 
 def _parted(actions: Any, space: Any) -> tuple[Any, np.ndarray]:
@@ -151,4 +164,4 @@ def _parted(actions: Any, space: Any) -> tuple[Any, np.ndarray]:
     if numbers is None or numbers.shape != space.shape or not np.isfinite(numbers).all():
         raise ValueError(f"actions must be finite with shape {space.shape}, got {shown(actions)}")
     given, asked = np.asarray(actions), np.asarray(numbers[..., -1] > 0.0)
-    return (given[..., 0] if isinstance(space, MultiDiscrete) else given[..., :-1].copy()), asked
+    return (given[..., 0][()] if isinstance(space, MultiDiscrete) else given[..., :-1].copy()), asked

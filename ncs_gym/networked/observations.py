@@ -226,7 +226,7 @@ class Entries:
         values = {
             "age": lambda: np.minimum(age, OLDEST_OBSERVED).astype(np.float32),
             "arrived": lambda: np.asarray(arrived, np.int8),
-            "pending_actions": lambda: np.array(pending),  # the network goes on writing into its own
+            "pending_actions": lambda: self._within_limits(np.array(pending)),  # the network writes on into its own
         }
         added = {name: values[name]() for name in self.names}
         if self._is_flat:
@@ -237,6 +237,12 @@ class Entries:
             return (*observation, *added.values())
         own = observation if isinstance(self._inner, spaces.Dict) else {"observation": observation}
         return {**own, **added}
+
+    def _within_limits(self, actions: np.ndarray) -> np.ndarray:
+        """Returns actions as the space of observations has them: what is beyond limits was sent like that."""
+        if not isinstance(self._actions, spaces.Box):
+            return actions
+        return np.clip(actions, self._actions.low, self._actions.high)
 
     def _flattened(self, name: str, value: Any) -> np.ndarray:
         """Returns what `gymnasium.spaces.flatten` makes of a value, of N values at once."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import Autoreset
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, EveryEpisode
 from ncs_gym.envs.json_settings import from_json, to_json
@@ -17,8 +18,10 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
-from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, setting, shown
+from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, setting, shown, warn_caller
 
+# Keys of infos that are the network's own.
+INFOS = "measurement_age", "packet_arrived", "action_age", "action_applied", "packets"
 LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
 # What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
 Predictor = Callable[[Any, Any, Any], Any]
@@ -79,6 +82,7 @@ class NetworkSettings:
         self.pending = self._memory() if given_pending is None else as_count(given_pending, "pending", low=1, high=1000)
         self.entries = Entries(settings["observe"], observations, actions, len(self.parts), self.pending)
         self.delay_reward = as_flag(settings["delay_reward"], "delay_reward")
+        self._has_warned = False
         self.recorded = dict(settings) | {
             "channel": to_json(settings["channel"]),
             "downlink": to_json(settings["downlink"]),
@@ -111,6 +115,16 @@ class NetworkSettings:
         if isinstance(option, EveryEpisode):
             each = [EveryEpisode(option.draw, first) for first in each]
         return [links.read(one, "channel") for one, links in zip(each, uplinks, strict=True)]
+
+    def require_memory(self, age: int) -> None:
+        """Warns the caller, once, where a predictor lacks actions that were decided since the newest sample."""
+        if age > self.pending and not self._has_warned:
+            self._has_warned = True
+            warn_caller(
+                f"the newest sample is {age} steps old, and the predictor is given the last {self.pending} actions: "
+                f"give pending={age} or more, or say what the channel promises (max_consecutive_losses)",
+                UserWarning,
+            )
 
     def _memory(self) -> int:
         """Returns how many actions the newest sample may lack: what the contracts allow, or without any the delays."""
@@ -165,7 +179,7 @@ def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
         return None
     if given is None:
         try:
-            if not isinstance(actions, spaces.Discrete):  # whose zero is an action like any other
+            if not _has_choices(actions):
                 return zero_of(actions)
         except ValueError:
             pass
@@ -178,6 +192,14 @@ def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
     return action
 
 
+def _has_choices(actions: spaces.Space) -> bool:
+    """Returns whether some part of actions is a number of a list, whose zero is an action like any other."""
+    if isinstance(actions, spaces.Dict | spaces.Tuple):
+        inner = actions.spaces.values() if isinstance(actions, spaces.Dict) else actions.spaces
+        return any(map(_has_choices, inner))
+    return isinstance(actions, spaces.Discrete | spaces.MultiDiscrete)
+
+
 def _require_like(declared: Channel, channel: Channel) -> None:
     if channel.on_request != declared.on_request:
         raise ValueError(f"the environment was made for channels with on_request={declared.on_request}")
@@ -187,6 +209,24 @@ def _require_downlink(declared: Channel | None, channel: Channel) -> None:
     if declared is None:
         raise ValueError("the environment has an ideal downlink: make it with downlink=Channel(...)")
     downlink_protocol(channel, None)
+
+
+def require_no_restarts(env: Any) -> None:
+    """Raises ValueError if an environment begins episodes by itself in `step`: samples of one would reach the next."""
+    layer = env
+    while layer is not None:
+        if isinstance(layer, Autoreset):
+            raise ValueError("Autoreset inside begins episodes that the network does not know of: put it around")
+        layer = vars(layer).get("env")
+
+
+def require_no_network(info: Mapping[str, Any]) -> None:
+    """Raises ValueError if infos of the environment, at a reset, have keys that are those of the network."""
+    if taken := [key for key in INFOS if key in info]:
+        raise ValueError(
+            f"infos of the environment inside have the key {taken[0]!r}, which is the network's: call it otherwise, or "
+            "if another network put it there, have one network with all delays and losses"
+        )
 
 
 def require_action(actions: spaces.Space, given: Any) -> None:

@@ -17,7 +17,14 @@ from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import NetworkSettings, Predictor, ReadNetwork, require_action
+from ncs_gym.networked.settings import (
+    NetworkSettings,
+    Predictor,
+    ReadNetwork,
+    require_action,
+    require_no_network,
+    require_no_restarts,
+)
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
 from ncs_gym.validation import require_batched_infos, shown
 
@@ -69,6 +76,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             raise ValueError(f"VectorNetworked takes vector environments, as gym.make_vec returns, got {shown(env)}")
         if isinstance(env.unwrapped, NCSVectorEnv):
             raise ValueError("expected a vector environment without a network of its own: an NCSVectorEnv has one")
+        require_no_restarts(env)
         self._settings = settings = NetworkSettings(env.single_observation_space, env.single_action_space, given)
         if settings.channels[0].on_request:
             raise ValueError("samples on request are for single environments: make each with Networked")
@@ -96,7 +104,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         """Starts episodes.
 
         Args:
-            seed: Seeds the networks (a list by its first entry) and the environments.
+            seed: Seeds the networks (a list by its first entry, a number then) and the environments.
             options: "channel" and "downlink" as for `Networked`, also lists with one for each environment; episodes
                 that begin by autoreset have the environments' own again. "reset_mask", bool (N,), starts some. The
                 rest is the environments'.
@@ -109,13 +117,18 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
         observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorNetworked")
+        require_no_network(info)
         first = seed[0] if isinstance(seed, list) else seed
+        if first is None and isinstance(seed, list):
+            raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
         if first is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
         for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
             links.give(given, np.flatnonzero(chosen).tolist())
         everywhere = bool(chosen.all())
-        if everywhere:
+        if not everywhere:
+            self._over = self._over & ~chosen  # what is reset now begins no episode in the next step
+        else:
             self._make()
             self._describe()
         self._begin(np.flatnonzero(chosen), self._snapshots.taken(observations), anew=not everywhere)
@@ -218,8 +231,9 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             pairs = zip(seen, settings.parts, arrivals, strict=True)
             seen = [_where(each.is_new(self._steps), sample, zero_of(part.space)) for sample, part, each in pairs]
         elif callable(settings.fill):
-            filled = settings.fill(seen[0], self._steps - arrivals[0].stamp, self._decided.copy())
-            seen = [_where(arrivals[0].stamp == self._steps, seen[0], filled)]
+            ages = self._steps - arrivals[0].stamp
+            settings.require_memory(int(ages.max()))
+            seen = [_where(ages == 0, seen[0], settings.fill(seen[0], ages, self._decided.copy()))]
         if not settings.entries.names:
             return joined(settings.parts, seen)
         ages = np.stack([self._steps - each.stamp for each in arrivals], axis=1)

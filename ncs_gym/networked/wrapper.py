@@ -16,7 +16,14 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import NetworkSettings, Predictor, ReadNetwork, require_action
+from ncs_gym.networked.settings import (
+    NetworkSettings,
+    Predictor,
+    ReadNetwork,
+    require_action,
+    require_no_network,
+    require_no_restarts,
+)
 from ncs_gym.validation import shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
@@ -111,6 +118,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"Networked takes an environment, as gym.make returns it, got {shown(env)}")
         if isinstance(env.unwrapped, NCSEnv):
             raise ValueError("an NCSEnv has its own network: give gym.make(id, channel=..., downlink=...)")
+        require_no_restarts(env)
         self._settings = settings = NetworkSettings(env.observation_space, env.action_space, given)
         RecordConstructorArgs.__init__(self, **settings.recorded)
         gym.Wrapper.__init__(self, env)
@@ -161,6 +169,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
         observation, info = self.env.reset(seed=seed, options=own or None)
+        require_no_network(info)
         if seed is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NETWORK_STREAM,)))
         rng = self.np_random
@@ -260,8 +269,9 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         if settings.fill == "zero":
             pairs = zip(seen, settings.parts, self._arrivals, strict=True)
             seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
-        elif callable(settings.fill) and self._arrivals[0].stamp < step:
-            seen = [settings.fill(seen[0], step - self._arrivals[0].stamp, np.array(self._decided))]
+        elif callable(settings.fill) and (age := step - self._arrivals[0].stamp):
+            settings.require_memory(age)
+            seen = [settings.fill(seen[0], age, np.array(self._decided))]
         observation = joined(settings.parts, seen)
         if not settings.entries.names:
             return observation

@@ -151,10 +151,12 @@ def test_exact_prediction_makes_up_for_delays(channel):
     def predicted(last, age, actions):
         return last + np.reshape(age, (-1, 1)) if np.ndim(age) else last + age
 
-    one = run(Networked(Counter(length=50), channel, fill=predicted), 40)
+    one = run(Networked(Counter(length=50), channel, fill=predicted, pending=40), 40)
     assert counts(one) == list(range(41))
     assert max(each[-1]["measurement_age"] for each in one) >= 3
-    envs = VectorNetworked(gym.vector.SyncVectorEnv([lambda: Counter(length=50)] * 5), channel, fill=predicted)
+    envs = VectorNetworked(
+        gym.vector.SyncVectorEnv([lambda: Counter(length=50)] * 5), channel, fill=predicted, pending=40
+    )
     assert (envs.reset(seed=0)[0] == 0).all()
     for k in range(1, 41):
         assert (envs.step(np.full((5, 1), k + 0.0))[0] == k).all()
@@ -293,6 +295,17 @@ def test_channels_of_episodes_are_drawn_or_given_and_other_options_reach_the_env
     assert inner.episode_channel.delay == 1
 
 
+@pytest.mark.parametrize("make", [Counter, lambda: gym.wrappers.DtypeObservation(gym.make("CartPole-v1"), np.float64)])
+def test_requests_keep_the_type_of_observations_and_actions(make):
+    env = RequestActions(Networked(make(), Channel(on_request=True)))
+    env.action_space.seed(0)
+    seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(5))]
+    assert {each.dtype for each in seen} == {env.observation_space.dtype, np.dtype(np.float64)}
+    assert all(map(env.observation_space.contains, seen))
+    with pytest.raises(ValueError, match="an entry more of a vector of numbers, got Discrete"):
+        RequestActions(Networked(gym.make("FrozenLake-v1"), Channel(on_request=True)))
+
+
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 def test_samples_on_request_cost_and_come_only_then(env_id):
     env = RequestActions(Networked(gym.make(env_id), Channel(on_request=True)), cost=0.5)
@@ -385,6 +398,48 @@ def test_networks_that_do_not_fit_are_one_sentence():
         Networked(Counter()).request()
     with pytest.raises(ValueError, match="a function for fill is for one channel"):
         Networked(Counter("dict"), {"count": Channel()}, fill=lambda *given: None)
+    with pytest.raises(ValueError, match="Autoreset inside begins episodes"):
+        Networked(TimeLimit(gym.wrappers.Autoreset(Counter()), 9))
+    with pytest.raises(ValueError, match="the key 'measurement_age', which is the network's"):
+        Networked(Networked(Counter(), LATE), LATE).reset()
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        gym.spaces.MultiDiscrete([3, 3]),
+        gym.spaces.Tuple([gym.spaces.Box(-1.0, 1.0), gym.spaces.Discrete(2)]),
+        gym.spaces.Dict({"gear": gym.spaces.Discrete(5)}),
+    ],
+)
+def test_number_zero_of_a_list_is_no_neutral_action(actions):
+    env = gym.wrappers.TransformAction(Counter(), None, actions)
+    with pytest.raises(ValueError, match="has no zero: give neutral="):
+        Networked(env, downlink=Channel(delay=1))
+    assert Networked(env, downlink=Channel(delay=1), neutral=actions.sample()).neutral is not None
+
+
+def test_predictor_that_lacks_actions_is_told_of_once():
+    def steps(env):
+        env.reset(seed=0)
+        for _ in range(30):
+            env.step(np.zeros(env.action_space.shape))
+
+    channel, settings = Channel(delay=1, loss=0.5), {"fill": lambda last, *_: last}
+    many = VectorNetworked(gym.vector.SyncVectorEnv([Counter] * 2), channel, **settings)
+    for env in (Networked(Counter(), channel, **settings), many):
+        with pytest.warns(UserWarning, match="is 2 steps old, and the predictor is given the last 1 actions") as told:
+            steps(env)
+        assert len(told) == 1
+    steps(Networked(Counter(), channel, pending=30, **settings))
+
+
+def test_pending_actions_are_told_within_their_limits():
+    env = Networked(gym.make("Pendulum-v1"), Channel(delay=1), observe="pending_actions")
+    env.reset(seed=0)
+    seen, *_, info = env.step(np.array([9.0], np.float32))
+    assert (seen[-1], info["action_applied"]) == (2.0, 9.0)
+    assert env.observation_space.contains(seen)
 
 
 @pytest.mark.parametrize(

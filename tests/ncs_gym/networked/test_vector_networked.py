@@ -70,9 +70,17 @@ def test_one_environment_is_that_of_the_single_network(env_id, settings):
             return
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize(
+    ("mode", "resets"),
+    [
+        (AutoresetMode.NEXT_STEP, False),
+        (AutoresetMode.NEXT_STEP, True),  # as SB3VecEnv does
+        (AutoresetMode.SAME_STEP, False),
+        (AutoresetMode.DISABLED, True),
+    ],
+)
 @pytest.mark.parametrize("late", ["apply", "queue"])
-def test_episodes_that_end_at_different_times_begin_anew_alone(mode, late):
+def test_episodes_that_end_at_different_times_begin_anew_alone(mode, resets, late):
     lengths = 5, 7, 11
     settings = {"channel": Channel(delay=2, send_period=2), "downlink": Channel(delay=1), "late": late}
     makes = [lambda length=length: Counter(length=length) for length in lengths]
@@ -83,7 +91,7 @@ def test_episodes_that_end_at_different_times_begin_anew_alone(mode, late):
     over = [False] * 3
     for k in range(40):
         actions = np.arange(3.0)[:, None] + 10.0 * k
-        if mode is AutoresetMode.DISABLED and any(over):
+        if resets and any(over):
             seen, info = many.reset(options={"reset_mask": np.array(over)})
             for e in np.flatnonzero(over):
                 assert seen[e] == singles[e].reset()[0]
@@ -158,6 +166,18 @@ def test_channels_of_episodes_are_drawn_also_where_they_begin_by_themselves():
     assert set(ages[3::5].ravel()) == {0, 1, 2, 3}  # of last steps: the delays drawn
 
 
+def test_channels_given_to_some_stay_for_their_episodes():
+    env = VectorNetworked(SyncVectorEnv([lambda length=length: Counter(length=length) for length in (3, 9)]), Channel())
+    env.reset(seed=0)
+    for _ in range(3):
+        _, _, over, _, _ = env.step(np.zeros((2, 1)))
+    *_, info = env.reset(options={"reset_mask": over, "channel": Channel(delay=7)})
+    for _ in range(3):
+        np.testing.assert_array_equal(info["channel_delay"], [7, 0])
+        *_, info = env.step(np.zeros((2, 1)))
+    np.testing.assert_array_equal(info["measurement_age"], [3, 0])
+
+
 def test_many_large_observations_are_what_they_were():
     env = VectorNetworked(SyncVectorEnv([lambda: Counter("image")] * 2, copy=False), LATE)
     env.reset(seed=0)
@@ -173,3 +193,7 @@ def test_what_vector_environments_cannot_have_is_one_sentence():
         VectorNetworked(gym.make("Pendulum-v1"))
     with pytest.raises(ValueError, match="an NCSVectorEnv has one"):
         VectorNetworked(gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2))
+    with pytest.raises(ValueError, match="the key 'measurement_age', which is the network's"):
+        VectorNetworked(SyncVectorEnv([lambda: Networked(Counter())])).reset()
+    with pytest.raises(ValueError, match=r"the first of the seeds seeds the networks, .* got \[None, 2\]"):
+        VectorNetworked(SyncVectorEnv([Counter] * 2)).reset(seed=[None, 2])
