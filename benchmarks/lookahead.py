@@ -20,6 +20,7 @@ from benchmarks.timing import microseconds
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
+from shields.runtime.backup_plans import Lookahead
 from shields.runtime.set_test import PredictedErrors
 
 # Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
@@ -97,7 +98,7 @@ class PlainProgram:
     def __init__(self, shield: SafetyFilter) -> None:
         plant, steps = shield.plant, shield.horizon
         assert steps is not None
-        assert shield.lookahead is not None
+        assert isinstance(shield.lookahead, Lookahead)
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
         self.row_limits, self.weighting, self.radius = (

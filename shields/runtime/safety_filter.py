@@ -14,6 +14,7 @@ from ncs_gym.envs.spaces import expressible
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, own_error_state, read_only, shown, warn_caller
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
+from shields.runtime.no_plans import NoPlans
 from shields.runtime.set_test import (
     MOST_INPUTS_WITH_VERTICES,
     PredictedErrors,
@@ -63,7 +64,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     Attributes:
         test: The test of an input.
-        lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
+        lookahead: What finds and certifies the plans of mode "lookahead"; in others `NoPlans`.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
@@ -78,7 +79,7 @@ class SafetyFilter(ReadOnlyArrays):
     horizon: int | None = None
     least_safe_steps: int = 0
     test: SetTest = field(init=False, repr=False)
-    lookahead: Lookahead | None = field(init=False, repr=False, default=None)
+    lookahead: Lookahead | NoPlans = field(init=False, repr=False)
     _no_plan: np.ndarray = field(init=False, repr=False)
     _constant: np.ndarray = field(init=False, repr=False)
     _low: np.ndarray = field(init=False, repr=False)
@@ -105,6 +106,7 @@ class SafetyFilter(ReadOnlyArrays):
         object.__setattr__(self, "_remembered", {})
         object.__setattr__(self, "horizon", horizon)
         object.__setattr__(self, "least_safe_steps", least)
+        object.__setattr__(self, "lookahead", NoPlans(self.plant.m))
         if horizon is not None:
             from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
 
@@ -153,7 +155,7 @@ class SafetyFilter(ReadOnlyArrays):
             if decision is not None:
                 return decision
         n, m = self.plant.n, self.plant.m
-        plans = None if self.lookahead is None else self.lookahead.as_stored(stored)[..., None]
+        plans = self.lookahead.as_stored(stored)[..., None]
         decided = self.decide_columns(_as_column(x_hat, n), errors.batch(), _as_column(proposed, m), plans)
         one = Decision(*(array[..., 0].tolist() for array in decided))
         plan = decided.plan[..., 0]
@@ -170,10 +172,8 @@ class SafetyFilter(ReadOnlyArrays):
             return Decision(proposed, False, True, False, margin, REASONS[SAFE], self._no_plan)
         if isnan(test_margin):
             return None
-        if self.lookahead is not None:
-            plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
-            if plan is None:
-                return None
+        plan = self.lookahead.beginning_alone(estimate, errors, proposed)
+        if plan is not None:
             return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
         if self.mode != "project" or self.plant.m > 1:
             return None
@@ -203,16 +203,14 @@ class SafetyFilter(ReadOnlyArrays):
         valid: np.ndarray = within[0] if len(within) == 1 else np.all(within, axis=0)
         passed = (judged >= MARGIN) & valid
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
-        plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
+        plan = np.full((self.lookahead.horizon, *proposed.shape), np.nan)
+        stored = plan.copy() if stored is None else stored
         decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
-        if self.lookahead is not None:
-            stored = plan.copy() if stored is None else stored
-            self.lookahead.keep(decided, valid, estimates, errors, stored)
+        self.lookahead.keep(decided, valid, estimates, errors, stored)
         if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~decided.passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
-        if self.lookahead is not None and stored is not None:
-            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
+        self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
     @own_error_state
@@ -242,7 +240,7 @@ class SafetyFilter(ReadOnlyArrays):
         count = len(arrays["estimates"]) if arrays["estimates"].ndim == 2 else 0
         shapes = {"estimates": [(count, n)], "error_shapes": [(n, n), (count, n, n)], "proposals": [(count, m)]}
         if stored is not None:
-            arrays["stored"], shapes["stored"] = _as_array(stored), [(count, self.horizon or 0, m)]
+            arrays["stored"], shapes["stored"] = _as_array(stored), [(count, self.lookahead.horizon, m)]
         for name, array in arrays.items():
             if array.shape not in shapes[name]:
                 wanted = " or ".join(str(shape).replace(f"({count},", "(N,", 1) for shape in shapes[name])
@@ -252,7 +250,7 @@ class SafetyFilter(ReadOnlyArrays):
         errors = errors.of(np.zeros(count, np.intp)) if one_shape else errors
         columns = [np.array(arrays[name].T, order="C") for name in ("estimates", "proposals")]
         plans = None
-        if stored is not None and self.lookahead is not None:
+        if stored is not None:
             plans = self.lookahead.all_as_stored(arrays["stored"]).transpose(1, 2, 0).copy()
         decided = self.decide_columns(columns[0], errors, columns[1], plans)
         return decided._replace(
@@ -277,10 +275,9 @@ class SafetyFilter(ReadOnlyArrays):
     @own_error_state
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
-        if self.lookahead is None:
-            return self._no_plan
         first = self.decide(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
-        return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
+        plan = np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
+        return plan[: self.lookahead.horizon]
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
         """Returns what is known of one error shape, (n, n), without a last axis, read-only; itself if it is that.
@@ -305,7 +302,7 @@ class SafetyFilter(ReadOnlyArrays):
     def errors_of_many(self, error_shapes: np.ndarray) -> PredictedErrors:
         """Returns what is known of error shapes, (k, n, n); only mode "lookahead" needs the shapes themselves."""
         known = self.test.predicted(error_shapes, self.certificate.error_shapes)
-        return known if self.lookahead is not None else known._replace(shape=known.shape[:0])
+        return known if self.lookahead.needs_shapes else known._replace(shape=known.shape[:0])
 
     @own_error_state
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray | PredictedErrors, u: np.ndarray) -> float:

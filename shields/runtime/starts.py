@@ -37,7 +37,7 @@ class StartKnown(NamedTuple):
 
     Attributes:
         in_safe_set: Whether every possible start lies in the certificate's safe set: in S, or in P if it has one.
-        in_box: Whether every possible start lies in the safe box.
+        in_box: Whether every possible start lies in the safe box; in modes without plans, in the safe set.
     """
 
     in_safe_set: bool
@@ -111,7 +111,8 @@ def starts_known(
     if initial is None:
         return (StartKnown(False, False),) * (input_delay + 1)
     plant, inside = safety_filter.plant, starts_inside(safety_filter.certificate, initial)
-    known = [StartKnown(inside, inside or starts_in_box(plant, initial))]
+    in_box = inside or (safety_filter.mode == "lookahead" and starts_in_box(plant, initial))
+    known = [StartKnown(inside, in_box)]
     if isinstance(initial, Ellipsoid):
         center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
@@ -122,7 +123,7 @@ def starts_known(
         center, shape = _moved(plant, center, shape)
         errors = safety_filter.errors_of(shape)
         inside = bool(safety_filter.test.knows_inside(center, errors, MARGIN))
-        known.append(StartKnown(inside, inside or _in_box(safety_filter, center, errors)))
+        known.append(StartKnown(inside, inside or safety_filter.lookahead.knows_in_box(center, errors)))
     return tuple(known)
 
 
@@ -138,11 +139,12 @@ def known_inside(
     Either from where starts are possible, or from its estimate, shape (n,), and from the input u that acts then, shape
     (m,), decided before; there is none at the start of an episode.
     """
-    if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
+    if known.in_box:
         return True
     if not safety_filter.test.keeps_within_step(estimate, errors, MARGIN, u):
         return False
-    return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
+    inside = bool(safety_filter.test.knows_inside(estimate, errors, MARGIN))
+    return inside or safety_filter.lookahead.knows_in_box(estimate, errors)
 
 
 def first_store(
@@ -156,15 +158,11 @@ def first_store(
     """
     lookahead = safety_filter.lookahead
     inside = known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN)
-    if lookahead is None or (inside and not lookahead.least):
+    if inside and not lookahead.least:
         return np.empty((0, safety_filter.plant.m)), known.in_safe_set
     plan = safety_filter.first_plan(estimate, errors)
     in_box = len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))
     return plan, known.in_safe_set or in_box
-
-
-def _in_box(safety_filter: SafetyFilter, center: np.ndarray, errors: PredictedErrors) -> bool:
-    return safety_filter.lookahead is not None and safety_filter.lookahead.knows_in_box(center, errors)
 
 
 def _moved(plant: LinearPlant, center: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -96,7 +96,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
         self._state = MonitorState(broken, nothing, nothing, nothing, wait)
         self._interventions, self._proved = np.zeros((2, count), np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
-        self._stored = np.full((self._filter.horizon or 0, inner.plant.m, count), np.nan)
+        self._stored = np.full((self._filter.lookahead.horizon, inner.plant.m, count), np.nan)
         self._errors = NumberedErrors(self._filter)
         self._no_reason = np.full(count, "", dtype=object)
         self._no_reason.flags.writeable = False

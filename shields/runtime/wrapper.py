@@ -151,7 +151,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
                 intervened=intervened,
                 interventions=interventions,
                 protects=self._filter.mode != "monitor",
-                plan=None if self._filter.lookahead is None else plan.copy(),
+                plan=plan.copy() if self._filter.mode == "lookahead" else None,
             )
         )
 
@@ -323,7 +323,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         reason, now = self._monitored.reason, self._episode
         now.proved += not reason
         ahead = {}
-        if self._filter.lookahead is not None:
+        if self._filter.mode == "lookahead":
             ahead["shield_plan_length"] = self._monitored.plan_length
             ahead["shield_safe_steps"] = self._monitored.safe_steps
         return ahead | {

@@ -39,13 +39,21 @@ class Lookahead:
         margin: By which plans must pass their test.
 
     Attributes:
+        horizon: Longest plan, in steps.
         least: g.
+        needs_shapes: Whether plans need the error shapes themselves.
         planner: Finds the plans.
     """
 
+    needs_shapes = True
+
     def __init__(self, test: SetTest, fallback: Fallback, horizon: int, least: int, margin: float) -> None:
-        self._test, self.least, self._margin = test, least, margin
+        self._test, self.horizon, self.least, self._margin = test, horizon, least, margin
         self.planner = Planner(test, fallback, horizon, least + 1, margin)
+
+    def beginning_alone(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> np.ndarray | None:
+        """Returns a plan, (j, m), of a single environment that begins with what is proposed, if one is soon found."""
+        return self.planner.beginning_alone(estimate, errors.shape, proposed)
 
     def keep(
         self, decided: Decision, valid: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
@@ -132,7 +140,7 @@ class Lookahead:
         if not np.count_nonzero(begun):
             return begun
         inputs, lengths = found.inputs[begun], found.lengths[begun]
-        kept = np.arange(1, self.planner.horizon) < lengths[:, None]
+        kept = np.arange(1, self.horizon) < lengths[:, None]
         some = some[begun]
         decided.input[:, some] = inputs[:, 0].T
         decided.plan[:-1, :, some] = np.where(kept[..., None], inputs[:, 1:], np.nan).transpose(1, 2, 0)
@@ -146,7 +154,7 @@ class Lookahead:
     def as_stored(self, plan: Any) -> np.ndarray:
         """Returns a plan, shape (k, m), as an array (horizon, m), NaN beyond its end; all NaN for what is no plan."""
         plant, numbers = self._test.plant, as_numbers(plan)
-        stored = np.full((self.planner.horizon, plant.m), np.nan)
+        stored = np.full((self.horizon, plant.m), np.nan)
         if numbers is None or numbers.ndim != 2 or numbers.shape[1] != plant.m or len(numbers) > len(stored):
             return stored
         numbers = numbers.copy()  # read once

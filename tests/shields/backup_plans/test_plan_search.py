@@ -205,6 +205,11 @@ def test_other_modes_take_no_horizon_and_keep_no_plan(mode, certificate, loaded)
         decision = shield.decide(np.array([1.8, 0.5]), 0.1 * certificate.Sigma, np.array([u]), [[1.0]])
         assert decision.plan.shape == (0, 1)
         assert decision.stored is False
+        many = shield.decide_many(
+            np.full((2, 2), 0.5), 0.1 * certificate.Sigma, np.full((2, 1), u), np.empty((2, 0, 1))
+        )
+        assert many.plan.shape == (2, 0, 1)
+    assert shield.first_plan(np.zeros(2), shield.errors_of(0.1 * certificate.Sigma)).shape == (0, 1)
 
 
 @pytest.mark.parametrize("name", ["cruise", "n=4 m=3 p=2"])
