@@ -8,6 +8,7 @@ import numpy as np
 
 # Repeated or late numbers are few in a row, unless something began anew.
 MOST_LATE = 16
+BEFORE = "the packet arrived before it was sent: the clocks of sender and receiver differ, set one by the other"
 WAY_AND_BACK = "delays are those of the whole way and back"
 
 
@@ -37,3 +38,8 @@ def require_time(numbers: np.ndarray, sent: np.ndarray) -> None:
             f"between the packets {numbers[hurried[0]]} and {numbers[hurried[0] + 1]} its stamps leave too little time "
             "for the lost ones: the clock was set back there, cut the record"
         )
+
+
+def many(number: int, noun: str) -> str:
+    """Returns a number with its noun, in the plural where it is not one."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
