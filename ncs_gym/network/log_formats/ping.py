@@ -91,9 +91,42 @@ def _of_numbers(
     lines: Sequence[str], pattern: re.Pattern[str], program: str, summary: _Summary | None, period: float | None
 ) -> Record:
     """Returns the packets of a program that numbers them; a number without an answer is a lost packet."""
+    header = next((line for line in lines if line.startswith("PING")), None)
+    answers, stamps = _answers_of(lines, pattern, program, has_header=header is not None)
+    first, last = min(answers), max(answers)
+    begins = 0 if first == 0 or program == "fping" or (header is not None and _FROM_ZERO.match(header)) else 1
+    if header is not None:
+        first = min(first, begins)
+    if summary is not None:
+        last = max(last, begins + summary.transmitted - 1)
+    require_packets(last - first + 1)
+    numbers = np.arange(first, last + 1)
+    delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
+    if len(stamps) > 1:
+        sent, how = _between_stamps(numbers, stamps), "sent when its stamps say"
+        for number, stamp in stamps.items():  # the answer came when it came
+            delays[number - first] += stamp - sent[number - first]
+    else:
+        between, how = _period_of(summary, period)
+        sent = between * (numbers - first)
+    notes = _disagreements(summary, delays)
+    if before := min(answers) - first:
+        notes += f" Its first answer has the number {min(answers)}: {before:,} before it count as lost."
+    return Record(sent, delays, f"Read as the output of {program}: {WAY_AND_BACK}, packets were {how}.{notes}")
+
+
+def _answers_of(
+    lines: Sequence[str], pattern: re.Pattern[str], program: str, *, has_header: bool
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Returns how long the answer to each number took, NaN for none, and when those with a stamp were sent [s].
+
+    Numbers begin anew after the largest one of 16 bits: what is returned goes on.
+
+    Raises:
+        ValueError: If a clock was set back, the lines are of several runs or hosts, or none has a number.
+    """
     answers: dict[int, float] = {}
     stamps: dict[int, float] = {}
-    header = next((line for line in lines if line.startswith("PING")), None)
     hosts, last, late, origin, printed, newest = set(), None, 0, None, None, -np.inf
     for count, line in enumerate(lines, 1):
         if (found := pattern.match(line)) is None:
@@ -120,7 +153,7 @@ def _of_numbers(
             is_late = number <= last and (known is None or not np.isnan(known))
             late = late + 1 if is_late else 0
             too_late = last - number > _LATEST and sent is None
-            if too_late or late > MOST_LATE or (header is not None and number < 0):
+            if too_late or late > MOST_LATE or (has_header and number < 0):
                 raise ValueError(
                     f"line {count}: number {found['number']} may be a late answer, or come after many lost ones or of "
                     "another run: record with ping -D, whose stamps tell, and each run in a file of its own"
@@ -135,26 +168,7 @@ def _of_numbers(
         raise ValueError("it has the answers of several hosts: put each into a file of its own")
     if not answers:
         raise ValueError("no packet of ping has a number")
-    first, last = min(answers), max(answers)
-    begins = 0 if first == 0 or program == "fping" or (header is not None and _FROM_ZERO.match(header)) else 1
-    if header is not None:
-        first = min(first, begins)
-    if summary is not None:
-        last = max(last, begins + summary.transmitted - 1)
-    require_packets(last - first + 1)
-    numbers = np.arange(first, last + 1)
-    delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
-    if len(stamps) > 1:
-        sent, how = _between_stamps(numbers, stamps), "sent when its stamps say"
-        for number, stamp in stamps.items():  # the answer came when it came
-            delays[number - first] += stamp - sent[number - first]
-    else:
-        between, how = _period_of(summary, period)
-        sent = between * (numbers - first)
-    notes = _disagreements(summary, delays)
-    if before := min(answers) - first:
-        notes += f" Its first answer has the number {min(answers)}: {before:,} before it count as lost."
-    return Record(sent, delays, f"Read as the output of {program}: {WAY_AND_BACK}, packets were {how}.{notes}")
+    return answers, stamps
 
 
 def _of_windows(lines: Sequence[str], summary: _Summary | None, period: float | None) -> Record:
