@@ -64,7 +64,7 @@ test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## 
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit and the study as the pages
 # have them, and the same bits in every process.
-SLOW_PART ?= tests/shields/test_certificates_of_package.py tests/experiments/commands/test_audit.py tests/experiments/study \
+SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/experiments/study \
 	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process
 test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)

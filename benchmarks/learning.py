@@ -351,9 +351,9 @@ def pretrained(
 
     PPO with the hyperparameters and steps of agents/tuned, or the defaults and 150,000 steps, and networks of two
     layers of 32. Each agent is evaluated on 200 episodes and saved with its card; a line says how long that took. Its
-    certificate is the one in shields/certificates. --evaluate-only evaluates the agents that are there and writes their
-    cards again. --table prints them beside the best linear controller behind the same shield, on the same episodes,
-    without those whose packages are missing.
+    certificate is the one in shields/packaged_certificates. --evaluate-only evaluates the agents that are there and
+    writes their cards again. --table prints them beside the best linear controller behind the same shield, on the same
+    episodes, without those whose packages are missing.
     """
     if table:
         print("| environment | agent (overridden) | best linear controller | difference, paired |\n|---|---|---|---|")

@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, Multipliers, Proof, Updates
-from shields.certificates import certificate_for
 from shields.errors import CertificateError, GuaranteeLostError, GuaranteeLostWarning, Infeasible
+from shields.packaged_certificates import certificate_for
 from shields.polytope import Polytope
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify

@@ -17,7 +17,7 @@ from numpy._core._multiarray_umath import __cpu_features__
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate
-from shields.certificates import certificate_of_package
+from shields.packaged_certificates import certificate_of_package
 
 ROOT = Path(__file__).resolve().parent.parent
 # Those of named plants by their names, the others by `_name_of`.

@@ -43,7 +43,7 @@ LAYERS = {
         {"json_documents", "polytope"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
-        {"certificates"},
+        {"packaged_certificates"},
         {"runtime"},
         {"nodes", "silence", "torch"},
     ),

@@ -18,7 +18,7 @@ from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.reading import MOST_PACKETS
 from shields import Certificate, silence_of
 from shields.atomic_write import write_atomically
-from shields.certificates import certificate_of_package
+from shields.packaged_certificates import certificate_of_package
 
 
 class _Promise(NamedTuple):

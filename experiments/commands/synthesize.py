@@ -11,8 +11,8 @@ from experiments.settings import SynthesizeSettings
 from experiments.settings.certificates import changed_contract
 from ncs_gym import ChannelContract, LinearPlant
 from shields.certificate_text import size_of
-from shields.certificates import synthesis_status
 from shields.errors import SynthesisInterrupted
+from shields.packaged_certificates import synthesis_status
 
 _DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"
 

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.settings import (
+from ncs_gym.envs.loop_settings import (
     CHANNELS,
     channel_setting,
     expect,

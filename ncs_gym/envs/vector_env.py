@@ -14,7 +14,7 @@ from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, 
 from ncs_gym.envs.episode_channels import channel_infos, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.settings import CHANNELS, channel_setting, vector_reset_options
+from ncs_gym.envs.loop_settings import CHANNELS, channel_setting, vector_reset_options
 from ncs_gym.envs.spaces import Observer, actions_of, read_actions
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet

@@ -16,8 +16,7 @@ from gymnasium.vector.utils import batch_space, iterate
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
-from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import (
+from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
     ReadNetwork,
@@ -25,6 +24,7 @@ from ncs_gym.networked.settings import (
     require_no_network,
     require_no_restarts,
 )
+from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
 from ncs_gym.validation import require_batched_infos, shown
 

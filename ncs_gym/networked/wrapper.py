@@ -15,8 +15,7 @@ from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests, require_on_request
-from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
-from ncs_gym.networked.settings import (
+from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
     ReadNetwork,
@@ -24,6 +23,7 @@ from ncs_gym.networked.settings import (
     require_no_network,
     require_no_restarts,
 )
+from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
 from ncs_gym.validation import shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.

@@ -12,7 +12,7 @@ from ncs_gym.validation import own_error_state
 from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
 from shields.paper.certificate import PaperCertificate
 from shields.verification import Report
-from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
+from shields.verification.condition import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.rational_matrix import Matrix, add, multiply, quadratic, rational, scale, subtract, transpose
 
 # alpha and eps_up are square roots and quantiles in float64; their rounding counts as this much against the

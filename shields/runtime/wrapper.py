@@ -16,12 +16,12 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
-from ncs_gym.envs.settings import channel_setting
+from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import AroundEnvironment, as_number, own_error_state, setting, shown, warn_caller
 from shields.certificate import Certificate
-from shields.certificates import certificate_for
+from shields.packaged_certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.guarantee import LoopObservation, LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter

@@ -10,7 +10,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
+from shields.verification.condition import ACTION_ROUNDING, Condition, flag, scalar_condition
 from shields.verification.polytope_conditions import faces_of, root_above, widths_of
 from shields.verification.rational_matrix import (
     Matrix,

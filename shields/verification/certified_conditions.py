@@ -12,7 +12,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
 from shields.verification.between_samples import between_conditions
-from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
+from shields.verification.condition import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
 from shields.verification.polytope_conditions import faces_of, polytope_conditions
 from shields.verification.rational_matrix import (
     Matrix,

@@ -13,7 +13,7 @@ from scipy.linalg import qr
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
-from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
+from shields.verification.condition import ACTION_ROUNDING, Condition, flag, scalar_condition
 from shields.verification.rational_matrix import (
     Matrix,
     add,

@@ -10,7 +10,7 @@ from flint import arb, arb_mat, ctx, fmpq
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.verification.conditions import Condition
+from shields.verification.condition import Condition
 from tests.second_verifier.exact import (
     FLOAT32,
     PRECISION,

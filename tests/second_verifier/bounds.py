@@ -12,7 +12,7 @@ from flint import arb, ctx, fmpq
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
 from shields.certificate import Certificate
-from shields.verification.conditions import Condition
+from shields.verification.condition import Condition
 from tests.second_verifier.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number
 
 # No term of a sum of ellipsoids gets a smaller weight.

@@ -11,7 +11,7 @@ from flint import fmpq
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.verification.conditions import Condition
+from shields.verification.condition import Condition
 from tests.second_verifier.between_samples import between_conditions
 from tests.second_verifier.bounds import bound_conditions
 from tests.second_verifier.exact import (

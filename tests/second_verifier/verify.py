@@ -10,7 +10,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.validation import own_error_state
 from shields import Certificate, Report
 from shields.paper import PaperCertificate
-from shields.verification.conditions import Condition
+from shields.verification.condition import Condition
 from tests.second_verifier.certified import certified_conditions
 from tests.second_verifier.exact import is_so
 from tests.second_verifier.paper import paper_conditions

@@ -10,7 +10,7 @@ from jinja2 import UndefinedError
 from experiments.report.html import comparison_report, sweep_report
 from experiments.runs.arms import Arm
 from shields import Report
-from shields.verification.conditions import flag
+from shields.verification.condition import flag
 from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
 
 VERIFIED = Report((flag("(E1) Sigma - A Sigma A' >= 0", True), flag("(S) the safe set", True)))

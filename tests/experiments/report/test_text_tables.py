@@ -12,7 +12,7 @@ from experiments.report.text_tables import scenario_text, summary_text, sweep_ta
 from experiments.study.summary import study_summary
 from experiments.study.tables import comparisons_table, evaluation_table, margins_table, prices_table
 from shields import Report
-from shields.verification.conditions import flag
+from shields.verification.condition import flag
 from tests.experiments.results import run, summary_of
 
 # Returns whose mean lies just below zero, and so do both ends of its interval.

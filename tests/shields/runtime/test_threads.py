@@ -19,7 +19,7 @@ from ncs_gym import Channel, ChannelContract, Estimator, Packet, batch_reactor, 
 from ncs_gym.estimation.arrival_histories import MAX_GRAPHS, arrival_histories, histories_of
 from ncs_gym.estimation.error_bound import certified_error_set
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.certificates import certificate_for
+from shields.packaged_certificates import certificate_for
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.set_test import ellipsoid_test

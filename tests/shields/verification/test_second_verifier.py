@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "shields.certificate",
     "shields.paper",
     "shields.polytope",
-    "shields.verification.conditions",
+    "shields.verification.condition",
 }
 
 
@@ -90,12 +90,12 @@ def test_the_verifiers_have_no_code_in_common():
             module = node.module if isinstance(node, ast.ImportFrom) else None
             if module is not None and module.startswith(("ncs_gym", "shields")):
                 assert module in MAY_IMPORT, (path.name, module)
-                if module == "shields.verification.conditions":
+                if module == "shields.verification.condition":
                     assert [alias.name for alias in node.names] == ["Condition"], path.name
 
 
 @pytest.mark.parametrize(
-    "slip", ["shields.verification.conditions.is_positive_semidefinite", "tests.second_verifier.exact.is_semidefinite"]
+    "slip", ["shields.verification.condition.is_positive_semidefinite", "tests.second_verifier.exact.is_semidefinite"]
 )
 def test_a_slip_in_one_verifier_is_noticed_by_the_other(slip, certificate, loaded, monkeypatch):
     wrong = with_multipliers(certificate, error=1e-320)

@@ -8,12 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import shields.certificates
+import shields.packaged_certificates
 from ncs_gym import ChannelContract, contract_of
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import ENVIRONMENTS
 from shields import CertificateError, SafetyShield, certificate_for, synthesize
-from shields.certificates import certificate_of_package
+from shields.packaged_certificates import certificate_of_package
 from shields.synthesis.invariant_polytope import share_in_polytope
 from shields.verification import require_valid, verifier
 from tests.certificates import certificate_of
@@ -52,7 +52,7 @@ def calls(monkeypatch):
 @pytest.fixture
 def unasked(tmp_path, monkeypatch):
     """A plant that this process has asked for no certificate of; a folder of certificates that the package reads."""
-    monkeypatch.setattr(shields.certificates, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(shields.packaged_certificates, "__file__", str(tmp_path / "__init__.py"))
     plant = small([[0.9, 0.1], [0.0, 0.8]], delta=0.05 * (1.0 + 1e-6 * next(UNASKED)))  # bounds are smaller then
     certificate = certificate_of(*named("stable"), "polytope")
     return plant, replace(certificate, fingerprint=plant.fingerprint), tmp_path / "own.json"

@@ -3,7 +3,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from shields.verification.conditions import flag, matrix_condition, scalar_condition
+from shields.verification.condition import flag, matrix_condition, scalar_condition
 
 BEYOND_FLOATS = Fraction(10) ** 400
 

@@ -13,7 +13,7 @@ from gymnasium.wrappers import Autoreset
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, EveryEpisode
 from ncs_gym.envs.json_settings import from_json, to_json
-from ncs_gym.envs.settings import channel_setting
+from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of
 from ncs_gym.network.downlink import downlink_protocol
