@@ -179,10 +179,10 @@ class Entries:
     def __init__(
         self, names: str | Sequence[str], observations: spaces.Space, actions: spaces.Space, parts: int, pending: int
     ) -> None:
-        names = (names,) if isinstance(names, str) else tuple(names)
-        if any(name not in ENTRIES for name in names) or len(set(names)) < len(names):
+        several: tuple[Any, ...] = tuple(names) if isinstance(names, list | tuple) else (names,)
+        if any(name not in ENTRIES for name in several) or len(set(several)) < len(several):
             raise ValueError(f"observe must be different ones of {', '.join(ENTRIES)}, got {shown(names)}")
-        self.names, self._inner, self._actions = names, observations, actions
+        self.names, self._inner, self._actions = several, observations, actions
         made = {
             "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),
             "arrived": lambda: spaces.MultiBinary(parts),

@@ -22,7 +22,7 @@ from ncs_gym.plants.description import described
 from ncs_gym.plants.family import plant_of_middle
 from ncs_gym.plants.hard_bounds import HardBounds
 from ncs_gym.plants.limit_values import LimitValues
-from ncs_gym.plants.past_inputs import LONGEST_INPUT_DELAY, inputs_under_way, storing
+from ncs_gym.plants.past_inputs import inputs_under_way, storing, with_past_inputs
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.family import Family
@@ -56,8 +56,8 @@ FARTHEST = 1e30
 LARGEST_CONDITION = 1e9
 # Arguments of the constructor about limits, in this order: those that are fields, too, need not be given.
 _LIMITS = (
-    *("state_limits", "input_limits", "output_limits", "mixed_limits", "du_max", "box", "u_max", "offset"),
-    *("input_ends", "box_ends", "mixed_rows", "mixed_ends"),
+    *("state_limits", "input_limits", "output_limits", "mixed_limits", "input_delay", "du_max", "box", "u_max"),
+    *("offset", "input_ends", "box_ends", "mixed_rows", "mixed_ends"),
 )
 
 
@@ -80,9 +80,10 @@ def with_limits_as_published(kind: Kind) -> Kind:
                 "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
                 "H=... for the output matrix of a state-space model"
             )
-        if (du_max := arguments.pop("du_max", None)) is not None:  # a plant of more states
-            limited = kind(**arguments).with_rate_limits(du_max)
-            arguments = {each.name: getattr(limited, each.name) for each in fields(limited)}
+        input_delay, du_max = (arguments.pop(name, None) for name in ("input_delay", "du_max"))
+        if not (input_delay is None and du_max is None):  # a plant of more states
+            larger = with_past_inputs(kind(**arguments), input_delay, du_max)
+            arguments = {each.name: getattr(larger, each.name) for each in fields(larger)}
         construct(self, **limits.fields_of(arguments))
 
     of_fields = dict(inspect.signature(construct).parameters)
@@ -120,6 +121,8 @@ class LinearPlant(LimitValues, HardBounds):
         mixed_limits: Limits of states and inputs together, of outputs with feedthrough and of coupled inputs, a list of
             (state row, input row, low, high) with low <= state row x + input row u <= high for the x at the beginning
             of a step and the u that is held then.
+        input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
+            estimator knows; everything else is given for the model's own states.
         du_max: Largest change of each input from one step to the next, a positive number or shape (m,): the plant gets
             past inputs as further states (`with_rate_limits`).
         offset: c of a model in absolute coordinates, shape (n,).
@@ -208,6 +211,7 @@ class LinearPlant(LimitValues, HardBounds):
             input_limits: tuple[ArrayLike, ArrayLike] | None = None,
             output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
             mixed_limits: Sequence[tuple[ArrayLike, ArrayLike, float, float]] | None = None,
+            input_delay: int | None = None,
             du_max: ArrayLike | None = None,
             box: ArrayLike | None = None,
             u_max: ArrayLike | None = None,
@@ -261,6 +265,8 @@ class LinearPlant(LimitValues, HardBounds):
             names = tuple(f"{letter}{i + 1}" for i in range(size))
             for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
                 self._set(field_name, as_names(getattr(self, field_name), default, field_name))
+            if len(set(getattr(self, f"{name}_names"))) < size:
+                raise ValueError(f"{name}_names must differ, got {shown(getattr(self, f'{name}_names'))}")
         self._make_arrays_read_only()
         warn_of_no_noise(is_given)
 
@@ -323,9 +329,6 @@ class LinearPlant(LimitValues, HardBounds):
         cls,
         sys: Any,
         dt: float | None = None,
-        *,
-        input_delay: int = 0,
-        du_max: ArrayLike | None = None,
         **settings: Any,
     ) -> Self:
         """Returns the plant of a state-space model; its C becomes H.
@@ -334,19 +337,12 @@ class LinearPlant(LimitValues, HardBounds):
             sys: A state-space model of python-control or scipy.signal, or a tuple (A, B, C, D) in continuous or
                 (A, B, C, D, dt) in discrete time. A model in continuous time is sampled exactly, by zero-order hold.
             dt: Duration of a step [s], needed unless the model has one.
-            input_delay: Steps after which an input takes effect. The inputs under way become further states, which the
-                estimator knows; box, bounds and names are given for the model's own states.
-            du_max: Largest change of each input from one step to the next, as for `with_rate_limits`.
             settings: Other arguments of `LinearPlant` except A, B and H; limits at least.
 
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
-        plant = cls(**statespace.sampled_arguments(sys, dt, settings))
-        if input_delay:
-            delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
-            plant = storing(plant, delay, delay)
-        return plant if du_max is None else plant.with_rate_limits(du_max)
+        return cls(**statespace.sampled_arguments(sys, dt, settings))
 
     @classmethod
     @own_error_state
@@ -432,11 +428,14 @@ class LinearPlant(LimitValues, HardBounds):
             per: What it is a change per, "step" or "second".
 
         Raises:
-            ValueError: If an argument is wrong, the box counts between samples, or the plant has an `initial_cov`.
+            ValueError: If an argument is wrong, no input can change by as much, the box counts between samples, or the
+                plant has an `initial_cov`.
         """
         if per not in ("step", "second"):
             raise ValueError(f"per must be 'step' or 'second', got {shown(per)}")
         change = limits.as_input_limits(du_max, self.m, "du_max") * (self.dt if per == "second" else 1.0)
+        if (change >= 2.0 * self.input_half).all():
+            raise ValueError(f"du_max = {shown(du_max)} limits nothing: inputs change by no more than their range")
         plant = self if inputs_under_way(self) else storing(self, 1, delay=0)
         rows = np.concatenate([np.zeros((self.m, plant.n - self.m)), -np.eye(self.m), np.eye(self.m)], axis=1)
         rates = limits.Rows(rows / change[:, None], *np.array([[-1.0], [1.0]]) * np.ones(self.m))

@@ -6,8 +6,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
+from ncs_gym.validation import as_count
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -39,6 +41,17 @@ def inputs_under_way(plant: LinearPlant) -> int:
     ):
         stored += m
     return stored
+
+
+def with_past_inputs(plant: Kind, input_delay: int | None, du_max: ArrayLike | None) -> Kind:
+    """Returns the plant with inputs that take effect later, and that change by no more than `du_max`; None for neither.
+
+    Raises:
+        ValueError: If either is wrong, or see `storing`.
+    """
+    delay = 0 if input_delay is None else as_count(input_delay, "input_delay", low=0, high=LONGEST_INPUT_DELAY)
+    plant = storing(plant, delay, delay) if delay else plant
+    return plant if du_max is None else plant.with_rate_limits(du_max)
 
 
 def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:

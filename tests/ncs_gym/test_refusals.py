@@ -451,7 +451,9 @@ PLANTS = [
     *changed(
         partial(LinearPlant.from_statespace, MODEL),
         ({"H": C}, "H come from the state-space model"),
-        ({"input_delay": -1}, "input_delay must be a whole number >= 1"),
+        ({"input_delay": -1}, "input_delay must be a whole number >= 0"),
+        ({"du_max": 8.0}, "limits nothing: inputs change by no more"),
+        ({"state_names": ("a", "a")}, "state_names must differ, got"),
         ({"input_delay": 1, "initial_cov": np.eye(2)}, "must be given by initial_bound"),
         ({"input_delay": 1, "between_samples": 8}, "without input_delay"),
         ({"continuous_model": [[-2.0, 1.0]]}, "continuous_model is that of sys"),

@@ -8,6 +8,10 @@ import numpy as np
 
 # Repeated or late numbers are few in a row, unless something began anew.
 MOST_LATE = 16
+# In longer records some numbers follow each other, and no more than this share goes back, where counters begin anew.
+_FEW, _BACK_SHARE = 20, 0.25
+# Stamps are no later than this [s].
+_LATEST_STAMP = 0.1
 BEFORE = "the packet arrived before it was sent: the clocks of sender and receiver differ, set one by the other"
 WAY_AND_BACK = "delays are those of the whole way and back"
 
@@ -27,12 +31,19 @@ class Record(NamedTuple):
 
 
 def require_time(numbers: np.ndarray, sent: np.ndarray) -> None:
-    """Raises ValueError if there is too little time between two packets for those that are missing between them."""
+    """Raises ValueError if numbers do not count packets, or there is too little time for those that are missing.
+
+    A packet may be sent as late as others are: by what the shortest time between two is shorter than the usual one.
+    """
     steps, gaps = np.diff(numbers), np.diff(sent)
+    if len(steps) >= _FEW and (not (steps == 1).any() or (steps < 0).mean() > _BACK_SHARE):
+        raise ValueError("the numbers of its packets do not count them: hardly any follows that of the packet before")
     if not (steps == 1).any():
         return
-    expected = steps * np.quantile(gaps[steps == 1], 0.05)
-    hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - 0.1))
+    usual = gaps[steps == 1]
+    late = min(2.0 * float(np.median(usual) - usual.min()), _LATEST_STAMP)
+    expected = steps * np.quantile(usual, 0.05)
+    hurried = np.flatnonzero((steps > 1) & (gaps < 0.9 * expected) & (gaps < expected - late))
     if len(hurried):
         raise ValueError(
             f"between the packets {numbers[hurried[0]]} and {numbers[hurried[0] + 1]} its stamps leave too little time "

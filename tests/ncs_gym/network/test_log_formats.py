@@ -537,6 +537,19 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
             rows("seq,sent,received", [(n, n if n < 20 else n - 6) for n in range(60) if not 20 <= n < 30]),
             "between the packets 19 and 30 its stamps leave too little time",
         ),
+        *(
+            (
+                rows(
+                    "seq,sent,received",
+                    [(n, 0.02 * (n if n < 20 else n - k)) for n in range(60) if not 20 <= n < 20 + k],
+                ),
+                f"between the packets 19 and {20 + k} its stamps leave too little time",
+            )
+            for k in (1, 5)
+        ),
+        (rows("seq,sent,received", [(37 * n % 300, n) for n in range(300)]), "the numbers of its packets do not count"),
+        (rows("seq,sent,received", [(30 - n, n) for n in range(30)]), "the numbers of its packets do not count"),
+        (rows("seq,sent,received", [(160 * n, n) for n in range(30)]), "the numbers of its packets do not count"),
         (
             "sent,received\n" + "".join(f"{0.1 * n:.2f},{0.1 * n + (0.5 if n < 40 else 0.2):.2f}\n" for n in range(80)),
             "line 42: from here on packets take 0.3 s less or more, and this one overtakes the one before",
