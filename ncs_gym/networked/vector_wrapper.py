@@ -51,6 +51,10 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         pending: See `Networked`.
         delay_reward: See `Networked`.
 
+    Attributes:
+        episode_channels: The channels of the present episodes, N of them; with several a dictionary of these.
+        episode_downlinks: The downlinks, likewise; None for an ideal one.
+
     Raises:
         ValueError: If a setting is wrong, or does not fit the environments' spaces.
     """
@@ -97,6 +101,18 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         if self._rng is None:
             self._rng = seeding.np_random()[0]
         return self._rng
+
+    @property
+    def episode_channels(self) -> Any:
+        """The channels of the present episodes, N of them; with several a dictionary of these."""
+        now = [tuple(links.now) for links in self._uplinks]
+        keys = [part.key for part in self._settings.parts]
+        return now[0] if keys[0] is None else dict(zip(keys, now, strict=True))
+
+    @property
+    def episode_downlinks(self) -> tuple[Channel | None, ...]:
+        """The downlinks of the present episodes, N of them; None for an ideal one."""
+        return tuple(self._downlinks.now)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None

@@ -172,6 +172,7 @@ def test_channels_given_to_some_stay_for_their_episodes():
     for _ in range(3):
         _, _, over, _, _ = env.step(np.zeros((2, 1)))
     *_, info = env.reset(options={"reset_mask": over, "channel": Channel(delay=7)})
+    assert (env.episode_channels, env.episode_downlinks) == ((Channel(delay=7), Channel()), (None, None))
     for _ in range(3):
         np.testing.assert_array_equal(info["channel_delay"], [7, 0])
         *_, info = env.step(np.zeros((2, 1)))
