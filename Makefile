@@ -62,9 +62,11 @@ coverage-report: ## that share, of the tests that ran last
 test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks, and examples in processes of their own
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
-# What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit and the study as the pages
-# have them, and the same bits in every process.
+# What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the study and a record as the
+# pages have them, hints, and the same bits in every process.
 SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/experiments/study \
+	tests/experiments/commands/test_requirements.py \
+	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \
 	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process
 test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 from functools import partial
 from os import PathLike
 from typing import Any
@@ -77,10 +78,17 @@ class NetworkSettings:
                 zero_of(part.space)
         self.late = _one_of(settings["late"], LATE, "late")
         self.idle = _one_of(settings["idle"], IDLE, "idle")
+        for name, usual in (("late", LATE[0]), ("idle", IDLE[0])):
+            if self.downlink is None and getattr(self, name) != usual:
+                raise ValueError(f"{name} is about a network of the actions: give downlink=Channel(...), too")
         self.neutral = _neutral(settings["neutral"], actions, needed=self.downlink is not None)
         given_pending = settings["pending"]
         self.pending = self._memory() if given_pending is None else as_count(given_pending, "pending", low=1, high=1000)
         self.entries = Entries(settings["observe"], observations, actions, len(self.parts), self.pending)
+        if given_pending is not None and not ("pending_actions" in self.entries.names or callable(self.fill)):
+            raise ValueError(
+                "pending is how many actions are observed, or given to a predictor: observe pending_actions"
+            )
         self.delay_reward = as_flag(settings["delay_reward"], "delay_reward")
         self._has_warned = False
         self.recorded = dict(settings) | {
@@ -104,6 +112,12 @@ class NetworkSettings:
         Raises:
             ValueError: If it is no channel, or of keys that observations do not have.
         """
+        for name in options.keys() - {"channel", "downlink"}:
+            if meant := get_close_matches(str(name), ("channel", "downlink")):
+                warn_caller(
+                    f"the reset option {shown(name)} is the environment's; that of the network is {meant[0]!r}",
+                    UserWarning,
+                )
         option = options.pop("channel", None)
         given = option.first if isinstance(option, EveryEpisode) else option
         each = [given] * len(self.parts)

@@ -140,6 +140,7 @@ def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_pat
     assert "was broken at no time; a record of this length excludes more than" in " ".join(kept.stdout.split())
 
 
+@pytest.mark.slow
 def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["wifi_record.py", str(tmp_path / "packets.csv")])

@@ -291,6 +291,8 @@ def test_channels_of_episodes_are_drawn_or_given_and_other_options_reach_the_env
     assert delays == set(range(5))
     info = env.reset(options={"channel": Channel(delay=9), "start": 3})[1]
     assert (inner.episode_channel.delay, info["options"]) == (9, {"start": 3})
+    with pytest.warns(UserWarning, match="'chanel' is the environment's; the network's is 'channel'"):
+        env.reset(options={"chanel": Channel()})
     inner.reset()
     assert inner.episode_channel.delay == 1
 
@@ -374,6 +376,9 @@ def test_time_limits_stand_inside_and_outside():
         ({"late": "never"}, "late must be one of 'apply', 'drop', 'queue', got 'never'"),
         ({"idle": 0}, "idle must be one of 'hold', 'neutral', got 0"),
         ({"pending": 0}, "pending must be"),
+        ({"pending": 4, "observe": "age"}, "pending is how many actions a predictor gets"),
+        ({"late": "drop"}, "late is about a network of the actions: give downlink"),
+        ({"idle": "neutral"}, "idle is about a network of the actions: give downlink"),
         ({"delay_reward": 1}, "delay_reward must be"),
     ],
 )

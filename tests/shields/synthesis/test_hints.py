@@ -206,6 +206,7 @@ def test_clock_that_has_run_out_ends_a_search():
         Clock(time.thread_time() - 1.0).check()
 
 
+@pytest.mark.slow
 def test_a_contract_is_named_where_a_stable_plant_has_none():
     plant = LinearPlant(
         A=[[0.998]], B=[[0.01]], H=[[1.0]], dt=0.1, state_limits=([0.2], [0.9]), input_limits=([0.0], [1.0]),
