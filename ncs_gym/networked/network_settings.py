@@ -86,9 +86,7 @@ class NetworkSettings:
         self.pending = self._memory() if given_pending is None else as_count(given_pending, "pending", low=1, high=1000)
         self.entries = Entries(settings["observe"], observations, actions, len(self.parts), self.pending)
         if given_pending is not None and not ("pending_actions" in self.entries.names or callable(self.fill)):
-            raise ValueError(
-                "pending is how many actions are observed, or given to a predictor: observe pending_actions"
-            )
+            raise ValueError("pending is how many actions a predictor gets, or an agent that observes pending_actions")
         self.delay_reward = as_flag(settings["delay_reward"], "delay_reward")
         self._has_warned = False
         self.recorded = dict(settings) | {
@@ -113,11 +111,9 @@ class NetworkSettings:
             ValueError: If it is no channel, or of keys that observations do not have.
         """
         for name in options.keys() - {"channel", "downlink"}:
-            if meant := get_close_matches(str(name), ("channel", "downlink")):
-                warn_caller(
-                    f"the reset option {shown(name)} is the environment's; that of the network is {meant[0]!r}",
-                    UserWarning,
-                )
+            if meant := get_close_matches(str(name), ("channel", "downlink"), cutoff=0.75):
+                said = f"the reset option {shown(name)} is the environment's; the network's is {meant[0]!r}"
+                warn_caller(said, UserWarning)
         option = options.pop("channel", None)
         given = option.first if isinstance(option, EveryEpisode) else option
         each = [given] * len(self.parts)
