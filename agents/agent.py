@@ -220,11 +220,16 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
-    parameters = parameters_of(weights)
-    model = build_model(algorithm, SB3VecEnv(loop.vector(2)), hyperparams, seed=0)  # as in `untrained`
-    model.set_parameters(parameters, exact_match=True, device="cpu")
+    parameters, envs = parameters_of(weights), SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
+    if mean.ndim == 1 and mean.shape != envs.observation_space.shape:
+        raise AgentError(
+            f"the agent saw observations of {len(mean)} entries, those of {env_id} have the shape "
+            f"{envs.observation_space.shape} now: it is registered with another task or observe="
+        )
+    model = build_model(algorithm, envs, hyperparams, seed=0)  # as in `untrained`
+    model.set_parameters(parameters, exact_match=True, device="cpu")
     usable = mean.shape == variance.shape == model.observation_space.shape
     if not (usable and np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise AgentError("the agent is damaged: its normalization has a wrong shape or value")

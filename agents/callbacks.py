@@ -40,11 +40,13 @@ class SafetyCallback(BaseCallback):
         history: Totals after every rollout; where rollouts are single steps, after every 200th part of the training.
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
+        priced: The penalty of PPO-Lagrangian, whose value totals hold; None without one.
     """
 
     def __init__(self, on_progress: Callable[[int], None] | None = None, history: Sequence[TrainingPoint] = ()) -> None:
         super().__init__()
         self.history = list(history)
+        self.priced: CostPenalty | None = None
         self._on_progress = on_progress
         self.violation_steps, self.interventions = self._last.violation_steps, self._last.interventions
         self._corrections: float | None = None
@@ -84,7 +86,8 @@ class SafetyCallback(BaseCallback):
     def _present(self) -> TrainingPoint:
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
-        return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions)
+        multiplier = 0.0 if self.priced is None else self.priced.penalty
+        return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions, multiplier)
 
     def add_point(self) -> None:
         """Adds a point to the curve, of what happened since the last one."""

@@ -26,12 +26,14 @@ class TrainingPoint:
             only if it is outside the shield: with `SB3VecEnv`, not with `make_vec_env` (NaN before the first).
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
+        multiplier: Price of a violating step then, of PPO-Lagrangian; 0 in other trainings.
     """
 
     steps: int
     episode_return: float
     violation_steps: int
     interventions: int
+    multiplier: float = 0.0
 
 
 def history_document(history: Sequence[TrainingPoint]) -> str:

@@ -80,8 +80,8 @@ def train(
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
         start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
             optimizers and its normalization; replay buffers begin anew.
-        history: Totals of the training of that agent: counts go on from the last, and rates fall as in one training of
-            all steps. Empty to count from 0, and for rates that begin anew.
+        history: Totals of the training of that agent: counts and the multiplier of PPO-Lagrangian go on from the last,
+            and rates fall as in one training of all steps. Empty to count from 0, and for rates that begin anew.
         checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and when the
             training is interrupted (Ctrl-C); None for none.
 
@@ -97,7 +97,10 @@ def train(
     callback = SafetyCallback(on_progress, history)
     beside: list[BaseCallback] = [callback]
     if loop.lagrangian is not None and isinstance(envs, CostPenalty):
-        beside.append(DualAscentCallback(loop.lagrangian, envs))
+        callback.priced = envs
+        beside = [DualAscentCallback(loop.lagrangian, envs), callback]  # totals hold the price that goes on
+        if history:
+            envs.penalty = history[-1].multiplier
     if log_folder:
         beside.append(EvaluationCallback(loop, seed))
     if start is not None:

@@ -186,6 +186,13 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
+def guarded(array: np.ndarray) -> np.ndarray:
+    """Returns a view of an array for code of others, which cannot write into it."""
+    view = array.view()
+    view.setflags(write=False)
+    return view
+
+
 def require_batched_infos(info: Any, outside: str) -> None:
     """Raises ValueError unless the infos of a vector environment are a dictionary of arrays, as wrappers outside need.
 

@@ -144,6 +144,12 @@ def _training_caption(arms: ResultsByArm, is_watched: bool) -> str:
     text = f"Training. {band if runs > 1 else 'One run per arm, so there is no band.'}"
     if is_watched:
         text += f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many)."
+    unfinished = [name for name, results in arms.items() if not np.isfinite(_histories(results)[1]).any()]
+    if unfinished:
+        text += (
+            f" No episode of {' and '.join(unfinished)} was finished, so that it has no return; those of others are of "
+            "episodes that ended early."
+        )
     if "monitor" in arms:
         text += " The monitor's are what the shield would have overridden; its agent is the unshielded one."
     penalized = [name for name in arms if Arm.of(name).penalizes_interventions or Arm.of(name).penalizes_violations]

@@ -205,8 +205,8 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
     advice = "give another --out, or --force to replace them"
     try:
         document = json_values(read_file(folder / "settings.json"))
-        kept_command, kept = document["command"], document["settings"]
-        if not isinstance(kept, dict):
+        kept_command, kept, registered = document["command"], document["settings"], document.get("environments", {})
+        if not (isinstance(kept, dict) and isinstance(registered, dict)):
             raise TypeError("settings")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise OtherResultsError(
@@ -214,10 +214,10 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
         ) from error
     if kept_command != command:
         raise OtherResultsError(f"{folder} holds finished results of ncs {kept_command}: {advice}")
-    defaults = settings_json(command, type(settings)())["settings"]
+    defaults, own = settings_json(command, type(settings)())["settings"], settings_json(command, settings)
     before, now = (
         flat({name: value for name, value in each.items() if name not in _IGNORED})
-        for each in (defaults | kept, settings_json(command, settings)["settings"])
+        for each in (defaults | kept, own["settings"])
     )
     growing = _GROWING.get(command, ())
     others = [
@@ -225,6 +225,8 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
         for name in before | now
         if before.get(name) != now.get(name) and not (name in growing and _contains(now.get(name), before.get(name)))
     ]
+    changed = [env_id for env_id, digest in own["environments"].items() if registered.get(env_id, digest) != digest]
+    others += [f"{env_id}, which is registered otherwise now" for env_id in changed]
     if others:
         listed = "; ".join([*others[:_MOST_LISTED], *(["..."] if len(others) > _MOST_LISTED else [])])
         raise OtherResultsError(f"{folder} holds finished results of other settings ({listed}): {advice}")

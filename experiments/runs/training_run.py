@@ -23,6 +23,7 @@ from experiments.baselines import controller, tuned_weights
 from experiments.json_values import to_json
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
+from experiments.settings.arguments import registration_of
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import LARGEST_NUMBER, shown
 from shields import Certificate
@@ -175,12 +176,13 @@ class TrainingRun:
 
     @property
     def key(self) -> str:
-        """SHA-256 of everything the result depends on: all settings, this project's source and versions of packages."""
+        """SHA-256 of all that the result depends on: settings, environment, source, versions of packages."""
         names = set(self.__dataclass_fields__) - {"certificate", "certificate_basis", "grid_point", "module"}
         certificate = self.certificate_basis or self.certificate.checksum
         content = {name: getattr(self, name) for name in names}
         content |= {
             "module": module_digest(self.module),
+            "environment": registration_of(self.loop.env),
             "certificate": certificate,
             "training_loop": _described(self.training_loop, certificate),
             "loop": _described(self.loop, certificate),

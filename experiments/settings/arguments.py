@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from math import inf
+from pathlib import Path
 from typing import Annotated, Any
 
+import gymnasium as gym
+from cloudpickle import dumps
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.hyperparams import literal, with_changes
+from ncs_gym.reading import read_file
 from ncs_gym.validation import shown
 from shields.runtime.safety_filter import LONGEST_HORIZON
 
@@ -42,6 +47,20 @@ Assignments = Annotated[
 def id_alone(env_id: str) -> str:
     """Returns the id of "module:id", by which the environment is registered."""
     return env_id.rpartition(":")[2]
+
+
+def registration_of(env_id: str) -> str:
+    """Returns the SHA-256 of what an id is registered with, empty for none: a module may register it otherwise later.
+
+    Functions and classes of a module count by their names: its source is another matter (`module_digest`).
+    """
+    spec = gym.registry.get(id_alone(env_id))
+    if spec is None:
+        return ""
+    kwargs = dict(spec.kwargs)
+    if isinstance(plant := kwargs.get("plant"), str):  # a file, which may be another one later
+        kwargs["plant"] = read_file(Path(plant))
+    return hashlib.sha256(dumps([sorted(kwargs.items()), spec.max_episode_steps])).hexdigest()
 
 
 def beside_those_of_file(settings: Any, of_file: Any) -> Any:

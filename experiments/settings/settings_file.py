@@ -10,7 +10,7 @@ from typing import Any
 
 from experiments.errors import SettingsError
 from experiments.json_values import from_json
-from experiments.settings.arguments import id_alone
+from experiments.settings.arguments import id_alone, registration_of
 from ncs_gym.reading import json_values, read_file
 from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
@@ -23,14 +23,20 @@ _OF_THE_MACHINE = ("engine", "ray_address", "ray_wait", "cpus_per_run", "gpus_pe
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
-    """Returns a command's settings as JSON values; of "module:id" the id alone: a file imports nothing."""
+    """Returns a command's settings as JSON values; of "module:id" the id alone: a file imports nothing.
+
+    Beside them stands what the environments are registered with, as far as they are.
+    """
     values = json.loads(json.dumps(asdict(settings), default=str))
+    ids = []
     if isinstance(values.get("env"), str):
-        values["env"] = id_alone(values["env"])
+        ids = [id_alone(values["env"])]
+        values["env"] = ids[0]
     if isinstance(values.get("envs"), list):
-        values["envs"] = [id_alone(each) for each in values["envs"]]
+        ids = values["envs"] = [id_alone(each) for each in values["envs"]]
     kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
-    return {"format": FORMAT, "command": command, "settings": kept}
+    environments = {env_id: digest for env_id in ids if (digest := registration_of(env_id))}
+    return {"format": FORMAT, "command": command, "settings": kept, "environments": environments}
 
 
 def save_settings(path: Path, command: str, settings: Any) -> None:

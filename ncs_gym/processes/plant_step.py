@@ -11,7 +11,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process, own_process
 from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import read_only
+from ncs_gym.validation import guarded, read_only
 
 # Noise is drawn for about this many environment steps at once, for this many steps of one environment at most.
 BLOCK_SIZE, LONGEST_BLOCK = 4096, 256
@@ -234,7 +234,7 @@ class PlantSimulation:
         nominal = self._model.A.dot(state) + self._model.B.dot(u)
         if self._is_linear:
             return self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
-        x_next = self.process.step(self._model, state, u)
+        x_next = self.process.step(self._model, guarded(state), u)
         if self._is_disturbed:
             x_next = x_next + self.draw_disturbance(rng, x_next, steps, memory)
         if self.process.is_written:

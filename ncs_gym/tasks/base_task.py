@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from math import nan
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import ReadOnlyArrays
+from ncs_gym.validation import ReadOnlyArrays, shown
 
 
 class Task(ReadOnlyArrays, ABC):
@@ -112,3 +113,33 @@ class Task(ReadOnlyArrays, ABC):
     def check(self, plant: LinearPlant) -> str:
         """Returns why this task does not suit the plant, or an empty string."""
         return ""
+
+
+def as_reward(task: Task, value: Any) -> float:
+    """Returns what `reward` of a task says as a number.
+
+    Raises:
+        ValueError: If it is no number; that of a state that ran away is infinite.
+    """
+    try:
+        reward = float(value + 0.0)
+    except (TypeError, ValueError):
+        reward = nan
+    if reward != reward:
+        raise ValueError(f"the reward of {type(task).__name__} must be a number, got {shown(value)}")
+    return reward
+
+
+def as_rewards(task: Task, values: Any, count: int) -> np.ndarray:
+    """Returns what `reward_many` of a task says as a new array, shape (count,).
+
+    Raises:
+        ValueError: If it is no array of so many numbers.
+    """
+    rewards = np.array(values)
+    if rewards.shape != (count,) or rewards.dtype.kind not in "fiu" or np.isnan(rewards).any():
+        raise ValueError(
+            f"the reward of {type(task).__name__} must be a number for each environment, shape ({count},), got "
+            f"{shown(values)} of shape {rewards.shape}"
+        )
+    return rewards.astype(np.float64, copy=False)

@@ -210,7 +210,10 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
         (lambda folder: change(folder, hyperparams={"tensorboard_log": "/"}), "damaged: PPO: unknown hyperparameter"),
         (lambda folder: change(folder, channel={"loss": 7}), "damaged"),
         (lambda folder: change(folder, normalization={"mean": [0.0] * 3}), "damaged"),
-        (lambda folder: change(folder, normalization=SHORT), "normalization"),
+        (
+            lambda folder: change(folder, normalization=SHORT),
+            r"saw observations of 1 entries, those of .* now: it is registered",
+        ),
     ],
 )
 def test_damaged_and_foreign_agents_are_one_sentence(folder, damage, words):

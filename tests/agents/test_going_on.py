@@ -9,8 +9,8 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents import Agent, AppliedActionBuffer, LoopConfig, ShieldSettings, TrainingStopped, train
-from agents.results import HISTORY_FILE
+from agents import Agent, AppliedActionBuffer, LagrangianSettings, LoopConfig, ShieldSettings, TrainingStopped, train
+from agents.results import HISTORY_FILE, history_document
 from ncs_gym import truck_trailer
 from shields import SafetyShield
 from tests.certificates import certificate_of
@@ -75,6 +75,17 @@ def test_history_makes_two_trainings_count_as_one(loop):
     rate = second.agent.model.policy.optimizer.param_groups[0]["lr"]
     whole = train(loop, 1024, 0, hyperparams=SMALL).agent.model.policy.optimizer.param_groups[0]["lr"]
     assert rate == pytest.approx(whole)
+
+
+def test_price_of_violations_goes_on_with_the_history():
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", lagrangian=LagrangianSettings(learning_rate=0.5))
+    first = train(loop, 1600, 0, hyperparams=SMALL)
+    reached = first.history[-1].multiplier
+    assert reached == pytest.approx(0.5 * first.violation_steps) or reached > 0.5
+    second = train(loop, 64, 1, hyperparams=SMALL, start=first.agent, history=first.history)
+    assert second.history[-1].multiplier >= reached > 0.0
+    assert json.loads(history_document(second.history))[-1]["multiplier"] >= reached
+    assert train(loop, 64, 1, hyperparams=SMALL, start=first.agent).history[-1].multiplier < reached
 
 
 def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):

@@ -9,6 +9,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
 from experiments.errors import FolderInUseError, OtherResultsError
@@ -21,6 +23,8 @@ from experiments.settings import (
     SweepSettings,
     TrainSettings,
 )
+from experiments.settings.arguments import registration_of
+from ncs_gym import Channel, Regulation, register_plant, truck_trailer
 from tests.command import assert_one_sentence, ncs
 
 
@@ -121,6 +125,51 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
 def test_what_changes_no_result_or_adds_to_them_is_taken(command, kind, change, tmp_path):
     settings = finished(command, kind(out=tmp_path), "attack.json" if command == "attack" else "summary.json")
     claim_folder(command, replace(settings, **change))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"task": Regulation(state_cost=np.diag([4.0, 1.0]))},
+        {"max_episode_steps": 50},
+        {"disturbance": lambda rng, plant, nominal: np.zeros(2)},
+        {"channel": Channel(loss=0.1)},
+        {"plant": truck_trailer(mass=900.0)},
+        {"terminate_on_violation": True},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_folder_of_an_environment_that_is_registered_otherwise_now_is_refused(changed, tmp_path):
+    def registered(**more):
+        gym.registry.pop("Own/Truck-v0", None)
+        register_plant("Own/Truck-v0", **{"plant": truck_trailer()} | more)
+
+    try:
+        registered()
+        settings = finished("compare", CompareSettings(env="own:Own/Truck-v0", out=tmp_path))
+        before = registration_of("Own/Truck-v0")
+        registered()
+        assert registration_of("module:Own/Truck-v0") == before
+        claim_folder("compare", settings)
+        finished("compare", settings)
+        registered(**changed)
+        assert registration_of("Own/Truck-v0") != before
+        with pytest.raises(OtherResultsError, match=r"\(Own/Truck-v0, which is registered otherwise"):
+            claim_folder("compare", settings)
+        claim_folder("compare", replace(settings, force=True))
+    finally:
+        del gym.registry["Own/Truck-v0"]
+
+
+def test_a_plant_in_a_file_counts_with_what_the_file_holds(tmp_path):
+    try:
+        truck_trailer().save(tmp_path / "plant.json")
+        register_plant("Own/File-v0", tmp_path / "plant.json")
+        before = registration_of("Own/File-v0")
+        truck_trailer(mass=900.0).save(tmp_path / "plant.json")
+        assert registration_of("Own/File-v0") != before
+    finally:
+        del gym.registry["Own/File-v0"]
 
 
 def test_single_finished_runs_are_kept_and_a_folder_without_any_is_taken(tmp_path):

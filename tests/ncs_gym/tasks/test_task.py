@@ -1,7 +1,8 @@
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking, truck_trailer
+from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
 from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
 
 
@@ -110,3 +111,54 @@ def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
         states = to_state @ inputs
         used = np.maximum(np.abs(plant.box_rows @ states).max(axis=0), np.abs(inputs.T / plant.u_max).max(axis=1))
         assert farthest_equilibrium(plant, output) == pytest.approx((output @ states / used).max(), rel=1e-3)
+
+
+class Paying(Task):
+    """Pays what a function of state and input says."""
+
+    def __init__(self, pays):
+        object.__setattr__(self, "pays", pays)
+
+    def reward(self, plant, task_state, state, u):
+        return self.pays(state, u)
+
+
+class PayingMany(Paying):
+    vectorized = True
+
+
+def written(state, u):
+    state -= 0.02
+    return 0.0
+
+
+@pytest.mark.parametrize("kind", [Paying, PayingMany])
+@pytest.mark.parametrize(
+    ("pays", "words"),
+    [
+        (lambda state, u: -np.square(u), "the reward of Paying.* must be a number"),
+        (lambda state, u: None, "the reward of Paying.* must be a number"),
+        (lambda state, u: np.nan * state[0], "the reward of Paying.* must be a number"),
+        (written, "read-only"),
+    ],
+)
+def test_reward_is_a_number_and_moves_nothing(kind, pays, words):
+    settings = {"plant": truck_trailer(mass=4000.0), "task": kind(pays)}
+    single = gym.make("ncs_gym/LinearNCS-v0", **settings)
+    single.reset(seed=0)
+    with pytest.raises(ValueError, match=words):
+        single.step(np.ones(1, np.float32))
+    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, **settings)
+    many.reset(seed=0)
+    with pytest.raises(ValueError, match=words):
+        many.step(np.ones((3, 1), np.float32))
+
+
+def test_whole_numbers_are_rewards_and_the_array_stays_the_tasks_own():
+    paid = np.ones(3, np.int64)
+    task = PayingMany(lambda state, u: paid)
+    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, plant=truck_trailer(mass=4000.0), task=task)
+    envs.reset(seed=0)
+    rewards = envs.step(np.ones((3, 1), np.float32))[1]
+    assert (rewards.dtype, rewards.tolist()) == (np.float64, [1.0, 1.0, 1.0])
+    assert rewards is not paid
