@@ -35,11 +35,11 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import LinearProcess, Process, own_process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
-from ncs_gym.tasks.base_task import Task, as_reward
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, as_flag, guarded, own_error_state, setting, shown, warn_caller
+from ncs_gym.validation import as_count, as_flag, own_error_state, setting, shown, warn_caller
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
@@ -336,8 +336,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         packets = self._channel_state.exchange(rng, self.steps, sample, self._estimator.episode)
         self._packets += sends
         self._estimator.advance(u, packets)
-        earned = self._task.reward(self._plant, self._task_state, guarded(self._state), u)
-        reward = as_reward(self._task, earned)
+        reward = self._task.reward_one(self._plant, self._task_state, self._state, u)
         worst = self._plant.worst_constraint_values(before, u, self._state)
         info = self._info(inputs, worst, arrived=bool(packets), read=read)
         process = self._process.process

@@ -28,10 +28,10 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, PacketRecord
-from ncs_gym.tasks.base_task import Task, as_rewards
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, frozen, guarded, own_error_state, setting, shown
+from ncs_gym.validation import as_count, frozen, own_error_state, setting, shown
 
 
 class NCSVectorEnv(SpecOfJson, VectorEnv):
@@ -237,8 +237,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         inputs = self._downlink_state.exchange(self.np_random, self.steps, u)
         applied, committed, missing = inputs
         arrived = self._advance(applied, self._requested(missing))
-        earned = self._task.reward_many(self._plant, self._task_state, guarded(self._state), applied)
-        reward = as_rewards(self._task, earned, self.num_envs)
+        reward = self._task.reward_many(self._plant, self._task_state, self._state, applied)
         restarted = self._done.copy() if some_done else None
         if restarted is not None:  # NEXT_STEP: the last step ended these episodes
             self._begin(restarted, None)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import ReadOnlyArrays, shown
+from ncs_gym.validation import ReadOnlyArrays, guarded, shown
 
 
 class Task(ReadOnlyArrays, ABC):
@@ -103,43 +103,39 @@ class Task(ReadOnlyArrays, ABC):
             return self.observe(task_state)
         return np.array([self.observe(each) for each in task_state], dtype=np.float64).T
 
+    def reward_one(self, plant: LinearPlant, task_state: Any, state: np.ndarray, u: np.ndarray) -> float:
+        """Returns `reward` as a number; it cannot write into the state.
+
+        Raises:
+            ValueError: If it is no number; that of a state that ran away is infinite.
+        """
+        value = self.reward(plant, task_state, guarded(state), u)
+        try:
+            reward = float(value + 0.0)
+        except (TypeError, ValueError):
+            reward = nan
+        if reward != reward:
+            raise ValueError(f"the reward of {type(self).__name__} must be a number, got {shown(value)}")
+        return reward
+
     def reward_many(self, plant: LinearPlant, task_state: np.ndarray, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns the rewards of N environments, shape (N,), for states (n, N) and inputs (m, N)."""
-        if self.vectorized:
-            return self.reward(plant, task_state, state, u)
-        each = zip(task_state, state.T, u.T, strict=True)
-        return np.array([self.reward(plant, own, x, applied) for own, x, applied in each], dtype=np.float64)
+        """Returns what `reward_one` does for states (n, N) and inputs (m, N): a new array of shape (N,).
+
+        Raises:
+            ValueError: If a reward is no number, or there are not N.
+        """
+        state = guarded(state)
+        if not self.vectorized:
+            each = zip(task_state, state.T, u.T, strict=True)
+            return np.array([self.reward_one(plant, own, x, applied) for own, x, applied in each])
+        rewards = np.array(self.reward(plant, task_state, state, u))
+        if rewards.shape != u.shape[1:] or rewards.dtype.kind not in "fiu" or np.isnan(rewards).any():
+            raise ValueError(
+                f"the reward of {type(self).__name__} must be a number for each environment, shape {u.shape[1:]}, got "
+                f"{shown(rewards)} of shape {rewards.shape}"
+            )
+        return rewards.astype(np.float64, copy=False)
 
     def check(self, plant: LinearPlant) -> str:
         """Returns why this task does not suit the plant, or an empty string."""
         return ""
-
-
-def as_reward(task: Task, value: Any) -> float:
-    """Returns what `reward` of a task says as a number.
-
-    Raises:
-        ValueError: If it is no number; that of a state that ran away is infinite.
-    """
-    try:
-        reward = float(value + 0.0)
-    except (TypeError, ValueError):
-        reward = nan
-    if reward != reward:
-        raise ValueError(f"the reward of {type(task).__name__} must be a number, got {shown(value)}")
-    return reward
-
-
-def as_rewards(task: Task, values: Any, count: int) -> np.ndarray:
-    """Returns what `reward_many` of a task says as a new array, shape (count,).
-
-    Raises:
-        ValueError: If it is no array of so many numbers.
-    """
-    rewards = np.array(values)
-    if rewards.shape != (count,) or rewards.dtype.kind not in "fiu" or np.isnan(rewards).any():
-        raise ValueError(
-            f"the reward of {type(task).__name__} must be a number for each environment, shape ({count},), got "
-            f"{shown(values)} of shape {rewards.shape}"
-        )
-    return rewards.astype(np.float64, copy=False)
