@@ -108,7 +108,9 @@ def infeasibility(problem: DesignProblem, *, polytope: bool) -> Infeasible:
     binding = "U" if _margin(problem, polytope=polytope, input_limits=False) >= 1.0 else "I"
     missing = "ellipsoid or polytope" if polytope else "ellipsoid"
     what = (
-        "(U) the input limits are too tight" if binding == "U" else f"(I) no invariant {missing} in the box was found"
+        "(U) no gain was found that keeps the input limits"
+        if binding == "U"
+        else f"(I) no invariant {missing} in the box was found"
     )
     return _with_share(what, binding, fraction)
 
@@ -131,7 +133,7 @@ def infeasibility_around(plant: LinearPlant, contract: ChannelContract | None, r
     is_input = [k <= j < k + m for j in tolerance.binding]
     what = "(I) no invariant polytope within the limits was found"
     if is_input and all(is_input):
-        what = "(U) the input limits are too tight"
+        what = "(U) no gain was found that keeps the input limits"
     elif tolerance.binding:
         what += f" (those that bind: {', '.join(_limit(plant, j) for j in tolerance.binding)})"
     return _with_share(what, what[1], tolerance.margin)

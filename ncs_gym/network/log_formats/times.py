@@ -137,7 +137,8 @@ def _lines_of(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column],
     _require_order(moments, np.where(np.isnan(delays), np.nan, arrived), places)
     delays[flagged] = np.nan
     if (delays < 0.0).any():
-        raise ValueError(f"line {places[int(np.argmax(delays < 0.0))]}: {BEFORE}")
+        read_in = "" if until.unit else f" ({shown(until.name)} was read in {units[1]})"
+        raise ValueError(f"line {places[int(np.argmax(delays < 0.0))]}: {BEFORE}{read_in}")
     return _Lines(moments, delays, np.array(numbers), np.array(places), len(marked), origin, units)
 
 

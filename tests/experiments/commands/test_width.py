@@ -120,7 +120,9 @@ class Shown:
         return printed("synthesize", "--plant", self.plant, "--max-age", 2, "--out", self.folder / "c.json")
 
     def verify(self):
-        shown = [printed("verify", file) for file in sorted((ROOT / "shields" / "packaged_certificates").glob("C*.json"))]
+        shown = [
+            printed("verify", file) for file in sorted((ROOT / "shields" / "packaged_certificates").glob("C*.json"))
+        ]
         return "\n".join(line for text in shown for line in text.splitlines() if " verifies" not in line)
 
     def channel(self):
