@@ -470,7 +470,7 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
             for unit, name, wrong in (("", "lost", "lost"), ("", "status", "status"), ("_s", "ok", "sent_s"))
         ),
         ("seq,sent,delay\n1,0,0.1\n2,1,0.1\n2,2,0.1\n", "packet 2 was sent at two times"),
-        ("sent_ms,received\n0,0.07\n500,0.569\n", r"the clocks of .* \('received' was read in ms\)"),
+        ("sent_ms,received\n0,0.07\n500,0.569\n", "('received' was read in ms)"),
         ("sent_ms,delay\n120000000,5\n120000020,6\n", "'delay' has no unit: name it delay_ms or delay_s"),
         ("sent,delay_ms\n120000000,5\n120000020,6\n", "'sent' has no unit: name it sent_ms or sent_s"),
         ("sent,rtt_s\n1,5\n2,6\n", "'sent' has no unit: name it sent_s or sent_ms"),
