@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import platform
 import warnings
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -52,6 +54,7 @@ class Agent:
         residual_gain: Normalized gain, shape (m, n), to whose action that of the model is added; None for none.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
+        kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
 
     algorithm: str
@@ -63,6 +66,12 @@ class Agent:
     residual_gain: np.ndarray | None = None
     shield_mode: str | None = None
     horizon: int | None = None
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of the environment that it was trained in: `gym.make(agent.env, **agent.env_kwargs)`."""
+        return self.kwargs if self.channel is None else self.kwargs | {"channel": self.channel}
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries).
@@ -116,7 +125,12 @@ class Agent:
         return digest.hexdigest()
 
     def files(self) -> dict[str, bytes]:
-        """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest."""
+        """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest.
+
+        Raises:
+            ValueError: If the environment was made with something that a file does not keep.
+        """
+        _require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
         self.model.save(buffer)
         content = {
@@ -125,7 +139,7 @@ class Agent:
             "env": self.env,
             "channel": to_json(self.channel),
             "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
-            "plant": None if (plant := _plant_of(self.env)) is None else plant.fingerprint,
+            "plant": None if (plant := _plant_of(self.env, self.kwargs)) is None else plant.fingerprint,
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
                 "variance": self.normalization.variance.tolist(),
@@ -136,6 +150,8 @@ class Agent:
         }
         if self.residual_gain is not None:
             content["residual_gain"] = self.residual_gain.tolist()
+        if self.kwargs:
+            content["kwargs"] = self.kwargs
         return {"model.zip": buffer.getvalue(), "agent.json": document_of(content)}
 
     def save(
@@ -149,11 +165,11 @@ class Agent:
             evaluation: Episodes whose figures the card gives; None leaves them out.
 
         Raises:
-            ValueError: If the certificate is for another plant than that of the agent's environment.
+            ValueError: If the certificate is for another plant than that of the agent's environment, or see `files`.
             OSError: If a file cannot be written.
         """
         folder = Path(folder)
-        if shield is not None and not _is_for_plant_of(self.env, shield.certificate.fingerprint):
+        if shield is not None and not _is_for_plant_of(self.env, self.kwargs, shield.certificate.fingerprint):
             raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
         files = self.files() | {"README.md": _card(self, shield, evaluation).encode()}
         folder.mkdir(parents=True, exist_ok=True)
@@ -195,13 +211,28 @@ def pretrained(env_id: str) -> Agent:
     return Agent.load(pretrained_folder(env_id))
 
 
-def _plant_of(env_id: str) -> LinearPlant | None:
-    return getattr(gym.make(env_id).unwrapped, "plant", None)
+def _require_kept(kwargs: Mapping[str, Any], env_id: str) -> None:
+    """Raises ValueError unless keyword arguments of an environment are those that files of agents keep."""
+    for name, value in kwargs.items():
+        try:
+            json.dumps(value, allow_nan=False)
+            is_kept = name in _KEPT
+        except (TypeError, ValueError):
+            is_kept = False
+        if not is_kept:
+            raise ValueError(
+                f"files of agents do not keep {name}={shown(value)} of {env_id}: register an environment with it "
+                "(register_plant), and train in that"
+            )
 
 
-def _is_for_plant_of(env_id: str, fingerprint: str | None) -> bool:
+def _plant_of(env_id: str, kwargs: Mapping[str, Any]) -> LinearPlant | None:
+    return getattr(gym.make(env_id, **kwargs).unwrapped, "plant", None)
+
+
+def _is_for_plant_of(env_id: str, kwargs: Mapping[str, Any], fingerprint: str | None) -> bool:
     """Returns whether what was stored with a fingerprint belongs to an environment's plant, or lack of one."""
-    plant = _plant_of(env_id)
+    plant = _plant_of(env_id, kwargs)
     return fingerprint is None if plant is None else fingerprint is not None and plant.fingerprint == fingerprint
 
 
@@ -213,12 +244,14 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
             f"the agent was trained in {shown(str(env_id))[1:-1]}, which is not registered here: import the module "
             "that registers it, or on the command line give --env module:id, with the name of that module"
         )
-    if not _is_for_plant_of(env_id, content["plant"]):
+    kwargs = content.get("kwargs", {})
+    _require_kept(kwargs, env_id)
+    if not _is_for_plant_of(env_id, kwargs, content["plant"]):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {shown(algorithm)}")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
-    loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
+    loop = LoopConfig(env=env_id, kwargs=kwargs | {"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
     parameters, envs = parameters_of(weights), SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
@@ -249,6 +282,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         residual_gain=gain,
         shield_mode=shield_mode,
         horizon=horizon,
+        kwargs=kwargs,
     )
 
 
@@ -334,6 +368,11 @@ def _normalization_for(
     )
 
 
+# Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
+_KEPT = {
+    *("task", "disturbance", "noise", "initial_set", "terminate_on_violation", "allow_assumption_violation", "process"),
+    *("contract", "downlink", "downlink_contract", "observe", "horizon", "between_samples"),
+}
 _PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 _USE = """## Use
 
@@ -346,7 +385,7 @@ from agents import Agent, LoopConfig{imports}
 agent = Agent.load(".")
 loop = LoopConfig(
     env=agent.env,
-    kwargs={{"channel": agent.channel}},{shield}
+    kwargs=agent.env_kwargs,{shield}
 )
 ```
 """
@@ -354,12 +393,13 @@ loop = LoopConfig(
 
 def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | None) -> str:
     """Returns the card of an agent, in Markdown, as `Agent.save` explains."""
-    env = gym.make(agent.env).unwrapped
+    env = gym.make(agent.env, **agent.kwargs).unwrapped
     plant, channel = getattr(env, "plant", None), agent.channel or getattr(env, "channel", None)
     rows = {
         "environment": f"`{agent.env}`",
         "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
         "channel": f"`{channel}`" + ("" if agent.channel else ", that of the id"),
+        "other settings": ", ".join(f"{name}={value!r}" for name, value in agent.kwargs.items()) or "those of the id",
         "shield": _shield_text(shield),
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),
         "SHA-256 of the weights": f"`{agent.checksum}`",
@@ -375,6 +415,7 @@ def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | 
     known = ""
     if shield is not None:
         horizon = "" if shield.horizon is None else f", horizon={shield.horizon}"
+        horizon += f", least_safe_steps={shield.least_safe_steps}" if shield.least_safe_steps else ""
         known = f'\n    shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"{horizon}),'
     imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
     return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
@@ -407,4 +448,5 @@ def _shield_text(shield: ShieldSettings | None) -> str:
     if shield is None:
         return "none"
     horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"
+    horizon += f", {shield.least_safe_steps} safe steps sought" if shield.least_safe_steps else ""
     return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

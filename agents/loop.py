@@ -150,6 +150,9 @@ class LoopConfig:
         if self.filter is not None:
             envs = self.filter(envs)
         if self.residual_gain is not None:
+            plant = getattr(envs.unwrapped, "plant", None)
+            if plant is not None and plant.input_middle.any():
+                raise ValueError("a residual gain needs input limits that are symmetric (plant.symmetric)")
             envs = ResidualActions(envs, self.residual_gain)
         if self.lagrangian is not None:
             return CostPenalty(envs, self.lagrangian.multiplier)

@@ -21,6 +21,7 @@ from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
+from ncs_gym.envs.json_settings import to_json
 from ncs_gym.validation import reason_of
 from shields.atomic_write import write_atomically
 
@@ -191,4 +192,5 @@ def _agent(
         residual_gain=loop.residual_gain,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
+        kwargs={name: to_json(value) for name, value in loop.kwargs.items() if name != "channel"},
     )

@@ -38,8 +38,10 @@ def evaluate(settings: EvaluateSettings) -> None:
     agent, folder = agent_named(str(settings.model), env_id, settings.vec_normalize)
     if env_id is None:
         registered_env(agent.env)
-    kwargs = {"channel": agent.channel, "between_samples": settings.between_samples}
-    loop = with_channel(LoopConfig(env=agent.env, kwargs=kwargs), settings.channel)
+    loop = LoopConfig(env=agent.env, kwargs=agent.env_kwargs)
+    if settings.between_samples is not None:
+        loop = loop.with_kwargs(between_samples=settings.between_samples)
+    loop = with_channel(loop, settings.channel)
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
     if settings.shield == "as-trained" and folder.is_file():

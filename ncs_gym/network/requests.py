@@ -80,6 +80,7 @@ class Requests:
         # Without a contract it is enough to know which packets may still arrive.
         self._oldest = channel.longest_delay if contract is None else contract.max_age
         self._back = np.arange(input_delay + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
+        self._counts = self._back < len(self._back) - (contract is None)
         self.begin()
 
     def begin(self, chosen: np.ndarray | None = None, channels: Sequence[Channel] | None = None) -> None:
@@ -132,7 +133,7 @@ class Requests:
         Args:
             age: Steps since the newest sample that arrived was taken, or shape (N,).
         """
-        return np.count_nonzero(self._flags & (self._back < age + self._input_delay), axis=0)
+        return np.count_nonzero(self._flags & self._counts & (self._back < age + self._input_delay), axis=0)
 
     def decide(self, age: Any) -> None:
         """Decides the request of sample k + c + 1.

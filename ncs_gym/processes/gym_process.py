@@ -176,6 +176,8 @@ class _OpenedEnvs(Process):
         inner: One for each environment.
     """
 
+    vectorized = True
+
     def __init__(self, inner: list[OpenedEnv]) -> None:
         self.inner = inner
         self.is_written = inner[0].is_written

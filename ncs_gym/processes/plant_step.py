@@ -234,7 +234,8 @@ class PlantSimulation:
         nominal = self._model.A.dot(state) + self._model.B.dot(u)
         if self._is_linear:
             return self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
-        x_next = self.process.step(self._model, guarded(state), u)
+        step = self.process.step if self.size is None else self.process.step_many
+        x_next = step(self._model, guarded(state), u)
         if self._is_disturbed:
             x_next = x_next + self.draw_disturbance(rng, x_next, steps, memory)
         if self.process.is_written:

@@ -20,7 +20,9 @@ class Process:
     another process from `opened`, which belongs to a single environment, or to a vector of them.
 
     Attributes:
-        vectorized: Whether `step` takes any number of states and inputs at once.
+        vectorized: Whether `step` takes any number of states and inputs at once, as that of what `opened` returns for
+            many environments has to. It is never inherited: a subclass that does not declare it is stepped for one
+            environment after the other.
         is_written: Whether it can be put into a state, so that episodes start where the environment says and
             disturbances of the plant can act.
         terminated, truncated: Whether it ended the episode by itself; arrays (N,) for many environments.
@@ -30,6 +32,11 @@ class Process:
     is_written: bool = True
     terminated: Any = False
     truncated: Any = False
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Keeps a subclass from inheriting a promise about a method that it may override."""
+        super().__init_subclass__(**keywords)
+        cls.vectorized = vars(cls).get("vectorized", False)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns what moves in one environment (None) or in `size` of them.
@@ -85,6 +92,13 @@ class Process:
         """
         raise ValueError(f"a {type(self).__name__} moves only once it is opened")
 
+    def step_many(self, plant: LinearPlant, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Returns what `step` does for states (n, N) and inputs (m, N), for all at once or for one after the other."""
+        if self.vectorized:
+            return self.step(plant, states, inputs)
+        each = [self.step(plant, x, u) for x, u in zip(states.T, inputs.T, strict=True)]
+        return np.array(each, dtype=np.float64).T
+
     def write(self, state: np.ndarray) -> np.ndarray:
         """Puts everything that has not ended into a state, shape (n,) or (n, N), and returns what is read back."""
         return state
@@ -107,6 +121,8 @@ class Process:
 @dataclass(frozen=True)
 class LinearProcess(Process):
     """The plant's own equations and disturbances: the certified model is the truth."""
+
+    vectorized: ClassVar[bool] = True
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x + B u."""
@@ -132,6 +148,8 @@ class FamilyProcess(Process):
 
 class _Members(Process):
     """One member of a family, or one of each of `size` environments; the plant of the middle until they are chosen."""
+
+    vectorized = True
 
     def __init__(self, plant: LinearPlant, family: Family, size: int | None) -> None:
         self._family, self._size = family, size
@@ -190,18 +208,12 @@ class FunctionProcess(Process):
         object.__setattr__(self, "vectorized", as_flag(self.vectorized, "vectorized"))
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns what the function returns, for all environments at once or for one after the other.
+        """Returns what the function returns.
 
         Raises:
             ValueError: If that is not finite, or of another shape than the state.
         """
-        if state.ndim > 1 and not self.vectorized:
-            columns = [self._checked(x, v) for x, v in zip(state.T.copy(), u.T.copy(), strict=True)]
-            return np.array(columns).T
-        return self._checked(state.copy(), u.copy())
-
-    def _checked(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        value = self.function(state, u)
+        value = self.function(state.copy(), u.copy())
         x_next = as_setting(value)
         if x_next is None or x_next.shape != state.shape or not np.isfinite(x_next).all():
             raise ValueError(f"the process must return a finite next state of shape {state.shape}, got {shown(value)}")

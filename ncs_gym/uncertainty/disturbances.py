@@ -59,7 +59,7 @@ class Disturbance(ReadOnlyArrays, ABC):
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Keeps a subclass from inheriting a promise about methods that it may override."""
         super().__init_subclass__(**keywords)
-        for name in ("vectorized", "memoryless"):
+        for name in ("vectorized", "memoryless", "replaces_process_noise"):
             setattr(cls, name, vars(cls).get(name, False))
 
     def begin(self, rng: np.random.Generator, plant: LinearPlant, size: int | None = None) -> Any:

@@ -3,6 +3,7 @@ import pickle
 import zipfile
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -107,6 +108,25 @@ def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, 
     assert names["agent"].checksum == agent.checksum
     loop = names["loop"]
     assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate, mode, horizon=horizon))
+
+
+def test_folder_keeps_how_the_environment_was_made(tmp_path):
+    downlink = Channel(loss=0.3, delay=2, max_consecutive_losses=3)
+    kwargs = {"downlink": downlink, "between_samples": 8, "observe": ("age",), "channel": Channel(loss=0.1)}
+    env = gym.make(CRUISE, **kwargs).unwrapped
+    certificate = certificate_of(env.plant, env.certificate_contract)
+    shield = ShieldSettings(certificate, "lookahead", least_safe_steps=2)
+    loop = LoopConfig(env=CRUISE, kwargs=kwargs, shield=shield)
+    agent = train(loop, 64, 0, hyperparams={"n_envs": 2, "n_steps": 32, "batch_size": 32}, checkpoints=tmp_path).agent
+    agent.save(tmp_path, shield)
+    again, card = Agent.load(tmp_path), (tmp_path / "README.md").read_text()
+    assert again.env_kwargs == agent.env_kwargs
+    made = gym.make(again.env, **again.env_kwargs).unwrapped
+    assert (made.plant.fingerprint, made.downlink, made.observe) == (env.plant.fingerprint, downlink, ("age",))
+    assert "between_samples=8" in card
+    assert "least_safe_steps=2" in card
+    with pytest.raises(ValueError, match="files of agents do not keep disturbance=<function"):
+        replace(agent, kwargs={"disturbance": lambda *given: None}).save(tmp_path)
 
 
 def test_card_without_a_shield_names_none(folder, agent, certificate):

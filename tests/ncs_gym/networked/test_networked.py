@@ -308,6 +308,14 @@ def test_requests_keep_the_type_of_observations_and_actions(make):
         RequestActions(Networked(gym.make("FrozenLake-v1"), Channel(on_request=True)))
 
 
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_a_sample_that_cannot_arrive_any_more_is_not_outstanding(delay):
+    env = RequestActions(Networked(Counter(), Channel(on_request=True, loss=1.0, delay=delay)))
+    env.reset(seed=0)
+    seen = [env.step(np.array([0.0, 1.0 if k == 0 else -1.0]))[0][-1] for k in range(5)]
+    assert seen == [1.0] * delay + [0.0] * (5 - delay)
+
+
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 def test_samples_on_request_cost_and_come_only_then(env_id):
     env = RequestActions(Networked(gym.make(env_id), Channel(on_request=True)), cost=0.5)

@@ -8,6 +8,7 @@ import pytest
 from gymnasium.spaces import Box
 
 from ncs_gym import (
+    AdversarialDisturbance,
     Channel,
     Ellipsoid,
     FunctionProcess,
@@ -16,6 +17,7 @@ from ncs_gym import (
     LinearProcess,
     NCSEnv,
     NCSVectorEnv,
+    Process,
     Remainder,
 )
 
@@ -234,3 +236,51 @@ def test_a_step_too_large_for_float64_is_an_alarm(many):
     env.reset(seed=0)
     *_, info = env.step(np.zeros((2, 1) if many else 1, np.float32))
     assert np.all(info["assumption_violated"])
+
+
+class Drag(Process):
+    """Slows down by a part of the size of its state, as one state alone has it."""
+
+    vectorized = True
+
+    def step(self, plant, state, u):
+        return A @ state + B @ u - 0.01 * np.linalg.norm(state)
+
+
+class OneDrag(Drag):
+    """Does not declare `vectorized`: it is stepped for one environment after the other."""
+
+    def step(self, plant, state, u):
+        assert state.ndim == 1
+        return super().step(plant, state, u)
+
+
+def test_process_that_declares_nothing_is_stepped_for_one_environment_after_the_other():
+    starts = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2))
+    settings = {"plant": plant(), "disturbance": lambda rng, plant, nominal: np.zeros(2), "process": OneDrag()}
+    many = NCSVectorEnv(8, **settings, allow_assumption_violation=True)
+    many.reset(seed=0, options={"state": starts})
+    *_, info = many.step(np.ones((8, 1), np.float32))
+    wanted = [Drag().step(plant(), x, np.ones(1)) for x in starts]
+    np.testing.assert_allclose(info["state"], wanted, atol=1e-12)
+    assert (Drag.vectorized, OneDrag.vectorized) == (True, False)
+
+
+def test_process_of_others_cannot_write_into_the_state():
+    def written(plant, state, u):
+        state *= 0.5
+        return state
+
+    one = NCSEnv(plant=plant(), process=type("Writing", (Process,), {"step": lambda self, *given: written(*given)})())
+    one.reset(seed=0)
+    with pytest.raises(ValueError, match="read-only"):
+        one.step(np.ones(1, np.float32))
+
+
+def test_what_a_disturbance_declares_is_never_inherited():
+    class Mine(AdversarialDisturbance):
+        def draw(self, rng, plant, nominal_next, step, memory):
+            return np.zeros(plant.n)
+
+    assert (Mine.vectorized, Mine.memoryless, Mine.replaces_process_noise) == (False, False, False)
+    assert AdversarialDisturbance.replaces_process_noise
