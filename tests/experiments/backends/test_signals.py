@@ -79,7 +79,7 @@ def sent_twice(moment, number, *arguments):
 def test_signal_that_another_thread_gets_waits_until_a_process_has_started():
     """Its handler runs in the main thread, which had blocked it."""
     program = """
-import signal, threading
+import signal, threading, time
 from experiments.backends.worker import signals_blocked
 
 signal.signal(signal.SIGTERM, lambda number, frame: print("handled", flush=True))
@@ -87,8 +87,7 @@ other = threading.Thread(target=threading.Event().wait, daemon=True)
 other.start()
 with signals_blocked():
     signal.pthread_kill(other.ident, signal.SIGTERM)
-    for _ in range(100_000):
-        pass
+    time.sleep(0.5)  # by then the other thread has it
     print("started", flush=True)
 print("after", flush=True)
 """
