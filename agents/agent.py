@@ -71,7 +71,7 @@ class Agent:
     @property
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of the environment that it was trained in: `gym.make(agent.env, **agent.env_kwargs)`."""
-        return self.kwargs if self.channel is None else self.kwargs | {"channel": self.channel}
+        return self.kwargs | ({} if self.channel is None else {"channel": self.channel})
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries).

@@ -35,19 +35,23 @@ class SafetyCallback(BaseCallback):
     Args:
         on_progress: Called with the number of steps taken since its last call.
         history: Totals of the training that this one goes on from; empty for one that begins.
+        priced: The penalty of PPO-Lagrangian, whose value totals hold; None without one.
 
     Attributes:
         history: Totals after every rollout; where rollouts are single steps, after every 200th part of the training.
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
-        priced: The penalty of PPO-Lagrangian, whose value totals hold; None without one.
     """
 
-    def __init__(self, on_progress: Callable[[int], None] | None = None, history: Sequence[TrainingPoint] = ()) -> None:
+    def __init__(
+        self,
+        on_progress: Callable[[int], None] | None = None,
+        history: Sequence[TrainingPoint] = (),
+        priced: CostPenalty | None = None,
+    ) -> None:
         super().__init__()
         self.history = list(history)
-        self.priced: CostPenalty | None = None
-        self._on_progress = on_progress
+        self._on_progress, self._priced = on_progress, priced
         self.violation_steps, self.interventions = self._last.violation_steps, self._last.interventions
         self._corrections: float | None = None
         self._guaranteed: int | None = None
@@ -86,7 +90,7 @@ class SafetyCallback(BaseCallback):
     def _present(self) -> TrainingPoint:
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
-        multiplier = 0.0 if self.priced is None else self.priced.penalty
+        multiplier = float("nan") if self._priced is None else self._priced.penalty
         return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions, multiplier)
 
     def add_point(self) -> None:

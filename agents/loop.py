@@ -150,9 +150,6 @@ class LoopConfig:
         if self.filter is not None:
             envs = self.filter(envs)
         if self.residual_gain is not None:
-            plant = getattr(envs.unwrapped, "plant", None)
-            if plant is not None and plant.input_middle.any():
-                raise ValueError("a residual gain needs input limits that are symmetric (plant.symmetric)")
             envs = ResidualActions(envs, self.residual_gain)
         if self.lagrangian is not None:
             return CostPenalty(envs, self.lagrangian.multiplier)
@@ -194,6 +191,9 @@ class ResidualActions(AroundEnvironment, VectorWrapper):
         actions, observations = env.single_action_space.shape, env.single_observation_space.shape
         if actions is None or observations is None or gain.shape[0] != actions[0] or gain.shape[1] > observations[0]:
             raise ValueError(f"residual_gain must have the shape (m, n) of actions and states, got {gain.shape}")
+        plant = getattr(env.unwrapped, "plant", None)
+        if plant is not None and plant.input_middle.any():
+            raise ValueError("residual_gain is for input limits that are symmetric (plant.symmetric)")
         self.gain = gain
         super().__init__(env)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import nan
 
 import numpy as np
 
@@ -26,14 +27,14 @@ class TrainingPoint:
             only if it is outside the shield: with `SB3VecEnv`, not with `make_vec_env` (NaN before the first).
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
-        multiplier: Price of a violating step then, of PPO-Lagrangian; 0 in other trainings.
+        multiplier: Price of a violating step then, of PPO-Lagrangian; NaN in other trainings.
     """
 
     steps: int
     episode_return: float
     violation_steps: int
     interventions: int
-    multiplier: float = 0.0
+    multiplier: float = nan
 
 
 def history_document(history: Sequence[TrainingPoint]) -> str:

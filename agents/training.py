@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -95,13 +96,14 @@ def train(
     before = history[-1].steps if history else 0
     envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams, before)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
-    callback = SafetyCallback(on_progress, history)
-    beside: list[BaseCallback] = [callback]
-    if loop.lagrangian is not None and isinstance(envs, CostPenalty):
-        callback.priced = envs
-        beside = [DualAscentCallback(loop.lagrangian, envs), callback]  # totals hold the price that goes on
-        if history:
-            envs.penalty = history[-1].multiplier
+    beside: list[BaseCallback] = []
+    priced = envs if loop.lagrangian is not None and isinstance(envs, CostPenalty) else None
+    if loop.lagrangian is not None and priced is not None:
+        if history and not isnan(history[-1].multiplier):
+            priced.penalty = history[-1].multiplier
+        beside.append(DualAscentCallback(loop.lagrangian, priced))  # before the totals, which hold the next price
+    callback = SafetyCallback(on_progress, history, priced)
+    beside.append(callback)
     if log_folder:
         beside.append(EvaluationCallback(loop, seed))
     if start is not None:

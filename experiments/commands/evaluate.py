@@ -64,9 +64,10 @@ def evaluate(settings: EvaluateSettings) -> None:
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
     arms = {f"shield: {shield_name}": arm_summary(episodes_table([result]), mode, fixed_policy=True)}
     statistics = "" if settings.vec_normalize is None else f" with --vec-normalize {settings.vec_normalize}"
-    print(
-        wrapped(f"{agent.algorithm} of {folder}{statistics} in {agent.env}, {settings.episodes:,} episodes"), end="\n\n"
-    )
+    others = {name: value for name, value in loop.kwargs.items() if name != "channel"}
+    made = "".join(f", {name}={value!r}" for name, value in others.items())
+    what = f"{agent.algorithm} of {folder}{statistics} in {agent.env}{made}"
+    print(wrapped(f"{what}, {settings.episodes:,} episodes"), end="\n\n")
     print(summary_text(arms, {}))
     if mode is not None:
         (arm,) = arms.values()
@@ -76,6 +77,7 @@ def evaluate(settings: EvaluateSettings) -> None:
             "arms": arms,
             "env": agent.env,
             "channel": loop.channel and asdict(loop.channel),
+            "kwargs": others,
             "horizon": shield and shield.horizon,
             "least_safe_steps": least,
             "episodes": settings.episodes,

@@ -80,7 +80,9 @@ class Requests:
         # Without a contract it is enough to know which packets may still arrive.
         self._oldest = channel.longest_delay if contract is None else contract.max_age
         self._back = np.arange(input_delay + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
-        self._counts = self._back < len(self._back) - (contract is None)
+        # A sample as old as the longest delay has arrived, or never will; under a contract all of these count.
+        oldest = channel.longest_delay - 1 if contract is None else contract.max_age
+        self._counts = self._back <= input_delay + oldest
         self.begin()
 
     def begin(self, chosen: np.ndarray | None = None, channels: Sequence[Channel] | None = None) -> None:

@@ -126,7 +126,7 @@ class NetworkSettings:
             each = [EveryEpisode(option.draw, first) for first in each]
         return [links.read(one, "channel") for one, links in zip(each, uplinks, strict=True)]
 
-    def require_memory(self, age: int) -> None:
+    def warn_of_lacking_actions(self, age: int) -> None:
         """Warns the caller, once, where a predictor lacks actions that were decided since the newest sample."""
         if age > self.pending and not self._has_warned:
             self._has_warned = True

@@ -125,6 +125,9 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
                 that begin by autoreset have the environments' own again. "reset_mask", bool (N,), starts some. The
                 rest is the environments'.
         """
+        first = seed[0] if isinstance(seed, list) else seed
+        if first is None and seed is not None:
+            raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
         own, count = dict(options or {}), self.num_envs
         chosen = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
         if not self._started:
@@ -134,9 +137,6 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorNetworked")
         require_no_network(info)
-        first = seed[0] if isinstance(seed, list) else seed
-        if first is None and isinstance(seed, list):
-            raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
         if first is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
         for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
@@ -248,7 +248,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             seen = [_where(each.is_new(self._steps), sample, zero_of(part.space)) for sample, part, each in pairs]
         elif callable(settings.fill):
             ages = self._steps - arrivals[0].stamp
-            settings.require_memory(int(ages.max()))
+            settings.warn_of_lacking_actions(int(ages.max()))
             seen = [_where(ages == 0, seen[0], settings.fill(seen[0], ages, self._decided.copy()))]
         if not settings.entries.names:
             return joined(settings.parts, seen)

@@ -270,7 +270,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             pairs = zip(seen, settings.parts, self._arrivals, strict=True)
             seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
         elif callable(settings.fill) and (age := step - self._arrivals[0].stamp):
-            settings.require_memory(age)
+            settings.warn_of_lacking_actions(age)
             seen = [settings.fill(seen[0], age, np.array(self._decided))]
         observation = joined(settings.parts, seen)
         if not settings.entries.names:

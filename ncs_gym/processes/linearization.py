@@ -200,7 +200,7 @@ def _moved(
 ) -> np.ndarray:
     """Returns the next states, shape (n, N), after states (n, N) with inputs (m, N)."""
     if moving.vectorized:
-        return moving.step_many(frame, states, inputs)
+        return moving.step(frame, states, inputs)
     x_next = np.empty_like(states)
     for each in range(states.shape[1]):
         if moving.terminated or moving.truncated:

@@ -275,9 +275,10 @@ class SafetyFilter(ReadOnlyArrays):
     @own_error_state
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
+        if not self.lookahead.horizon:
+            return self._no_plan
         first = self.decide(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
-        plan = np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
-        return plan[: self.lookahead.horizon]
+        return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
         """Returns what is known of one error shape, (n, n), without a last axis, read-only; itself if it is that.
