@@ -145,7 +145,7 @@ def _training_caption(arms: ResultsByArm, is_watched: bool) -> str:
     if is_watched:
         text += f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many)."
     unfinished = [name for name, results in arms.items() if not np.isfinite(_histories(results)[1]).any()]
-    if unfinished:
+    if 0 < len(unfinished) < len(arms):
         text += (
             f" No episode of {' and '.join(unfinished)} was finished, so that it has no return; those of others are of "
             "episodes that ended early."
