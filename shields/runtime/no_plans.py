@@ -35,6 +35,10 @@ class NoPlans:
     def beginning_alone(self, *_: Any) -> None:
         """Finds no plan."""
 
+    def may_do_better(self, *_: Any) -> bool:
+        """Returns False: nothing takes the place of a projected input."""
+        return False
+
     def keep(self, *_: Any) -> None:
         """Lets no more inputs pass."""
 

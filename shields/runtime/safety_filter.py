@@ -149,7 +149,7 @@ class SafetyFilter(ReadOnlyArrays):
             self._tell_of_shapes(estimate, input_proposed)
         elif self.mode != "boundary":
             try:
-                decision = self._decide_alone(x_hat, errors, proposed)
+                decision = self._decide_alone(x_hat, errors, proposed, stored)
             except FloatingPointError:  # underflow, where numpy is told to raise
                 decision = None
             if decision is not None:
@@ -162,7 +162,9 @@ class SafetyFilter(ReadOnlyArrays):
         plan = plan[~np.isnan(plan[:, 0])] if len(plan) else self._no_plan
         return one._replace(input=np.array(one.input), reason=REASONS[one.reason], plan=plan)
 
-    def _decide_alone(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
+    def _decide_alone(
+        self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any
+    ) -> Decision | None:
         """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected."""
         for u, (low, high) in zip(proposed.tolist(), self.test.limits, strict=True):
             if not low <= u <= high:  # neither NaN
@@ -175,13 +177,13 @@ class SafetyFilter(ReadOnlyArrays):
         plan = self.lookahead.beginning_alone(estimate, errors, proposed)
         if plan is not None:
             return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
-        if self.mode != "project" or self.plant.m > 1:
+        if self.mode not in ("project", "lookahead") or self.plant.m > 1:
             return None
         closest = self.test.closest_alone(estimate, errors, proposed.item(), self.projection_margin)
         closest = self._expressible(np.array([closest]))
         test_margin, margin = self.test.margins_alone(estimate, errors, closest)
-        if not test_margin >= MARGIN:  # neither NaN
-            return None
+        if not test_margin >= MARGIN or self.lookahead.may_do_better(estimate, errors, proposed, closest, stored):
+            return None  # also for NaN
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
     @own_error_state  # what is not finite passes no test

@@ -20,6 +20,8 @@ from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, judged_shap
 MOST_REMEMBERED, MOST_NUMBERS = 4096, 10_000_000
 # Entries of an array that are worked on together.
 BLOCK = 1_000_000
+# What a row may exceed its limit by, in units of the box, before no plan is looked for: far more than rounding.
+SLACK = 1e-9
 
 
 class PlanTest:
@@ -48,6 +50,13 @@ class PlanTest:
         self._row_rounding = prediction.rounding[:, None, None] * (np.abs(prediction.rows) @ prediction.sizes[1:])
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
+        effects = prediction.rows @ prediction.forced
+        first, later = effects[..., : plant.m], effects[..., plant.m :]
+        self._by_first = (
+            np.concatenate([prediction.rows @ prediction.powers[1:], first], axis=2).reshape(-1, plant.n + plant.m).T
+        )
+        self._by_others = later @ np.tile(plant.input_middle, prediction.steps - 1) - prediction.middle
+        self._reach_of_others = np.abs(later) @ np.tile(plant.input_half, prediction.steps - 1) + SLACK
         self._most = min(MOST_REMEMBERED, max(1, MOST_NUMBERS // (prediction.steps * len(prediction.rows))))
         # Tightenings, and where among them those of a shape are: both are replaced together and never written into,
         # since threads share them.
@@ -87,6 +96,21 @@ class PlanTest:
         """Returns the same of the cone at some steps."""
         radius = tightening.radius[:, steps] - np.abs(estimates) @ self._end_rounding[:, steps]  # may be far below zero
         return np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
+
+    @own_error_state  # with what is not finite no plan begins
+    def may_begin(self, estimates: np.ndarray, tightening: Tightening, firsts: np.ndarray, shortest: int) -> np.ndarray:
+        """Returns where a plan of at least `shortest` inputs may begin with an input, (E, m); shape (E,).
+
+        Elsewhere none is certified: some row, on the way or at every end, is beyond its limit whatever inputs follow.
+        """
+        count, k = len(estimates), len(self.prediction.plant.box)
+        values = (np.concatenate([estimates, firsts], axis=1) @ self._by_first).reshape(count, *self._by_others.shape)
+        limits = self._row_limits(estimates, tightening, slice(None), slice(None))
+        kept = np.abs(values + self._by_others) <= limits + self._reach_of_others
+        in_box: np.ndarray = np.all(kept[..., :k], axis=2)
+        ends = np.ones_like(in_box) if self.prediction.ends else np.all(kept, axis=2)
+        ends[:, 1:] &= np.logical_and.accumulate(in_box[:, :-1], axis=1)
+        return np.any(ends[:, shortest - 1 :], axis=1)
 
     @own_error_state
     def certified(

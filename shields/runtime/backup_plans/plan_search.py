@@ -87,12 +87,28 @@ class Planner:
 
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns a plan, (j, m), of a single environment, if the first candidates of `beginning_with` are enough."""
-        plans = self._continued(estimate, proposed)
         tightening = self.test.tightenings_of(shape[None])
+        if not self.test.may_begin(estimate[None], tightening, proposed[None], self.enough)[0]:
+            return None
+        plans = self._continued(estimate, proposed)
         certified = self.test.certified(estimate[None], tightening, plans[None], self.enough)[0, :, self.enough - 1 :]
         which = int(certified.any(axis=1).argmax())
         more = int(certified[which].argmax())
         return plans[which, : self.enough + more] if certified[which, more] else None
+
+    def may_do_better(
+        self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray, projected: np.ndarray
+    ) -> bool:
+        """Returns whether `beginning_with` or `find` might find a plan, for one environment that has none stored."""
+        if self.enough > 1 or self.test.prediction.ends:
+            return True
+        x_hat, u = estimate[None], proposed[None]
+        if self.test.may_begin(x_hat, self.test.tightenings_of(shape[None]), u, self.enough)[0]:
+            return True
+        beginnings = np.full((1, 4, 1, len(proposed)), np.nan)
+        beginnings[0, 0, 0] = projected
+        projected_at, *others_at = _distances(self._completed(x_hat, beginnings), u)[0]
+        return min(others_at) < projected_at
 
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray, shortest: int
@@ -103,18 +119,24 @@ class Planner:
         then K, or the saturated regulator. The first candidate that is certified and long enough counts, and is all
         that is looked at; the solver is not asked.
         """
-        tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
-        plans = self._best(estimates, tightening, continued[:, :1], proposed, shortest)
+        tightening, plans = self.test.tightenings_of(shapes), self._none_for(len(estimates))
+        may_begin = self.test.may_begin(estimates, tightening, proposed, shortest)
         for next_of in (
-            lambda some: continued[some, 1:],
+            lambda some: self._continued(estimates[some], proposed[some])[:, :1],
+            lambda some: self._continued(estimates[some], proposed[some])[:, 1:],
             lambda some: self._limited(estimates[some], proposed[some], stored[some]),
         ):
-            left = np.flatnonzero(plans.lengths < self.enough)
+            left = np.flatnonzero(may_begin & (plans.lengths < self.enough))
             if not left.size:
                 break
             found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left], shortest)
             self.improve(plans, left, found)
         return plans
+
+    def _none_for(self, count: int) -> Plans:
+        """Returns that no plan was found for so many environments."""
+        inputs = np.zeros((count, self.horizon, self._plant.m))
+        return Plans(inputs, np.zeros(count, np.int64), np.full(count, np.inf))
 
     def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
         """Returns proposals followed by what is stored for later and then K, or by the saturated regulator."""
@@ -149,12 +171,33 @@ class Planner:
         states and inputs have limits together also the projected input and then K. The solver is asked where none of
         them is certified; where plans end in S also if nothing is stored. Plans that end in P would begin closer by it
         in a single step, but not in a loop (docs/lookahead.md), for three times the time.
-        `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none.
+        `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none. Where
+        there is one and plans end in P, a plan of any length is looked for only if a candidate begins closer.
         """
-        tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
-        candidates = completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
+        begins_closer = np.ones(len(estimates), np.bool_)
+        if self.enough == 1 and not self.test.prediction.ends:
+            firsts = self._completed(estimates, beginnings[:, :, :1])
+            projected_at, *others_at = _distances(firsts, proposed).T
+            begins_closer = np.isnan(projected[:, 0]) | np.any(others_at < projected_at, axis=0)
+        plans, some = self._none_for(len(estimates)), np.flatnonzero(begins_closer)
+        if some.size:
+            known = (each[some] for each in (estimates, shapes, proposed, projected, stored, beginnings))
+            self.improve(plans, some, self._found(*known))
+        return plans
+
+    def _found(
+        self,
+        estimates: np.ndarray,
+        shapes: np.ndarray,
+        proposed: np.ndarray,
+        projected: np.ndarray,
+        stored: np.ndarray,
+        beginnings: np.ndarray,
+    ) -> Plans:
+        """Returns the plans of `find`, of candidates with these beginnings, shape (E, 4, N, m), or of the solver."""
+        tightening, candidates = self.test.tightenings_of(shapes), self._completed(estimates, beginnings)
         # A regulator knows nothing of limits of states and inputs together, K keeps them. Elsewhere plans with K only
         # bring the state closer to the edge, where less can be promised later.
         if self.enough > 1 and len(self._plant.mixed_rows):
@@ -168,6 +211,10 @@ class Planner:
             if left.size:
                 self.improve(plans, left, self._solved(estimates[left], tightening.some(left), proposed[left]))
         return plans
+
+    def _completed(self, estimates: np.ndarray, beginnings: np.ndarray) -> np.ndarray:
+        """Returns the beginnings of `find`, completed by the regulator, K, the regulator and K."""
+        return completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
 
     def improve(self, plans: Plans, chosen: np.ndarray, others: Plans) -> None:
         """Puts other plans of the environments chosen in place where they have a higher rank, or begin closer."""
@@ -197,8 +244,7 @@ class Planner:
             longest = self.horizon - certified[..., ::-1].argmax(axis=-1)
             lengths[short] = np.where(certified.any(axis=-1), longest, 0)
         ranks = self.ranks(lengths)
-        distances = np.sqrt(np.square(plans[:, :, 0] - proposed[:, None]).sum(axis=-1))
-        distances = np.where(lengths > 0, distances, np.inf)
+        distances = np.where(lengths > 0, _distances(plans, proposed), np.inf)
         highest = ranks == ranks.max(axis=1, keepdims=True)
         best, rows = np.where(highest, distances, np.inf).argmin(axis=1), np.arange(len(plans))
         return Plans(*(part[rows, best] for part in (plans, lengths, distances)))
@@ -219,6 +265,11 @@ class Planner:
                 if (np.abs(found[0] - u) <= AS_PROPOSED * self._plant.input_half).all():
                     tried[e, 0, 0] = u
         return self._best(estimates, tightening, tried, proposed)
+
+
+def _distances(plans: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+    """Returns how far plans, (E, P, N, m), begin from the proposed inputs, (E, m): Euclidean, shape (E, P)."""
+    return np.sqrt(np.square(plans[:, :, 0] - proposed[:, None]).sum(axis=-1))
 
 
 class PlanProgram:

@@ -55,6 +55,20 @@ class Lookahead:
         """Returns a plan, (j, m), of a single environment that begins with what is proposed, if one is soon found."""
         return self.planner.beginning_alone(estimate, errors.shape, proposed)
 
+    def may_do_better(
+        self,
+        estimate: np.ndarray,
+        errors: PredictedErrors,
+        proposed: np.ndarray,
+        projected: np.ndarray,
+        stored: Any,
+    ) -> bool:
+        """Returns whether a plan might begin closer than a projected input does, both of a single environment.
+
+        If not, `keep` and `complete` leave the decision of mode "project" as it is.
+        """
+        return bool(np.size(stored)) or self.planner.may_do_better(estimate, errors.shape, proposed, projected)
+
     def keep(
         self, decided: Decision, valid: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
     ) -> None:
