@@ -149,14 +149,15 @@ class Varied:
 
 @dataclass(frozen=True)
 class Gain:
-    """The input gain varies."""
+    """The gain of inputs varies, as deviations from the operating point, where all are at rest."""
 
     values: ClassVar[dict[str, float]] = {"input gain": 1.0}
 
     def family(self, plant: LinearPlant, share: float) -> LinearPlant:
         """Returns the hull of the plants with the smallest and the largest gain."""
         plain = replace(plant, continuous_model=None)
-        return LinearPlant.family([replace(plain, B=factor * plant.B) for factor in (1.0 - share, 1.0 + share)])
+        ends = [replace(plain, B=factor * plant.B) for factor in (1.0 - share, 1.0 + share)]
+        return LinearPlant.family(ends, at_rest=True)
 
 
 _POLE, _MASS = {"pole_mass": 0.1, "length": 0.5}, {"mass": 4000.0}

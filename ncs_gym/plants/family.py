@@ -1,8 +1,9 @@
 """The plant of the middle of a family of plants, with a proved bound on what it leaves out of each of them.
 
-For x in the safe box and u within the limits, what the middle (A, B) leaves out of a member, (A_i - A) x + (B_i - B) u,
-is at most sum_j |[A_i - A, B_i - B]|_j w_j, entry by entry, with w the largest |x_j| and |u_j|. It is linear in the
-member, so a bound for some members is one for their convex hull (docs/shield_proof.md, "Plants that vary").
+For x in the safe box and u within the limits, what the middle (A, B) leaves out of a member, (A_i - A) x + (B_i - B) u
++ s_i, is at most sum_j |[A_i - A, B_i - B]|_j w_j + |s_i|, entry by entry, with w the largest |x_j| and |u_j|, and s_i
+the step of a member that rests elsewhere from the middle of the operating points. It is linear in the member, so a
+bound for some members is one for their convex hull (docs/shield_proof.md, "Plants that vary").
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.plants.limits import in_units_of_range
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.family import Family, entry_name, matrices_of
@@ -36,10 +38,18 @@ GRID = 256
 MOST_PARAMETERS = 6
 # In what members may differ; the plant of the middle has no model in continuous time.
 _OWN = ("A", "B", "continuous_model")
+# What is the same of all members, but was rounded around other operating points, agrees to this, relatively.
+_ROUNDED = ("box", "box_ends", "input_ends", "mixed_rows", "mixed_ends")
+SAME = 1e-9
 
 
 def plant_of_middle(
-    kind: type[P], members: Sequence[P] | Callable[..., P], ranges: Mapping[str, Any] | None, *, monotone: bool
+    kind: type[P],
+    members: Sequence[P] | Callable[..., P],
+    ranges: Mapping[str, Any] | None,
+    *,
+    monotone: bool,
+    at_rest: bool,
 ) -> P:
     """Returns what `LinearPlant.family` does, of plants of this class."""
     if callable(members):
@@ -48,8 +58,16 @@ def plant_of_middle(
         family, plants, basis = _of_plants(kind, members)
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
-    first = plants[0]
+    if _rest_matters(family, plants):
+        if not at_rest:
+            raise ValueError(
+                "the members differ in what acts on an operating point that is not zero: say at_rest=True if each is "
+                "at rest at its own one, as LinearPlant(offset=...) checks of a model in absolute coordinates"
+            )
+        basis += ", each being at rest at its operating point (given)"
+    first = _around_center(plants[0], family.center)
     middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
+    middle[:, -1] = 0.0
     off = np.abs(family.members - middle)
     if family.interval is not None:
         off = np.abs(family.interval - middle).max(axis=0, keepdims=True)
@@ -57,10 +75,66 @@ def plant_of_middle(
     return replace(
         first,
         A=middle[:, : first.n],
-        B=middle[:, first.n :],
+        B=middle[:, first.n : -1],
         continuous_model=None,
+        disturbance_bound=_covering([each.disturbance_bound for each in plants], first),
         remainder=Remainder(bound, True, basis, family),
     )
+
+
+def _rest_matters(family: Family, plants: list[P]) -> bool:
+    """Returns whether members differ in what acts on their operating points."""
+    differs = np.ptp(family.members[..., :-1], axis=0).any(axis=0)
+    return bool(np.any(_resting_points(plants)[:, differs]))
+
+
+def _resting_points(plants: list[P]) -> np.ndarray:
+    """Returns state and input that the deviations of each are counted from, shape (N, n + m)."""
+    return np.array([np.concatenate([each.operating_state, each.operating_input]) for each in plants])
+
+
+def _center_of(plants: list[P]) -> np.ndarray:
+    """Returns state and input in the middle of the operating points, shape (n + m,)."""
+    points = _resting_points(plants)
+    return 0.5 * (points.min(axis=0) + points.max(axis=0))  # exact where all are the same
+
+
+def _around_center(plant: P, center: np.ndarray | None) -> P:
+    """Returns a plant whose limits are those in deviations from another state and input, shape (n + m,)."""
+    assert center is not None
+    moved, n = center - _resting_points([plant])[0], plant.n
+    if not moved.any():
+        return plant
+    box = in_units_of_range(plant.box, *(plant.box_ends - plant.box @ moved[:n]))
+    mixed = in_units_of_range(plant.mixed_rows, *(plant.mixed_ends - plant.mixed_rows @ moved))
+    return replace(
+        plant,
+        operating_state=center[:n],
+        operating_input=center[n:],
+        box=box.rows,
+        box_ends=np.stack([box.low, box.high]),
+        input_ends=plant.input_ends - moved[n:],
+        mixed_rows=mixed.rows,
+        mixed_ends=np.stack([mixed.low, mixed.high]),
+    )
+
+
+def _covering(bounds: list[Ellipsoid | None], plant: LinearPlant) -> Ellipsoid | None:
+    """Returns an ellipsoid around all bounds of the disturbance, the first one if all are the same.
+
+    They differ by the rounding of operating points, which each holds: P_i <= P_0 + diag(row sums of |P_i - P_0|).
+
+    Raises:
+        ValueError: If they differ by more.
+    """
+    shapes = np.array([np.zeros((plant.n, plant.n)) if each is None else each.shape_matrix for each in bounds])
+    if not (off := np.abs(shapes - shapes[0])).any():
+        return bounds[0]
+    widths = np.where(np.isfinite(plant.reach[: plant.n]), plant.reach[: plant.n], 1.0)
+    excess = (off / (widths * widths[:, None])).sum(axis=2).max(axis=0)
+    if excess.max() > SAME**2:
+        raise ValueError("the members of a family may differ in A and B alone, and one has another disturbance_bound")
+    return Ellipsoid(shapes[0] + np.diag((1.0 + ROUNDING) * excess * widths**2))
 
 
 def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:
@@ -71,8 +145,8 @@ def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:
         )
     plants = list(members)
     _require_alike(kind, plants)
-    matrices = np.array([np.concatenate([each.A, each.B], axis=1) for each in plants])
-    family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices)
+    center, matrices = _center_of(plants), _matrices(plants)
+    family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices, center=center)
     return family, plants, f"for the convex hull of {len(plants)} plants"
 
 
@@ -93,16 +167,29 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     corners = [np.array(corner) for corner in itertools.product(*ends)]
     plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
     _require_alike(kind, plants)
-    matrices = np.array([np.concatenate([each.A, each.B], axis=1) for each in plants])
+    matrices = _matrices(plants)
     varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
-    room = ROOM * (varies * np.abs(matrices).max(axis=(0, 2)))[:, None] * np.isfinite(plants[0].reach)
+    room = ROOM * (varies * np.abs(matrices).max(axis=(0, 2)))[:, None]
+    room = room * np.append(np.isfinite(plants[0].reach), matrices[..., -1].any())
     interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
-    parameters = np.array(corners)
-    family = Family(names=names, parameters=parameters, members=matrices, function=function, interval=interval)
+    family = Family(
+        names=names,
+        parameters=np.array(corners),
+        members=matrices,
+        function=function,
+        interval=interval,
+        center=_center_of(plants),
+    )
     checked = _check_monotone(family, room)
     shown_ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(names, ends, strict=True))
     basis = f"for {shown_ranges}, entries of A and B being monotone in each (given, and checked at {checked:,} points)"
     return family, plants, basis
+
+
+def _matrices(plants: list[P]) -> np.ndarray:
+    """Returns [A, B, s] of plants around the middle of their operating points, shape (N, n, n + m + 1)."""
+    shape = plants[0].n, plants[0].n + plants[0].m + 1
+    return np.array([matrices_of(each, shape, _center_of(plants)) for each in plants])
 
 
 def _ends(name: str, value: Any) -> tuple[float, float]:
@@ -115,8 +202,8 @@ def _ends(name: str, value: Any) -> tuple[float, float]:
 
 
 def _require_alike(kind: type[P], plants: list[P]) -> None:
-    """Raises ValueError unless all are plants that differ in A and B alone."""
-    for number, each in enumerate(plants):
+    """Raises ValueError unless all are plants that differ in A and B alone, and in where they rest."""
+    for each in plants:
         if not isinstance(each, kind):
             raise ValueError(f"the members of a family must be of type {kind.__name__}, got {shown(each)}")
         if each.remainder is not None:
@@ -125,22 +212,29 @@ def _require_alike(kind: type[P], plants: list[P]) -> None:
             )
         if each.between_samples is not None:
             raise ValueError("between_samples is not proved for a family: give its members without it")
+        matrices_of(each, (plants[0].n, plants[0].n + plants[0].m + 1), np.zeros(each.n + each.m))
+    center = _center_of(plants)
+    first, *others = (_around_center(each, center) for each in plants)
+    for number, each in enumerate(others, 1):
         for entry in fields(each):
-            one, other = getattr(plants[0], entry.name), getattr(each, entry.name)
-            if entry.name not in _OWN and not _is_same(one, other):
+            one, other = getattr(first, entry.name), getattr(each, entry.name)
+            tolerance = SAME if entry.name in _ROUNDED else 0.0
+            if entry.name not in (*_OWN, "disturbance_bound") and not _is_same(one, other, tolerance):
                 raise ValueError(
                     f"the members of a family may differ in A and B alone, and member {number} has another {entry.name}"
                 )
-        matrices_of(each, (plants[0].n, plants[0].n + plants[0].m))
+    _covering([each.disturbance_bound for each in plants], first)
 
 
-def _is_same(one: Any, other: Any) -> bool:
+def _is_same(one: Any, other: Any, tolerance: float) -> bool:
     one, other = (each.shape_matrix if isinstance(each, Ellipsoid) else each for each in (one, other))
+    if tolerance:
+        return one.shape == other.shape and np.allclose(one, other, rtol=tolerance, atol=0.0)
     return bool(np.array_equal(one, other))
 
 
 def _check_monotone(family: Family, room: np.ndarray) -> int:
-    """Checks on a grid that entries are monotone up to `room`, shape (n, n + m); returns its number of points.
+    """Checks on a grid that entries are monotone up to `room`, shape (n, n + m + 1); returns its number of points.
 
     Raises:
         ValueError: If an entry is not, with its name and that of the parameter.
@@ -166,12 +260,12 @@ def _largest(plant: LinearPlant, off: np.ndarray) -> np.ndarray:
 
     Args:
         plant: A member.
-        off: How far entries of [A, B] are from the middle, shape (N, n, n + m).
+        off: How far entries of [A, B, s] are from the middle, shape (N, n, n + m + 1).
 
     Raises:
         ValueError: If members differ in what an unlimited state does.
     """
-    reach, differs = plant.reach, off.any(axis=(0, 1))
+    reach, differs = np.append(plant.reach, 1.0), off.any(axis=(0, 1))
     if free := np.flatnonzero(differs & np.isinf(reach)).tolist():
         raise ValueError(
             f"the members differ in what {plant.state_names[free[0]]} does, which no row of the box with two ends "

@@ -164,7 +164,7 @@ class Rows(NamedTuple):
     high: np.ndarray
 
 
-def _in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Rows:
+def in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Rows:
     """Returns those of rows, (k, n), with ends in their own units that have any finite end."""
     limited = np.isfinite(low) | np.isfinite(high)
     rows, low, high = rows[limited], low[limited], high[limited]
@@ -177,7 +177,7 @@ def _in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> R
 
 
 def _state_rows(limits: Any, center: np.ndarray) -> Rows:
-    return _in_units_of_range(np.eye(len(center)), *_from_center(limits, center, "state_limits"))
+    return in_units_of_range(np.eye(len(center)), *_from_center(limits, center, "state_limits"))
 
 
 def _output_rows(outputs: Any, center: np.ndarray) -> Rows:
@@ -193,7 +193,7 @@ def _output_rows(outputs: Any, center: np.ndarray) -> Rows:
         if np.abs(row).max() < SMALLEST_NUMBER:
             raise ValueError(f"every row of output_limits must limit something, got {shown(row.tolist())}")
         ends = _from_center((low, high), np.array([row @ center]), "the ends in output_limits")
-        found.append(_in_units_of_range(row[None], *ends))
+        found.append(in_units_of_range(row[None], *ends))
     return _joined(found)
 
 
@@ -219,7 +219,7 @@ def _mixed_rows(given: Any, state: np.ndarray, applied: np.ndarray) -> Rows:
                 "those of states alone"
             )
         ends = _from_center((low, high), np.array([row @ np.concatenate([state, applied])]), "the ends in mixed_limits")
-        found.append(_in_units_of_range(row[None], *ends))
+        found.append(in_units_of_range(row[None], *ends))
     return _joined(found)
 
 
@@ -340,7 +340,7 @@ def _residual_of_equilibrium(
     terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)
     if (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
         return missing
-    remedy = "leave out offset if the model is one of deviations from the operating point"
+    remedy = "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
     rest = np.eye(len(A)) - A
     if np.linalg.cond(rest) < 1e9:
         equilibrium = np.linalg.solve(rest, B @ applied + offset).tolist()

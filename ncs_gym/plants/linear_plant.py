@@ -352,6 +352,7 @@ class LinearPlant(LimitValues, HardBounds):
         ranges: Mapping[str, tuple[float, float]] | None = None,
         *,
         monotone: bool = False,
+        at_rest: bool = False,
     ) -> Self:
         """Returns the plant of the middle of a family, with a proved bound on what it leaves out of any member.
 
@@ -359,18 +360,23 @@ class LinearPlant(LimitValues, HardBounds):
         that vary"). An environment draws a member for every episode; what the bound allows is not drawn beside.
 
         Args:
-            members: Two plants or more that differ in A and B alone, whose convex hull is covered: the vertices. Or a
-                function of parameters given by name that returns such plants.
+            members: Two plants or more that differ in A and B alone, and in where they rest, whose convex hull is
+                covered: the vertices. Or a function of parameters given by name that returns such plants. Deviations
+                of the middle are counted from the middle of their operating points.
             ranges: Lowest and highest value of each parameter of the function, up to 6 of them.
             monotone: Whether every entry of A and B is monotone in each parameter while the others stay, anywhere in
                 the ranges. That is yours to prove; it bounds the entries by those of the corners, and is checked on a
-                grid. Needed for a function.
+                grid. Needed for a function. Where members rest at different points, it is also about A x + B u + c - x
+                at the middle of these.
+            at_rest: Whether every member is at rest at its own operating point, with c as `offset` in absolute
+                coordinates: A x + B u + c = x. Needed where members differ in what acts on operating points that are
+                not zero; a model of deviations does not say it.
 
         Raises:
             ValueError: If members differ in anything else, are proved between samples or have a remainder, a claim of
                 monotone entries is contradicted or missing, a state that matters has no limit, or an argument is wrong.
         """
-        return plant_of_middle(cls, members, ranges, monotone=monotone)
+        return plant_of_middle(cls, members, ranges, monotone=monotone, at_rest=at_rest)
 
     @own_error_state
     def resampled(self, dt: float) -> LinearPlant:

@@ -154,7 +154,7 @@ class _Members(Process):
     def __init__(self, plant: LinearPlant, family: Family, size: int | None) -> None:
         self._family, self._size = family, size
         count = 1 if size is None else size
-        self._matrices = np.tile(np.concatenate([plant.A, plant.B], axis=1), (count, 1, 1))
+        self._matrices = np.tile(np.column_stack([plant.A, plant.B, np.zeros(plant.n)]), (count, 1, 1))
         self._parameters = np.full((count, len(family.names)), np.nan)
 
     @property
@@ -175,8 +175,8 @@ class _Members(Process):
             self._parameters[e] = drawn
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns A_i x + B_i u."""
-        joint = np.concatenate([state, u])
+        """Returns A_i x + B_i u + s_i."""
+        joint = np.concatenate([state, u, np.ones((1, *state.shape[1:]))])
         if self._size is None:
             return self._matrices[0].dot(joint)
         return np.einsum("eij,je->ie", self._matrices, joint)

@@ -1,4 +1,4 @@
-"""The members of a family of plants that differ in A and B, of which each episode has one."""
+"""The members of a family of plants that differ in A and B and in where they rest, of which each episode has one."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_numbers, read_only, shown
 
 if TYPE_CHECKING:
@@ -17,16 +18,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Family(ReadOnlyArrays):
-    """Plants x+ = A_i x + B_i u + d, told apart by parameters (`LinearPlant.family`).
+    """Plants x+ = A_i x + B_i u + s_i + d, told apart by parameters (`LinearPlant.family`).
+
+    All are in deviations from one point; s_i is the step of a member there, which is at rest at another one.
 
     Attributes:
         names: Names of the parameters; "member", which counts from 0, for plants without any.
         parameters: Their values for the members that are listed, shape (N, k): plants, or the corners of a function.
-        members: [A_i, B_i] of these, shape (N, n, n + m).
+        members: [A_i, B_i, s_i] of these, shape (N, n, n + m + 1).
         function: Returns the plant of parameters between those listed; None if there are no others. No file holds it:
             a family that was read from one is that of the members listed.
-        interval: The low and the high entries of [A, B] of all that the function returns, shape (2, n, n + m); None
-            without one.
+        interval: The low and the high entries of [A, B, s] of all that the function returns, shape (2, n, n + m + 1);
+            None without one.
+        center: State and input that deviations are counted from, shape (n + m,); None is zero.
 
     Raises:
         ValueError: If a shape is wrong.
@@ -37,11 +41,14 @@ class Family(ReadOnlyArrays):
     members: np.ndarray
     function: Callable[..., LinearPlant] | None = None
     interval: np.ndarray | None = None
+    center: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         members = as_numbers(self.members)
         if members is None or members.ndim != 3 or not len(members) or not np.isfinite(members).all():
-            raise ValueError(f"the members of a family must be finite with shape (N, n, n + m), got {shown(members)}")
+            raise ValueError(
+                f"the members of a family must be finite with shape (N, n, n + m + 1), got {shown(members)}"
+            )
         parameters = as_matrix(self.parameters, (len(members), None), "the parameters of a family")
         default = tuple(f"p{number + 1}" for number in range(parameters.shape[1]))
         object.__setattr__(self, "names", as_names(self.names, default, "the names of parameters"))
@@ -99,7 +106,7 @@ class Family(ReadOnlyArrays):
         return np.where(np.isnan(fixed), rng.uniform(*self.ranges), fixed)
 
     def member(self, parameters: np.ndarray) -> np.ndarray:
-        """Returns [A, B] of the member with these parameters, shape (n, n + m).
+        """Returns [A, B, s] of the member with these parameters, shape (n, n + m + 1).
 
         Raises:
             ValueError: If the function returns something else, or within the ranges what contradicts the interval.
@@ -118,10 +125,10 @@ class Family(ReadOnlyArrays):
         return matrices
 
     def of_function(self, parameters: np.ndarray) -> np.ndarray:
-        """Returns [A, B] of the plant that the function returns, shape (n, n + m), whatever it is."""
+        """Returns [A, B, s] of the plant that the function returns, shape (n, n + m + 1), whatever it is."""
         assert self.function is not None
-        plant = self.function(**dict(zip(self.names, parameters.tolist(), strict=True)))
-        return matrices_of(plant, self.members.shape[1:])
+        plant, shape = self.function(**dict(zip(self.names, parameters.tolist(), strict=True))), self.members.shape[1:]
+        return matrices_of(plant, shape, np.zeros(shape[1] - 1) if self.center is None else self.center)
 
     def _fitting(self, fixed: np.ndarray) -> np.ndarray:
         """Returns the indices of the members listed that have these parameters, NaN fitting all."""
@@ -133,8 +140,10 @@ class Family(ReadOnlyArrays):
         return rows
 
 
-def matrices_of(plant: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns [A, B] of a plant, of a given shape.
+def matrices_of(plant: Any, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:
+    """Returns [A, B, s] of a plant in deviations from a state and input, (n + m,), where its step is s.
+
+    It is at rest at its own operating point (x_i, u_i): s = (A - I)(x - x_i) + B (u - u_i), rounded once.
 
     Raises:
         ValueError: If it is no plant, or of another shape.
@@ -142,13 +151,21 @@ def matrices_of(plant: Any, shape: tuple[int, ...]) -> np.ndarray:
     A, B = getattr(plant, "A", None), getattr(plant, "B", None)
     if not isinstance(A, np.ndarray) or not isinstance(B, np.ndarray):
         raise ValueError(f"the function of a family must return a LinearPlant, got {shown(plant)}")
-    matrices = np.concatenate([A, B], axis=1)
-    if matrices.shape != shape:
-        raise ValueError(f"the plants of a family must have [A, B] of the same shape {shape}, got {matrices.shape}")
-    return matrices
+    n, m = B.shape
+    if (n, n + m + 1) != shape:
+        wanted = (shape[0], shape[1] - 1)
+        raise ValueError(f"the plants of a family must have [A, B] of the same shape {wanted}, got {(n, n + m)}")
+    moved = center - np.concatenate([plant.operating_state, plant.operating_input])
+    step = exact.product(np.hstack([A, B, -np.eye(n)]), np.concatenate([moved, moved[:n]]))
+    return np.column_stack([A, B, step])
 
 
 def entry_name(chosen: np.ndarray) -> str:
-    """Returns what the first entry of [A, B] that is chosen, shape (n, n + m), is called: A[0, 1] or B[0, 0]."""
+    """Returns what the first entry of [A, B, s] that is chosen, shape (n, n + m + 1), is called.
+
+    A[0, 1] or B[0, 0]; of s, what it is.
+    """
     (row, column), n = np.argwhere(chosen)[0].tolist(), len(chosen)
+    if column == chosen.shape[1] - 1:
+        return f"state {row + 1} of the step from the middle of the operating points"
     return f"A[{row}, {column}]" if column < n else f"B[{row}, {column - n}]"

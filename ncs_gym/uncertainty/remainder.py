@@ -59,10 +59,10 @@ class Remainder:
         Raises:
             ValueError: If it belongs to another model, or the members of its family are of another size.
         """
-        size = len(model["A"]), len(model["A"]) + model["B"].shape[1]
+        size = len(model["A"]), len(model["A"]) + model["B"].shape[1] + 1
         if self.family is not None and self.family.members.shape[1:] != size:
             raise ValueError(
-                f"the members of the family must be [A, B] of shape {size}, got {self.family.members.shape[1:]}"
+                f"the members of the family must be [A, B, s] of shape {size}, got {self.family.members.shape[1:]}"
             )
         if self._model is not None:
             others = [name for name, value in model.items() if not np.array_equal(value, self._model[name])]

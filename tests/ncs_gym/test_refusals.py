@@ -415,7 +415,7 @@ PLANTS = [
             {"operating_state": [19.0], "offset": [0.0]},
             r"no equilibrium: .* not zero; with this input the equilibrium is \[20.0",
         ),
-        ({"A": [[1.0]], "offset": [0.0]}, "no equilibrium: .* leave out offset if the model is one of deviations"),
+        ({"A": [[1.0]], "offset": [0.0]}, "no equilibrium: .* leave out offset, which is c of a step, if the model"),
         ({"offset": [1.0]}, r"the equilibrium is \[30"),
         ({"state_limits": (20.0, 25.0)}, r"state_limits must have the operating point \[20.0\] strictly between"),
         ({"input_limits": (0.0, 9.0)}, "input_limits must have the operating point"),

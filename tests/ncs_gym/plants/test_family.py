@@ -44,7 +44,10 @@ def largest_gauge(plant, members, widths):
     """The largest r' R^-1 r of r = ([A_i, B_i] - [A, B]) z over members and the corners z of box and limits: exact.
 
     It is convex in z and in the member, so that no point of box x limits and of the members' hull has a larger one.
+    Members rest where the middle does.
     """
+    assert all(not member[:, len(widths) :].any() for member in members)
+    members = [member[:, : len(widths)] for member in members]
     middle, P = exact(np.hstack([plant.A, plant.B])), exact(plant.remainder.bound.shape_matrix)
     largest = Fraction(0)
     for member in members:
@@ -197,7 +200,79 @@ def test_copies_and_pickles_are_read_only_and_keep_the_function():
 def test_members_are_those_of_the_continuous_model():
     for mass in (3800.0, 3931.7, 4200.0):
         model = np.array([[0.0, 1.0, 0.0], [-4500.0 / mass, -4600.0 / mass, 1.0], [0.0, 0.0, 0.0]])
-        np.testing.assert_allclose(TRUCK.remainder.family.member(np.array([mass])), expm(0.5 * model)[:2], rtol=1e-12)
+        member = TRUCK.remainder.family.member(np.array([mass]))
+        np.testing.assert_allclose(member[:, :3], expm(0.5 * model)[:2], rtol=1e-12)
+        assert not member[:, 3].any()
+
+
+def tank(k, delay=0, level=None, **more):
+    """h' = 0.5 q - k h, in absolute coordinates, at rest at 0.4 / k with q = 0.8; q may act later."""
+    settings = {"state_limits": ([1.5], [2.5]), "input_limits": (0.0, 2.0), "input_delay": delay or None}
+    settings |= {"operating_state": [0.4 / k if level is None else level], "operating_input": [0.8]}
+    decay = np.exp(-0.5 * k)
+    model = ([[decay]], [[0.5 * (1.0 - decay) / k]], np.eye(1), np.zeros((1, 1)), 0.5)
+    return LinearPlant.from_statespace(model, **settings | QUIET | more)
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("kind", ["function", "plants"])
+def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay):
+    def of(k):
+        return tank(k, delay, offset=[0.0])
+
+    values = (0.19, 0.2, 0.21)
+    given = (of, {"k": (0.19, 0.21)}) if kind == "function" else ([of(k) for k in values],)
+    plant = LinearPlant.family(*given, monotone=kind == "function", at_rest=True)
+    assert "at rest at its operating point (given)" in plant.remainder.sentence
+    np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [0.0, 2.0], atol=1e-15)
+    np.testing.assert_allclose(plant.operating_state[0] + plant.box_ends[:, 0] / plant.box[0, 0], [1.5, 2.5])
+    size, largest = np.sqrt(plant.remainder.bound.shape_matrix[0, 0]), 0.0
+    for k in (*values, *np.linspace(0.19, 0.21, 7)):
+        decay = np.exp(-0.5 * k)
+        for level, acts, decided in itertools.product((1.5, 2.5), (0.0, 2.0), (0.0, 2.0)):
+            acts = acts if delay else decided
+            truth = [decay * level + 0.5 * (1.0 - decay) / k * acts, *[decided] * delay]
+            model = plant.A @ plant.to_deviation([level, *[acts] * delay])
+            model = model + plant.B @ plant.to_deviation([decided], "input")
+            left_out = plant.to_deviation(truth) - model
+            np.testing.assert_allclose(left_out[1:], 0.0, atol=1e-15)
+            largest = max(largest, abs(left_out[0]))
+    assert 0.5 * size < largest <= size
+    env = NCSEnv(plant, initial_set=Ellipsoid(1e-6 * np.eye(plant.n)))
+    for k in (0.19, 0.21):
+        parameters = {"k": k} if kind == "function" else {"member": values.index(k)}
+        info = env.reset(seed=0, options={"parameters": parameters})[1]
+        for _ in range(60):
+            rests = plant.to_deviation([0.8], "input")
+            info = env.step((rests - plant.input_middle) / plant.input_half)[-1]
+        np.testing.assert_allclose(plant.from_deviation(info["state"])[0], 0.4 / k, atol=2e-3)
+
+
+def test_members_are_at_rest_where_somebody_says_so():
+    def at_two(k):
+        return tank(k, level=2.0)
+
+    ranges, sentence = {"k": (0.19, 0.21)}, "say at_rest=True if each is at rest"
+    for members in ((at_two, ranges), ([at_two(0.19), at_two(0.21)],)):
+        with pytest.raises(ValueError, match=sentence):
+            LinearPlant.family(*members, monotone=len(members) > 1)
+    stays = LinearPlant.family(at_two, ranges, monotone=True, at_rest=True)
+    assert not stays.remainder.family.members[..., -1].any()
+    assert stays.operating_state == 2.0
+    # What differs acts on a state that rests at zero.
+    one, other = (np.array([[entry, 0.1], [0.0, 0.8]]) for entry in (0.8, 0.9))
+    limits = {"box": None, "state_limits": ([-1.0, 0.0], [1.0, 2.0]), "operating_state": [0.0, 1.0]}
+    plant = LinearPlant.family([LinearPlant(**SMALL | limits | {"A": each}) for each in (one, other)])
+    assert "given" not in plant.remainder.sentence
+
+
+def test_two_ended_disturbances_move_each_member():
+    def pushed(k):
+        return tank(k, disturbance_bound=([[1.0]], [-0.01], [0.03]))
+
+    plant = LinearPlant.family(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    assert plant.remainder.family.members[..., -1].all()
+    np.testing.assert_allclose(np.sqrt(plant.disturbance_bound.shape_matrix), 0.02, rtol=1e-9)
 
 
 def bent(mass):
@@ -256,10 +331,10 @@ REFUSED = {
                 HULL.remainder.bound,
                 True,
                 "an example",
-                Family(names=["a"], parameters=[[0.0]], members=np.zeros((1, 3, 4))),
+                Family(names=["a"], parameters=[[0.0]], members=np.zeros((1, 3, 5))),
             ),
         ),
-        r"of shape \(2, 3\)",
+        r"of shape \(2, 4\)",
     ),
 }
 

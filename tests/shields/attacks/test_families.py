@@ -11,9 +11,9 @@ from scipy.linalg import expm
 
 from experiments.attack.attack_cases import plant_cases
 from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
-from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSVectorEnv, Remainder
+from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSVectorEnv, Packet, Remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
-from shields import VectorSafetyShield, verify
+from shields import SafeLoop, VectorSafetyShield, verify
 from tests.certificates import certificate_of
 from tests.second_verifier.verify import verify_again
 from tests.shields.attacks.cases import varying_cart_pole, varying_truck
@@ -178,6 +178,37 @@ def test_members_keep_limits_of_every_kind(kind, count, steps):
     assert held == count * steps
     assert near > -0.5  # the shield is what keeps them away
     assert overridden > 0.1 * held
+
+
+def tank(k):
+    """A level with h' = 0.5 q - k h, in absolute coordinates, around where it rests with q = 0.8."""
+    decay = np.exp(-0.5 * k)
+    model = ([[decay]], [[0.5 * (1.0 - decay) / k]], [[1.0]], [[0.0]], 0.5)
+    settings = {"state_limits": ([1.5], [2.5]), "input_limits": (0.0, 2.0), "offset": [0.0]}
+    rests = {"operating_state": [0.4 / k], "operating_input": [0.8]}
+    bounds = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.02}
+    return LinearPlant.from_statespace(model, **settings, **rests, **bounds)
+
+
+@pytest.mark.parametrize("every", [1, 10])
+@pytest.mark.parametrize("outward", [-1.0, 1.0])
+@pytest.mark.parametrize("k", [0.19, 0.2, 0.21])
+def test_a_tank_that_rests_elsewhere_keeps_its_levels(k, outward, every):
+    plant = LinearPlant.family(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    loop = SafeLoop(certificate_of(plant, None, "polytope"), plant, Channel(delay=1), on_unproved="ignore")
+    level, arrived, reached = 2.0, [], 0.0
+    loop.start(plant.to_deviation([level + 0.02 * outward]))
+    for step in range(150):
+        loop.receive(arrived)
+        pushed = plant.to_deviation([1.0 + outward], "input")
+        q = plant.from_deviation(loop.decide(pushed).input, "input")[0]
+        assert loop.guaranteed
+        assert 1.5 <= level <= 2.5
+        reached = max(reached, abs(level - 2.0))
+        measured = plant.to_deviation([level - 0.02 * outward], "output")
+        arrived = [Packet(step, measured, loop.episode)] if step % every == 0 else []
+        level = level * np.exp(-0.5 * k) + q * 0.5 * (1.0 - np.exp(-0.5 * k)) / k + 0.01 * outward
+    assert reached > 0.3
 
 
 def test_the_cases_of_a_file_move_the_members_that_it_holds(tmp_path):
