@@ -13,7 +13,6 @@ from agents.evaluation import evaluate
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, with_gain
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
-from ncs_gym.registration import EPISODE_STEPS
 
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
@@ -131,12 +130,12 @@ class DualAscentCallback(BaseCallback):
     Args:
         settings: Limit and learning rate.
         priced: The environment's penalty, which is set.
+        episode_steps: Steps of an episode of full length, as `LoopConfig.episode_steps` says.
     """
 
-    def __init__(self, settings: LagrangianSettings, priced: CostPenalty) -> None:
+    def __init__(self, settings: LagrangianSettings, priced: CostPenalty, episode_steps: int) -> None:
         super().__init__()
-        self._settings, self._priced = settings, priced
-        self._episode_steps = getattr(priced.unwrapped, "max_episode_steps", None) or EPISODE_STEPS
+        self._settings, self._priced, self._episode_steps = settings, priced, episode_steps
         self._cost, self._steps = 0.0, 0
 
     def _on_step(self) -> bool:

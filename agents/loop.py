@@ -88,7 +88,7 @@ class LoopConfig:
 
     Raises:
         ValueError: If the shield is something else than its settings, another filter is given beside it, the id is
-            not registered, or a penalty or gain is wrong.
+            not registered, a penalty or gain is wrong, or `lagrangian` limits the cost of episodes without an end.
     """
 
     env: str
@@ -118,6 +118,11 @@ class LoopConfig:
             object.__setattr__(self, "residual_gain", as_matrix(self.residual_gain, (None, None), "residual_gain"))
         given = {name: value for name, value in self.kwargs.items() if value is not None}
         object.__setattr__(self, "kwargs", given)
+        if self.lagrangian is not None and self.episode_steps is None:
+            raise ValueError(
+                f"lagrangian limits the cost of an episode, and {self.env} has no max_episode_steps: register it with "
+                'some, or give kwargs={"max_episode_steps": ...}'
+            )
 
     def with_kwargs(self, **changes: Any) -> LoopConfig:
         """Returns the same loop with other keyword arguments of the environment; None goes back to the id's own."""
@@ -127,6 +132,12 @@ class LoopConfig:
     def channel(self) -> Channel | None:
         """Channel that replaces the one of the id; None where the id's own is kept."""
         return from_json(self.kwargs.get("channel"), (Channel,), "channel")
+
+    @property
+    def episode_steps(self) -> int | None:
+        """Steps after which an episode is truncated; None for never."""
+        steps = self.kwargs.get("max_episode_steps", gym.spec(self.env).max_episode_steps)
+        return steps if steps is not None and steps > 0 else None  # -1 asks `gym.make` for no end
 
     @property
     def without_penalties(self) -> LoopConfig:

@@ -98,10 +98,11 @@ def train(
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     beside: list[BaseCallback] = []
     priced = envs if loop.lagrangian is not None and isinstance(envs, CostPenalty) else None
-    if loop.lagrangian is not None and priced is not None:
+    if loop.lagrangian is not None and priced is not None and (episode_steps := loop.episode_steps) is not None:
         if history and not isnan(history[-1].multiplier):
             priced.penalty = history[-1].multiplier
-        beside.append(DualAscentCallback(loop.lagrangian, priced))  # before the totals, which hold the next price
+        # Before the totals, which hold the next price.
+        beside.append(DualAscentCallback(loop.lagrangian, priced, episode_steps))
     callback = SafetyCallback(on_progress, history, priced)
     beside.append(callback)
     if log_folder:

@@ -74,7 +74,7 @@ def arm_summaries(episodes: pd.DataFrame, mode: str) -> dict[str, dict[str, Any]
     """Returns what `arm_summary` says of every arm, by its name and in the order of the rows."""
     arms = {str(name): (Arm.of(str(name), mode), rows) for name, rows in episodes.groupby("arm", sort=False)}
     return {
-        name: arm_summary(rows, arm.mode, fixed_policy=arm.policy not in ("trained", "untrained"))
+        name: arm_summary(rows, arm.mode, fixed_policy=not arm.differs_from_run_to_run)
         for name, (arm, rows) in arms.items()
     }
 
@@ -152,27 +152,32 @@ def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
 
 
 def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
-    """Returns the differences between each other arm and the baseline in the runs with equal index, JSON values.
+    """Returns the differences between each other arm and the baseline, JSON values.
 
-    They are the differences of the mean returns, with Student's and the bootstrap's interval over the runs, and of the
-    numbers of violating episodes.
+    They are the mean differences of returns in episodes with the same numbers, with Student's and the bootstrap's
+    interval over the runs, or over the episodes where both policies are the same in all runs (`return_ci95_over`), and
+    the differences of the numbers of violating episodes.
     """
     as_trained = episodes[episodes["condition"] == AS_TRAINED]
-    runs = as_trained.groupby(["run", "arm"]).agg(mean=("episode_return", "mean"), violating=("violating", "sum"))
-    returns, violating = (
-        runs[name].unstack().pipe(lambda wide: wide.sub(wide[baseline], axis=0)) for name in ("mean", "violating")
-    )
-    return {
-        name: {
-            "return_mean": float(returns[name].mean()),
-            "return_ci95": mean_interval(returns[name].to_numpy()),
-            "return_bootstrap_ci95": bootstrap_interval(returns[name].to_numpy()),
-            "violating_episodes": int(violating[name].sum()),
-            "violating_episodes_by_run": violating[name].astype(int).tolist(),
+    differences = {}
+    for name in episodes["arm"].unique():
+        if name == baseline:
+            continue
+        both = as_trained[as_trained["arm"].isin([baseline, name])]
+        over_runs = any(Arm.of(each).differs_from_run_to_run for each in (baseline, name))
+        pairs = both.groupby([*(["run"] if over_runs else ["run", "index"]), "arm"])["episode_return"].mean().unstack()
+        returns = (pairs[name] - pairs[baseline]).to_numpy()
+        counts = both.groupby(["run", "arm"])["violating"].sum().unstack()
+        violating = (counts[name] - counts[baseline]).astype(int)
+        differences[name] = {
+            "return_mean": float(returns.mean()),
+            "return_ci95": mean_interval(returns),
+            "return_bootstrap_ci95": bootstrap_interval(returns),
+            "return_ci95_over": "runs" if over_runs else "episodes",
+            "violating_episodes": int(violating.sum()),
+            "violating_episodes_by_run": violating.tolist(),
         }
-        for name in episodes["arm"].unique()
-        if name != baseline
-    }
+    return differences
 
 
 def covered_fraction(summary: dict[str, Any]) -> float | None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import sqrt
 from typing import Any
 
-import gymnasium as gym
 import pandas as pd
 
 from agents.agent_file import has_pretrained
@@ -156,7 +156,7 @@ def gaussian_noise_of(loop: LoopConfig, certificate: Certificate, arms: Mapping[
     set on purpose and is not listed.
     """
     env = ncs_env(loop.single())
-    steps = gym.spec(loop.env).max_episode_steps or 1
+    steps = loop.episode_steps or 1
     downlink = env.downlink_protocol
     known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, downlink.input_delay)
     begins_inside = downlink.contract is not None and all(each.in_safe_set for each in known)
@@ -185,7 +185,7 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings.append(
             f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes; the "
-            f"true state came to {arm['largest_level']:.3f} times the safe set{leaves}."
+            f"true state came to {sqrt(arm['largest_level']):.3f} times the safe set{leaves}."
         )
     paired = summary["paired_differences"]
     for name, difference in paired["arms"].items():

@@ -70,8 +70,9 @@ def sweep(settings: SweepSettings) -> None:
             for i, point in enumerate(points)
         ]
         arms = [arm_summaries(part, settings.mode) for part in parts]
+        losses = [{"mean_loss": ncs_env(loop.single()).channel.mean_loss} for loop in loops]
         summary = {
-            "cells": [point | {"arms": each} for point, each in zip(points, arms, strict=True)]
+            "cells": [point | lost | {"arms": each} for point, lost, each in zip(points, losses, arms, strict=True)]
         } | experiment_provenance(settings, loops[0], certificates[0], runs)
         figures = sweep_figures(summary, settings.arms)
         certificates[0].save(settings.out / "certificate.json")

@@ -66,12 +66,8 @@ def comparison_figures(
 
 def scatter_figure(summary: dict[str, dict[str, Any]]) -> CaptionedFigure:
     """Returns mean return against violating episodes of every arm, from the summaries of the arms."""
-    runs = max(arm["runs"] for arm in summary.values())
-    means = f"Small dots are runs, markers the mean of {runs} of them; vertical bars are Student's 95 % interval of"
-    means += " the mean return over runs,"
     caption = (
-        "Cost and return in evaluation, better to the upper left. "
-        f"{means if runs > 1 else 'A marker is one run, so the return has no interval;'}"
+        f"Cost and return in evaluation, better to the upper left. {_vertical_bars(summary)}"
         " horizontal bars Clopper and Pearson's 95 % interval of violating episodes given the trained"
         " agents. Markers differ in size only to show where they coincide. Violations are those of the true state,"
         " returns the environment's own, without penalties. Episodes that end early sum fewer steps."
@@ -96,6 +92,22 @@ def scatter_figure(summary: dict[str, dict[str, Any]]) -> CaptionedFigure:
         axis.yaxis.set_major_formatter(thousands)
         legend_below(figure, handles)
         return figure
+
+
+def _vertical_bars(summary: dict[str, dict[str, Any]]) -> str:
+    """Returns what markers and their vertical bars are, given the summaries of arms, as the beginning of a sentence."""
+    runs, over = (
+        max(arm["runs"] for arm in summary.values()),
+        {arm["eval_return_ci95_over"] for arm in summary.values()},
+    )
+    text = f"Small dots are runs, markers the mean of {runs} of them; " if runs > 1 else "A marker is one run; "
+    if over == {"episodes"}:
+        return text + "vertical bars are Student's 95 % interval of the mean return over episodes,"
+    if runs == 1:
+        fixed = " that of a policy without training Student's 95 % interval over episodes;" if len(over) > 1 else ""
+        return f"{text}the return of an agent has no interval,{fixed}"
+    fixed = " (of policies without training, over episodes)" if len(over) > 1 else ""
+    return f"{text}vertical bars are Student's 95 % interval of the mean return over runs{fixed},"
 
 
 def training_figure(arms: ResultsByArm) -> CaptionedFigure:

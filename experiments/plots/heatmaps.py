@@ -14,6 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import Rectangle
 
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands
+from experiments.report.text_tables import losses_text
 from experiments.runs.arms import Arm
 
 # What the axes of a panel do not show; see `_other`.
@@ -93,6 +94,9 @@ def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Q
     caption = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
     if quantity.of_shields and "monitor" in arms:
         caption += " The monitor's are what the shield would have overridden."
+    if len(others) == 1 and cells[0]["burst_length"]:
+        caption += f" Losses come in bursts of {cells[0]['burst_length']:g} packets on average."
+    caption = " ".join(filter(None, (caption, losses_text(cells))))
     across = -(-len(arms) // -(-len(arms) // _COLUMNS))
     sides: tuple[_Side, _Side] = (_SIDE_LABELS[side], values), ("loss probability", losses)
     return _maps(panels, *sides, quantity.title, quantity.colors, norm, across, caption)[0]

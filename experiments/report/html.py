@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.json_values import flat
 from experiments.plots.figure_style import ArmStyle
+from experiments.report.text_tables import losses_text
 from experiments.runs.arms import Arm
 from shields import Report
 
@@ -29,13 +30,23 @@ def comparison_report(summary: dict[str, Any], verification: Report, figures: Fi
     """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline."""
     runs, title = max(arm["runs"] for arm in summary["arms"].values()), f"Safe learning on {summary['settings']['env']}"
     context = _origin("compare", summary, verification)
-    return render_page("comparison.html.j2", figures, title=title, runs=runs, findings=findings, **context)
+    trains = _trains([summary["arms"] | summary["references"]])
+    return render_page(
+        "comparison.html.j2", figures, title=title, runs=runs, trains=trains, findings=findings, **context
+    )
 
 
 def sweep_report(summary: dict[str, Any], verification: Report, figures: Figures) -> str:
     """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings."""
     title, context = f"Channels of {summary['settings']['env']}", _origin("sweep", summary, verification)
-    return render_page("sweep.html.j2", figures, title=title, **context)
+    cells = summary["cells"]
+    trains, losses = _trains([cell["arms"] for cell in cells]), losses_text(cells)
+    return render_page("sweep.html.j2", figures, title=title, trains=trains, losses=losses, **context)
+
+
+def _trains(groups: Sequence[Mapping[str, dict[str, Any]]]) -> bool:
+    """Returns whether anything was trained, given the summaries of arms by name."""
+    return any(arm["train_steps"] for arms in groups for arm in arms.values())
 
 
 def render_page(template: str, figures: Figures, **context: Any) -> str:

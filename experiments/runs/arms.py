@@ -76,6 +76,11 @@ class Arm:
         """Whether an agent is trained."""
         return self.policy == "trained"
 
+    @property
+    def differs_from_run_to_run(self) -> bool:
+        """Whether runs have different policies, as trained and untrained agents do; others are the same in all."""
+        return self.policy in ("trained", "untrained")
+
     def loops(
         self, loop: LoopConfig, certificate: Certificate, settings: LearningSettings
     ) -> tuple[LoopConfig, LoopConfig]:

@@ -20,6 +20,10 @@ from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
+from ncs_gym.validation import warn_caller
+
+# Shares of packets that differ by less are the same. Eigenvalues of a chain below this are rounding.
+SHARE, ROUNDING = 1e-3, 1e-12
 
 
 def registered_env(env_id: str) -> NCSEnv:
@@ -106,7 +110,8 @@ def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--cha
         flag: What the changes were given by, for messages.
 
     Raises:
-        ValueError: If a name is unknown or a value out of range, or bursts are asked for without a loss probability.
+        ValueError: If a name is unknown or a value out of range, or bursts are asked for without a loss probability, or
+            longer ones than the channel may lose in a row.
     """
     given = {name: value for name, value in changes.items() if value is not None}
     known = [each.name for each in fields(Channel)]
@@ -118,7 +123,26 @@ def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--cha
             raise ValueError(f"{flag} burst_length needs loss, too: the environment's own losses come in bursts")
         given["loss"] = _bursts(loss, length, given.get("send_period", own.send_period))
     changed = replace(own, **given)
+    most = changed.most_consecutive_losses
+    if most is not None and length is not None and length > max(most, 1):
+        raise ValueError(
+            f"{flag} burst_length={length:g}: the channel loses at most {most} packets in a row, and no mean is "
+            "longer; change max_consecutive_losses, too"
+        )
+    if "loss" in given and "max_consecutive_losses" not in given and (text := fewer_losses(changed)):
+        warn_caller(text, UserWarning)
     return None if changed == own else changed
+
+
+def fewer_losses(channel: Channel) -> str:
+    """Returns that a channel loses fewer packets than its losses say, since it loses so many in a row; else nothing."""
+    most, wanted = channel.max_consecutive_losses, replace(channel, max_consecutive_losses=None).mean_loss
+    if most is None or channel.mean_loss >= wanted - SHARE:
+        return ""
+    return (
+        f"of {wanted:.3g} of all packets {channel.mean_loss:.3g} are lost, since the channel loses at most {most} in a "
+        "row"
+    )
 
 
 def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:
@@ -132,6 +156,8 @@ def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:
     left = 1.0 / length if usable else 0.0
     entered = loss * left / (1.0 - loss) if usable else 2.0
     eigenvalue = 1.0 - left - entered
+    if send_period > 1 and abs(eigenvalue) < ROUNDING:
+        eigenvalue = 0.0  # independent losses
     if not usable or entered > 1.0 or (eigenvalue < 0.0 and send_period > 1):
         raise ValueError(f"no losses of probability {loss} come in bursts of mean length {length}: try a longer one")
     if send_period > 1:

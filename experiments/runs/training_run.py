@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 
 from agents.agent_file import AGENT_FILES, write_files
@@ -194,7 +193,7 @@ class TrainingRun:
     @property
     def total_steps(self) -> int:
         """Training steps, in whole rollouts, and evaluation steps."""
-        evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.scenarios))
+        evaluation = self.episodes * (self.loop.episode_steps or 1) * (1 + len(self.scenarios))
         if not self.trains:
             return evaluation
         rollout = rollout_steps(self.algorithm, self.settings)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
@@ -11,6 +12,7 @@ from agents.agent_file import AgentError
 from agents.callbacks import DualAscentCallback
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
 from agents.training import train
+from ncs_gym import NCSEnv, truck_trailer
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = dict(n_envs=4, n_steps=50, batch_size=200, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
@@ -19,8 +21,10 @@ GAIN = np.array([[0.4, -0.3]])
 
 def raised(settings, rollouts, env_id=CRUISE.env):
     """The multiplier after rollouts, each given by its number of steps in two environments and its violating steps."""
-    priced = CostPenalty(LoopConfig(env=env_id).vector(2), settings.multiplier)
-    callback, multipliers = DualAscentCallback(settings, priced), []
+    loop = LoopConfig(env=env_id, lagrangian=settings)
+    priced = loop.vector(2)
+    assert isinstance(priced, CostPenalty)
+    callback, multipliers = DualAscentCallback(settings, priced, loop.episode_steps), []
 
     class Quiet:
         logger, num_timesteps = type("Logger", (), {"record": lambda *entry: None})(), 0
@@ -53,6 +57,30 @@ def test_episodes_that_a_violation_ends_are_not_cheap():
 def test_multiplier_falls_below_the_limit_but_not_below_zero():
     settings = LagrangianSettings(learning_rate=0.5, cost_limit=3.0, multiplier=2.0)
     assert raised(settings, [(100, 5), (100, 1), (100, 0), (100, 0)]) == pytest.approx([3.0, 2.0, 0.5, 0.0])
+
+
+def test_an_episode_is_as_long_as_the_environment_says():
+    gym.register(
+        "Own50-v0", entry_point=lambda **kwargs: NCSEnv(truck_trailer(mass=4000.0), **kwargs), max_episode_steps=50
+    )
+    gym.register("OwnWithoutEnd-v0", entry_point=lambda **kwargs: NCSEnv(truck_trailer(), **kwargs))
+    settings = LagrangianSettings(cost_limit=2.0, multiplier=1.0)
+    for env, kwargs, steps in (
+        ("Own50-v0", {}, 50),
+        (CRUISE.env, {}, 200),
+        (CRUISE.env, {"max_episode_steps": 40}, 40),
+    ):
+        loop = LoopConfig(env=env, kwargs=kwargs, lagrangian=settings)
+        assert loop.episode_steps == steps
+        history = train(loop, 600, 0, hyperparams=TINY).history
+        price, before = settings.multiplier, 0
+        for point in history:
+            cost = (point.violation_steps - before) / 200 * steps
+            price, before = max(0.0, price + settings.learning_rate * (cost - 2.0)), point.violation_steps
+            assert point.multiplier == pytest.approx(price)
+        assert len(history) == 3
+    with pytest.raises(ValueError, match="OwnWithoutEnd-v0 has no max_episode_steps"):
+        LoopConfig(env="OwnWithoutEnd-v0", lagrangian=settings)
 
 
 class Prices(BaseCallback):

@@ -1,6 +1,7 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from agents import tuned_hyperparams
@@ -205,7 +206,7 @@ def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(train
     findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
     nothing = [line for line in findings if "shielded: nothing was overridden" in line]
     assert len(nothing) == (trained == evaluated == 0.0)
-    assert any("times the safe set" in line for line in findings) == (not nothing)
+    assert any("came to 0.707 times the safe set" in line for line in findings) == (not nothing)  # x'Mx is 0.5
     assert any("covers" in line for line in findings) == (trained > 0.0)
 
 
@@ -227,6 +228,22 @@ def test_paired_differences_are_those_of_runs_with_equal_index():
     assert difference["return_bootstrap_ci95"] == [-3.0, -1.0]
     assert difference["violating_episodes"] == -3
     assert difference["violating_episodes_by_run"] == [-2, -1]
+
+
+def test_policies_that_are_the_same_in_all_runs_are_paired_by_episodes():
+    plain = [result([0.0, 2.0], [1, 0]), result([10.0, 13.0], [0, 0], index=1)]
+    other = [result([1.0, 4.0], [0, 0]), result([11.0, 17.0], [0, 0], index=1)]
+    runs = [replace(run, arm="lqr") for run in plain] + [replace(run, arm="lqr+shielded") for run in other]
+    by_episodes = paired_differences(episodes_table(runs), "lqr")["lqr+shielded"]
+    half = 3.18245 * np.std([1.0, 2.0, 1.0, 4.0], ddof=1) / 2.0
+    np.testing.assert_allclose(by_episodes["return_ci95"], [2.0 - half, 2.0 + half], rtol=1e-3)
+    assert by_episodes["return_ci95_over"] == "episodes"
+    learned = [replace(run, arm="shielded") if run.arm == "lqr+shielded" else run for run in runs]
+    by_runs = paired_differences(episodes_table(learned), "lqr")["shielded"]
+    assert (by_runs["return_mean"], by_runs["return_ci95_over"]) == (2.0, "runs")
+    assert by_runs["return_ci95"][1] == pytest.approx(2.0 + 12.706 * 0.5, rel=1e-3)
+    alone = paired_differences(episodes_table(run for run in runs if run.index == 0), "lqr")["lqr+shielded"]
+    assert alone["return_ci95"][1] > 1.5  # of two episodes
 
 
 def test_no_violation_is_printed_with_its_upper_bound():

@@ -84,7 +84,14 @@ class Shown:
         arms = summary_of({"shielded:project+penalty": [run("shielded:project+penalty")]})["arms"]
         for arm in arms.values():
             arm |= {"train_steps": 9_000_000, "train_violation_steps": 8_000_000, "eval_episodes": 5_000}
-        sides = {"loss": 0.05, "downlink_loss": 0.05, "delay": 12, "quantization_step": 0.05, "burst_length": 25.0}
+        sides = {
+            "mean_loss": 0.04,
+            "loss": 0.05,
+            "downlink_loss": 0.05,
+            "delay": 12,
+            "quantization_step": 0.05,
+            "burst_length": 25.0,
+        }
         here, there = sides | {"mass_factor": 1.05, "arms": arms}, dict.fromkeys(sides, 0) | {"mass_factor": 1.0}
         return sweep_table([here, there | {"arms": arms}])
 

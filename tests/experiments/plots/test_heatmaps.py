@@ -19,7 +19,7 @@ def cells(arms, losses=(0.0, 0.3, 0.6), delays=(0, 4), roundings=(None,), bursts
     sides = ("loss", "delay", "quantization_step", "burst_length")
     grid = product(losses, delays, roundings, bursts)
     return [
-        dict(zip(sides, point, strict=True)) | {"arms": {arm: numbers(at) for arm in arms}}
+        dict(zip(sides, point, strict=True)) | {"mean_loss": point[0], "arms": {arm: numbers(at) for arm in arms}}
         for at, point in enumerate(grid)
     ]
 

@@ -320,6 +320,24 @@ def test_scatter_without_a_violation_shows_what_the_probability_is_at_most_and_o
     assert "no interval" in figure.caption
 
 
+@pytest.mark.parametrize(
+    ("names", "runs", "says"),
+    [
+        (("lqr", "lqr+shielded"), 2, "interval of the mean return over episodes"),
+        (
+            ("lqr",),
+            1,
+            "A marker is one run; vertical bars are Student's 95 % interval of the mean return over episodes",
+        ),
+        (("lqr", "shielded"), 1, "an agent has no interval, that of a policy without training Student's 95 %"),
+        (("lqr", "shielded"), 3, "mean return over runs (of policies without training, over episodes)"),
+        (("unshielded", "shielded"), 3, "mean return over runs, horizontal"),
+    ],
+)
+def test_scatter_says_what_its_vertical_bars_are_over(names, runs, says):
+    assert says in scatter_figure(summary_of(arms(*names, runs=runs))["arms"]).caption
+
+
 def test_arms_that_coincide_have_markers_of_different_sizes():
     shown = arms(*ALL_ARMS)
     for axis in scatter_figure(summary_of(shown)["arms"]).axes:

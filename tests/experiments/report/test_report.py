@@ -59,7 +59,7 @@ def swept(*names, seeds=1, mode="project", change=None, **settings):
     arms = summary_of({name: [run(name, i, **(change or {})) for i in range(seeds)] for name in names})["arms"]
     channels = [(0.0, 0, None, 1.0, None), (0.6, 4, 0.05, 2.0, 1.5)]
     sides = ("loss", "delay", "quantization_step", "burst_length", "mass_factor")
-    cells = [dict(zip(sides, channel, strict=True)) | {"arms": arms} for channel in channels]
+    cells = [dict(zip(sides, channel, strict=True)) | {"mean_loss": channel[0], "arms": arms} for channel in channels]
     own = provenance(arms=list(names), seeds=seeds, mode=mode, **settings)
     return sweep_report({"cells": cells} | own, VERIFIED, {"violations": ("Violations. Of all.", PNG)})
 

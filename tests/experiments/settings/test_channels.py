@@ -1,9 +1,11 @@
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from experiments.commands.sweep import grid_points, loop_at, name_of
+from experiments.report.text_tables import losses_text
 from experiments.runs.experiment import certificate_of, run_of_arm
 from experiments.runs.loops import changed_channel
 from experiments.settings.learning import SweepSettings
@@ -43,6 +45,29 @@ def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period
     runs = int((states[1:] & ~states[:-1]).sum())
     assert states.mean() == pytest.approx(loss, rel=0.05)
     assert states.sum() / runs == pytest.approx(length, rel=0.05)
+
+
+def test_independent_losses_are_bursts_for_every_period():
+    for loss, period in itertools.product((0.5, 0.8, 0.9), (1, 2, 3)):
+        channel = changed_channel(Channel(send_period=period), {"loss": loss, "burst_length": 1.0 / (1.0 - loss)})
+        assert channel.mean_loss == pytest.approx(loss)
+
+
+def test_a_channel_that_loses_only_so_many_in_a_row_loses_fewer_than_asked_for():
+    own = Channel(loss=0.3, max_consecutive_losses=5)
+    with pytest.warns(UserWarning, match=r"of 0.8 of all packets 0.7\d* are lost, since .* at most 5 in a row"):
+        channel = changed_channel(own, {"loss": 0.8, "burst_length": 5.0})
+    assert channel.mean_loss < 0.8
+    with pytest.raises(ValueError, match="at most 5 packets in a row, and no mean is longer"):
+        changed_channel(own, {"loss": 0.8, "burst_length": 12.0})
+    longer = changed_channel(own, {"loss": 0.8, "burst_length": 12.0, "max_consecutive_losses": 40})
+    assert longer.max_consecutive_losses == 40
+    cells = [{"loss": 0.8, "burst_length": 5.0, "mean_loss": channel.mean_loss}]
+    assert losses_text(cells) == (
+        "Channels lose only so many packets in a row, so that fewer are lost than asked for: "
+        f"{channel.mean_loss:.3f} for 0.8 in bursts of 5."
+    )
+    assert losses_text([{"loss": 0.8, "burst_length": 0.0, "mean_loss": 0.8}]) == ""
 
 
 def test_bursts_need_a_loss_probability():

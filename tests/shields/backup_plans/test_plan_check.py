@@ -79,7 +79,8 @@ def test_what_may_not_begin_a_plan_begins_none_of_many(case, shortest):
     tightening = test.tightenings_of(shapes)
     certified = test.certified(estimates, tightening, np.concatenate([plans, others], axis=1), shortest)
     may = test.may_begin(estimates, tightening, plans[:, 0, 0], shortest)
-    assert certified[may].any() and not certified[~may].any()
+    assert certified[may].any()
+    assert not certified[~may].any()
     assert may.all() == (shortest == 1 and certificate.polytope is None)  # there the end, S, is not looked at
     assert not test.may_begin(np.full_like(estimates, np.nan), tightening, plans[:, 0, 0], shortest).any() or may.all()
 
