@@ -15,8 +15,6 @@ from ncs_gym.validation import shown
 OLDEST_OBSERVED = LONGEST_DELAY
 # What `observe` may name.
 ENTRIES = "age", "arrived", "pending_actions"
-# Arrays below this size are copied without a second thought [bytes].
-SMALL = 4096
 
 
 class Part(NamedTuple):
@@ -97,6 +95,13 @@ def has_floats(space: spaces.Space) -> bool:
     return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
 
 
+def is_batched(space: spaces.Space) -> bool:
+    """Returns whether vector environments hold observations of many environments as arrays with a first axis more."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return all(map(is_batched, space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces))
+    return isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
+
+
 def zero_of(space: spaces.Space) -> Any:
     """Returns the zero of a space.
 
@@ -114,49 +119,16 @@ def zero_of(space: spaces.Space) -> Any:
     return zero
 
 
-class Snapshots:
-    """Keeps samples as they were when they were taken, with few copies of large ones.
-
-    Small arrays are copied. Large ones are not, unless the environment turns out to write into the same memory again:
-    memory of the first two samples is held back, so that a later one that lies there was written over an older one.
-    Samples until then are still as they were, since an environment goes through its buffers in turn.
-    """
-
-    def __init__(self) -> None:
-        self._held: list[Any] = []
-        self._reused = False
-
-    def begin(self) -> None:
-        """Forgets the samples of the episode before."""
-        self._held = []
-
-    def taken(self, sample: Any) -> Any:
-        """Returns a sample that stays as it is."""
-        if not isinstance(sample, np.ndarray):
-            if isinstance(sample, dict):
-                return {key: self.taken(each) for key, each in sample.items()}
-            return tuple(map(self.taken, sample)) if isinstance(sample, tuple) else sample
-        if sample.nbytes <= SMALL or self._reused:
-            return sample.copy(order="K")
-        if len(self._held) < 2:
-            self._held.append(sample)
-            return sample.copy(order="K")
-        first, second = self._held
-        self._reused = np.may_share_memory(sample, first) or np.may_share_memory(sample, second)
-        return sample.copy(order="K") if self._reused else sample
-
-
-def handed_out(sample: Any, *, anew: bool) -> Any:
-    """Returns a sample for the agent, whose arrays are its own.
-
-    Large ones are not copied where they are seen for the first time: an agent that writes into them changes what it
-    sees again while nothing arrives.
-    """
+def snapshot(sample: Any) -> Any:
+    """Returns a sample that stays as it is, whatever environment or agent write into their own later."""
     if isinstance(sample, np.ndarray):
-        return sample.copy(order="K") if sample.nbytes <= SMALL or not anew else sample
+        return sample.copy(order="K")
     if isinstance(sample, dict):
-        return {key: handed_out(each, anew=anew) for key, each in sample.items()}
-    return tuple(handed_out(each, anew=anew) for each in sample) if isinstance(sample, tuple) else sample
+        return {key: snapshot(each) for key, each in sample.items()}
+    if isinstance(sample, tuple):
+        entries = map(snapshot, sample)
+        return type(sample)(*entries) if hasattr(sample, "_fields") else tuple(entries)
+    return sample
 
 
 class Entries:

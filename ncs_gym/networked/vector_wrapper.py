@@ -24,7 +24,7 @@ from ncs_gym.networked.network_settings import (
     require_no_network,
     require_no_restarts,
 )
-from ncs_gym.networked.observations import Snapshots, handed_out, joined, quantized, zero_of
+from ncs_gym.networked.observations import is_batched, joined, quantized, snapshot, zero_of
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
 from ncs_gym.validation import require_batched_infos, shown
 
@@ -80,6 +80,11 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             raise ValueError(f"VectorNetworked takes vector environments, as gym.make_vec returns, got {shown(env)}")
         if isinstance(env.unwrapped, NCSVectorEnv):
             raise ValueError("expected a vector environment without a network of its own: an NCSVectorEnv has one")
+        if not is_batched(env.single_observation_space):
+            raise ValueError(
+                f"VectorNetworked takes observations that are arrays, not {shown(env.single_observation_space)}: put "
+                "Networked around each environment"
+            )
         require_no_restarts(env)
         self._settings = settings = NetworkSettings(env.single_observation_space, env.single_action_space, given)
         if settings.channels[0].on_request:
@@ -90,7 +95,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._uplinks, self._downlinks = settings.uplinks(self.num_envs), settings.downlinks(self.num_envs)
-        self._snapshots, self._rng = Snapshots(), None
+        self._rng = None
         self._nothing = settings.neutral if settings.neutral is not None else nothing(env.single_action_space)
         self._keeps_actions = bool(settings.entries.names) or callable(settings.fill)
         self._started = False
@@ -147,14 +152,13 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         else:
             self._make()
             self._describe()
-        self._begin(np.flatnonzero(chosen), self._snapshots.taken(observations), anew=not everywhere)
+        self._begin(np.flatnonzero(chosen), snapshot(observations), anew=not everywhere)
         return self._seen(), self._with_network(info)
 
     def _make(self) -> None:
         """Makes the memory of all networks, for episodes that begin in all environments."""
         rng, settings, count = self.np_random, self._settings, self.num_envs
         self._started = True
-        self._snapshots.begin()
         for links in (*self._uplinks, self._downlinks):
             links.begin(rng)
         self._arrivals = [_Arrivals(VectorChannelState(links.now, rng, count), count) for links in self._uplinks]
@@ -218,7 +222,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         sampled = observations
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             sampled = _merged(done, info["final_obs"], observations)
-        sample = self._snapshots.taken(sampled)
+        sample = snapshot(sampled)
         if settings.delay_reward:
             self._earned = self._earned + np.where(restarted, 0.0, rewards)
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
@@ -235,7 +239,7 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             info = info | {"final_obs": _listed(self.observation_space, self._seen(), done)}
             if isinstance(info.get("final_info"), dict):
                 info["final_info"] = info["final_info"] | self._with_network({})
-            self._begin(np.flatnonzero(done), self._snapshots.taken(observations), anew=True)
+            self._begin(np.flatnonzero(done), snapshot(observations), anew=True)
         self._over = done
         return self._seen(), rewards, terminated, truncated, self._with_network(info)
 
@@ -287,8 +291,7 @@ class _Arrivals:
         self.link, self.sample = link, None
         self.stamp, self.arrived = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         self.earned = np.zeros(count)
-        # Whether these samples were made here and nobody else has them; whether they have not been handed out yet.
-        self._is_own, self._anew = False, True
+        self._is_own = False  # whether these samples were made here, so that nobody else has them
         self._past: list[tuple[Any, np.ndarray | None]] = []
 
     def begin(self, rows: np.ndarray, samples: Any) -> None:
@@ -297,16 +300,14 @@ class _Arrivals:
             self.sample, self._is_own = samples, False
         else:
             if not self._is_own:
-                self.sample = handed_out(self.sample, anew=False)
+                self.sample = snapshot(self.sample)
             _write(self.sample, samples, rows)
             self._is_own = True
-        self._anew = True
         self.stamp[rows], self.earned[rows], self.arrived[rows] = 0, 0.0, False
 
     def seen(self) -> Any:
         """Returns the newest samples for the agent."""
-        anew, self._anew, self._is_own = self._anew, False, False
-        return handed_out(self.sample, anew=anew)
+        return snapshot(self.sample)
 
     def is_new(self, steps: np.ndarray) -> np.ndarray:
         """Returns where the newest sample arrived at this step, as the first of an episode does, shape (N,)."""
@@ -326,7 +327,7 @@ class _Arrivals:
             newer = arrives & (stamp > self.stamp)
             everywhere = np.count_nonzero(newer) == len(newer)
             self.sample = sample if everywhere else _where(newer, sample, self.sample)
-            self._is_own, self._anew = not everywhere, True
+            self._is_own = not everywhere
             self.stamp = np.where(newer, stamp, self.stamp)
             if by_then is not None:
                 self.earned = np.where(newer, by_then, self.earned)

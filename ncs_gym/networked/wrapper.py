@@ -23,7 +23,7 @@ from ncs_gym.networked.network_settings import (
     require_no_network,
     require_no_restarts,
 )
-from ncs_gym.networked.observations import OLDEST_OBSERVED, Snapshots, handed_out, joined, quantized, zero_of
+from ncs_gym.networked.observations import OLDEST_OBSERVED, joined, quantized, snapshot, zero_of
 from ncs_gym.validation import shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
@@ -126,7 +126,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         self._uplinks, self._downlinks = settings.uplinks(1), settings.downlinks(1)
         on_request = settings.channels[0].on_request
         self._requests = Requests(settings.channels[0], None) if on_request else None
-        self._snapshots, self._rng = Snapshots(), None
+        self._rng = None
         self._earned = self._told = 0.0
         self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
@@ -177,9 +177,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             links.give(given)
             links.begin(rng)
         self._network = network_infos(self._keys, self._uplinks, self._downlinks)
-        self._snapshots.begin()
         self._step = self._packets = 0
-        sample = self._snapshots.taken(observation)
+        sample = snapshot(observation)
         for part, arrivals, links in zip(self._settings.parts, self._arrivals, self._uplinks, strict=True):
             arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
         settings, given = self._settings, self.episode_downlink
@@ -219,7 +218,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             link, packet = arrivals.link, None
             if link.sends_at(step) if self._requests is None else self._requests.requested:
                 if sample is None:
-                    sample = self._snapshots.taken(observation)
+                    sample = snapshot(observation)
                 own = part.of(sample)
                 if link.channel.quantization_step:
                     own = quantized(link.channel, part.space, own)
@@ -264,8 +263,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         """Returns what the agent sees now."""
         settings, step = self._settings, self._step
         if self._sees_newest:
-            return self._arrivals[0].seen(step)
-        seen = [arrivals.seen(step) for arrivals in self._arrivals]
+            return self._arrivals[0].seen()
+        seen = [arrivals.seen() for arrivals in self._arrivals]
         if settings.fill == "zero":
             pairs = zip(seen, settings.parts, self._arrivals, strict=True)
             seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
@@ -330,9 +329,9 @@ class _Arrivals:
         self.link, self.sample = link, sample
         self.stamp, self.arrived, self.earned = 0, False, 0.0
 
-    def seen(self, step: int) -> Any:
-        """Returns the newest sample for the agent, at a step."""
-        return handed_out(self.sample, anew=self.is_new(step))
+    def seen(self) -> Any:
+        """Returns the newest sample for the agent."""
+        return snapshot(self.sample)
 
     def is_new(self, step: int) -> bool:
         """Returns whether the newest sample arrived at this step, as the first of an episode does."""

@@ -194,23 +194,51 @@ def test_entries_of_other_observations_have_names():
         Networked(Networked(Counter("dict"), LATE, observe=("age",)), observe=("age",))
 
 
-@pytest.mark.parametrize("kind", ["image", "buffers"])
-def test_large_observations_are_what_they_were_when_they_were_taken(kind):
-    env = Networked(Counter(kind), Channel(loss=0.3, delay=2, jitter=3))
-    env.reset(seed=0)
-    for k in range(60):
-        seen, *_, info = env.step(np.zeros(1))
-        assert (seen == (k + 1 - info["measurement_age"]) % 256).all()
+@pytest.mark.parametrize("channel", [Channel(loss=0.3, delay=2, jitter=3), Channel(delay=3), Channel(delay=9)])
+@pytest.mark.parametrize("kind", ["image", "buffers"])  # three buffers in turn
+def test_large_observations_are_what_they_were_when_they_were_taken(kind, channel):
+    env = Networked(Counter(kind, length=99), channel)
+    envs = VectorNetworked(gym.vector.SyncVectorEnv([lambda: Counter(kind, length=99)] * 2, copy=False), channel)
+    for _ in range(2):
+        env.reset(seed=0)
+        envs.reset(seed=0)
+        for k in range(1, 61):
+            seen, *_, info = env.step(np.zeros(1))
+            assert (seen == (k - info["measurement_age"]) % 256).all()
+            many, *_, info = envs.step(np.zeros((2, 1)))
+            assert (many == np.reshape((k - info["measurement_age"]) % 256, (2, 1, 1, 1))).all()
 
 
-def test_large_observations_that_arrive_are_not_copied():
-    env = Networked(Counter("image"))
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Graph(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)),
+        gym.spaces.Tuple([gym.spaces.Text(5), gym.spaces.Discrete(2)]),
+        gym.spaces.Sequence(gym.spaces.Box(-1.0, 1.0, (2,))),
+        gym.spaces.OneOf([gym.spaces.Discrete(2), gym.spaces.Box(-1.0, 1.0, (2,))]),
+    ],
+)
+def test_observations_without_arrays_are_late_one_by_one(space):
+    class Odd(gym.Env):
+        observation_space, action_space, given = space, gym.spaces.Discrete(2), None
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.given = [space.sample()]
+            return self.given[0], {}
+
+        def step(self, action):
+            self.given.append(space.sample())
+            return self.given[-1], 0.0, False, False, {}
+
+    env = Networked(Odd(), Channel(delay=2))
     env.reset(seed=0)
-    given = []
-    inner, step = env.env, env.env.step
-    inner.step = lambda action: given.append(step(action)) or given[-1]
-    seen = [env.step(np.zeros(1))[0] for _ in range(5)]
-    assert all(np.shares_memory(one, other[0]) for one, other in zip(seen[2:], given[2:], strict=True))
+    for k in range(1, 8):
+        seen = env.step(0)[0]
+        assert env.observation_space.contains(seen)
+        assert gym.utils.env_checker.data_equivalence(seen, env.unwrapped.given[max(k - 2, 0)])
+    with pytest.raises(ValueError, match=r"takes observations that are arrays, not .*: put Networked around each"):
+        VectorNetworked(gym.vector.SyncVectorEnv([Odd] * 2), Channel(delay=2))
 
 
 def test_quantized_floats_stay_in_their_space():
