@@ -168,7 +168,8 @@ class Estimator(CopiedWhole):
         Args:
             u: Applied input, shape (m,) [physical units].
             packets: In any order. Those of another episode are discarded, and stamps from the future, from before the
-                first step, older than the replay buffer or seen before.
+                first step, older than the replay buffer or seen before; another value with a stamp that was seen before
+                raises the alarm.
         """
         self._is_new = False
         self.step += 1
@@ -218,6 +219,9 @@ class Estimator(CopiedWhole):
         age = self.step - packet.stamp
         after = self._histories.after_arrival(history, age)
         if after == history:
+            before = self._samples[age] if 0 <= age < len(self._samples) else None
+            if before is not None and before.tolist() != packet.measurement.tolist():
+                self.alarm = True  # one of the two is not what the sensor measured then
             return history
         if not all(map(isfinite, packet.measurement.tolist())):
             self.alarm = self.damaged = True  # no sensor within the assumptions sends this

@@ -243,7 +243,7 @@ class SafeLoop(CopiedWhole):
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
-                are sorted out.
+                are sorted out. Two values of one sample end the guarantee.
             applied: What the actuator applied since the last decision, shape (m,), if that may be something else than
                 was decided for this time. If it is, the estimate follows it and the guarantee ends; if it is no finite
                 input, the estimate follows the decision.

@@ -209,7 +209,7 @@ def _of_list(
     if numbers:
         if (np.diff(numbers) <= 0).any():
             raise ValueError("the numbers of its packets do not ascend")
-        sent, arrived, _ = with_missing(every * (np.array(numbers) - numbers[0]), arrived, np.array(numbers))
+        sent, arrived, *_ = with_missing(every * (np.array(numbers) - numbers[0]), arrived, np.array(numbers))
     name = "one number per line" if columns is None else shown(column.name)
     read_as = f"Read as a list of delays: {name}, in {column.unit}, packets sent every {1000.0 * every:.4g} ms"
     read_as += " (the file does not say)." if period is None else "."

@@ -59,9 +59,9 @@ def of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column], 
     order = np.argsort(lines.sent, kind="stable")
     sent, delays = lines.sent[order], lines.delays[order]
     _require_receiver(sent, delays, lines.places[order])
-    missing, absent, usual = 0, 0, median_gap(sent)
+    missing, restarts, absent, usual = 0, 0, 0, median_gap(sent)
     if len(lines.numbers):
-        sent, delays, missing = with_missing(sent, delays, lines.numbers[order])
+        sent, delays, missing, restarts = with_missing(sent, delays, lines.numbers[order])
     else:
         sent, delays = with_absent(sent, delays)
         absent = len(sent) - len(order)
@@ -72,6 +72,8 @@ def of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column], 
         read_as += f" A {mark} of 0 or -1 stands for a lost packet ({many(lines.marked, 'line')})."
     if missing:
         read_as += f" A number without a line stands for a lost packet ({many(missing, 'number')})."
+    if restarts:
+        read_as += f" Numbers begin anew {many(restarts, 'time')}: packets without a line are not counted there."
     if absent:
         read_as += (
             f" {many(absent, 'packet')} without a line, where one is usually sent every {1000.0 * usual:.4g} ms, "

@@ -52,6 +52,8 @@ class PlainEstimator:
         self.priors[self.step] = Prior(self.mean, self.statistics)
         new = []
         for stamp, measurement, _ in packets:
+            if stamp in self.samples and not np.array_equal(measurement, self.samples[stamp]):
+                self.alarm = True  # one of the two is wrong
             if stamp not in self.priors or stamp in self.samples:
                 continue
             since = [self.priors[step].statistics.certified for step in range(stamp, self.step + 1)]

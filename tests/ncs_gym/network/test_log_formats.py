@@ -689,3 +689,33 @@ def test_equal_channels_of_a_record_stay_equal_and_read_only_when_copied():
     for other in (copy.deepcopy(channel), pickle.loads(pickle.dumps(channel))):
         assert other == channel
         assert not other.delays.flags.writeable
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize("outage", [0, 15, 600])
+def test_counters_that_go_on_from_zero_miss_no_loss(bits, outage, tmp_path):
+    rng, count = np.random.default_rng(bits + outage), 6000
+    first = rng.integers(0, 1 << bits) if bits < 16 else (1 << bits) - 1000
+    arrives = rng.random(count) > 0.1
+    arrives[[0, -1]] = True
+    around = (1 << bits) - first  # where it goes on from zero
+    if outage:
+        start = min(int(around) - outage // 2, count - outage - 10) % (count - outage - 10)
+        arrives[start : start + outage] = False
+    lines = [
+        f"{(k + first) % (1 << bits)},{0.02 * k + rng.uniform(-0.001, 0.001):.6f},0.005\n"
+        for k in np.flatnonzero(arrives).tolist()
+    ]
+    (tmp_path / "log.csv").write_text("seq,sent_s,delay_s\n" + "".join(lines))
+    log = PacketLog.load(tmp_path / "log.csv")
+    np.testing.assert_array_equal(np.isnan(log.delays), ~arrives)
+    assert "begin anew" not in log.read_as
+
+
+def test_numbers_that_begin_anew_are_told_of(tmp_path):
+    packets = [(k, 0.02 * k) for k in range(1000)] + [(k, 60.0 + 0.02 * k) for k in range(1000)]
+    text = "seq,sent_s,delay_s\n" + "".join(f"{number},{at:.3f},0.005\n" for number, at in packets)
+    (tmp_path / "log.csv").write_text(text)
+    log = PacketLog.load(tmp_path / "log.csv")
+    assert not np.isnan(log.delays).any()
+    assert "Numbers begin anew 1 time: packets without a line are not counted there." in log.read_as

@@ -158,6 +158,29 @@ def test_measurement_that_is_not_finite_is_an_alarm():
     assert loop.guaranteed
 
 
+@pytest.mark.parametrize("value", [0.25, np.nan])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0), (0, None, 1)])
+def test_another_value_of_a_sample_ends_the_guarantee_whatever_comes_first(order, value):
+    loop = started("truck", channel=Channel(delay=3))
+    for _ in range(3):
+        loop.step(np.zeros(1))
+    sample = Packet(2, loop.estimate)
+    both = [sample, Packet(2, sample.measurement + value)]
+    loop.step(np.zeros(1), [sample, Packet(2, sample.measurement.copy())])
+    assert loop.guaranteed
+    loop.start(np.zeros(2))
+    for _ in range(3):
+        loop.step(np.zeros(1))
+    both = [each._replace(episode=loop.episode) for each in both]
+    if None in order:
+        loop.step(np.zeros(1), both[:1])
+        assert loop.guaranteed
+        loop.step(np.zeros(1), both[1:])
+    else:
+        loop.step(np.zeros(1), [both[which] for which in order])
+    assert loop.reason in (ALARM, NOT_FINITE)
+
+
 @pytest.mark.parametrize("stepped", [True, False])
 def test_packet_of_an_earlier_episode_is_discarded_whatever_its_stamp(stepped):
     loop = started(channel=Channel(delay=3))
