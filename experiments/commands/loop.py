@@ -33,6 +33,7 @@ from experiments.runs.policies import require_no_statistics
 from experiments.settings import LoopSettings
 from experiments.terminal import wrapped
 from ncs_gym import NCSEnv
+from ncs_gym.network.contract import largest_age
 from ncs_gym.network.wire import SHORTEST_KEY
 from ncs_gym.reading import LARGEST_KEY, read_file
 from shields import Certificate, Infeasible, certificate_for
@@ -146,7 +147,7 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
     if settings.policy in OWN_POLICIES:
         require_no_statistics(settings.vec_normalize, settings.policy)
-    max_age = 0 if env.contract is None else env.contract.max_age
+    max_age = largest_age(env.contract, 0)
     return NetworkLoop(settings=settings, uplink=uplink, downlink=downlink, secret=key, max_age=max_age)
 
 

@@ -26,7 +26,7 @@ from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
@@ -221,6 +221,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
         contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
         self._contract, self._protocol, self._certificate_contract = contracts
+        self._oldest = largest_age(self._contract)
         self._downlink = downlink
         self._downlink_contract = None if downlink is None else self._protocol.contract
         histories = arrival_histories(plant, self._channel, self._certificate_contract)
@@ -471,7 +472,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
         happened = estimator.mean, self._state, missing, arrived
         told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant, read)
-        return loop_info(self._known, *happened, self._contract, *told)
+        return loop_info(self._known, *happened, self._oldest, *told)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

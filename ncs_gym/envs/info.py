@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.estimation.error_table import ErrorTable
-from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.requests import Requested
 
 # What is a number in the info of one environment, and of many an array that the environments go on using.
@@ -65,7 +64,7 @@ def loop_info(
     state: np.ndarray,
     missing: Any,
     arrived: Any,
-    contract: ChannelContract | None,
+    oldest: float,
     constraints: Constraints,
     sampled: Requested,
     network: dict[str, Any],
@@ -79,7 +78,7 @@ def loop_info(
         state: x, shape (n,) or (n, N).
         missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
-        contract: What the channel guarantees, if anything.
+        oldest: The largest age of the newest sample that the contract allows [steps]; infinite without one.
         constraints: How the safe box is kept; `values`, `cost` and `violations` are fresh arrays.
         sampled: What was requested in the step.
         network: What `EpisodeChannels.infos` says.
@@ -103,7 +102,7 @@ def loop_info(
         "assumption_violated": known.alarm,
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
-        "contract_broken": known.age > (np.inf if contract is None else contract.max_age),
+        "contract_broken": known.age > oldest,
         "downlink_broken": missing,
         "requested": sampled.requested,
         "request_forced": sampled.forced,

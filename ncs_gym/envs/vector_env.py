@@ -20,7 +20,7 @@ from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel, widest
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.network.requests import Requested, Requests, require_on_request
@@ -114,6 +114,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._single = single = NCSEnv(**settings)
         self._plant, self._channel, self._task = single.plant, single.channel, single.task
         self._contract, self._error_set, self.render_mode = single.contract, single.error_set, single.render_mode
+        self._oldest = largest_age(self._contract)
         self.single_observation_space = single.observation_space
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -461,7 +462,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         happened = self._estimator.mean, self._state, missing, arrived
         sampled = Requested(asked, forced, self._packets)
         told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant)
-        return loop_info(self._known, *happened, self._contract, *told)
+        return loop_info(self._known, *happened, self._oldest, *told)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
+from typing import overload
 
 from ncs_gym.network.channel import Channel, in_steps
 from ncs_gym.validation import as_count, as_number, warn_caller
@@ -60,6 +62,19 @@ def contract_of(channel: Channel) -> ChannelContract | None:
     """
     age = channel.oldest_age
     return None if age is None or age > MAX_AGE else ChannelContract(age, channel.quantization_step)
+
+
+@overload
+def largest_age(contract: ChannelContract | None, without: int) -> int: ...
+
+
+@overload
+def largest_age(contract: ChannelContract | None, without: float = inf) -> float: ...
+
+
+def largest_age(contract: ChannelContract | None, without: float = inf) -> float:
+    """Returns the largest age of the newest sample that a contract allows; without one, another number [steps]."""
+    return without if contract is None else contract.max_age
 
 
 def warn_of_broken_contract(

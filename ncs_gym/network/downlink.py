@@ -14,7 +14,7 @@ import numpy as np
 
 from ncs_gym.network.actuator import NEVER, Actuator, Command, CommittedInputs
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of
+from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of, largest_age
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.validation import frozen, read_only, shown
 
@@ -95,8 +95,7 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
             f"the downlink delays commands by up to {downlink.longest_delay} steps, which a contract of max_age = "
             f"{contract.max_age} never allows"
         )
-    input_delay = downlink.longest_delay if contract is None else contract.max_age
-    return DownlinkProtocol(downlink, input_delay, contract)
+    return DownlinkProtocol(downlink, largest_age(contract, downlink.longest_delay), contract)
 
 
 def require_fitting_downlink(protocol: DownlinkProtocol, downlink: Channel) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.validation import shown
 
 
@@ -78,10 +78,10 @@ class Requests:
         self._own_spare, self._contract, self._input_delay = spare_samples(channel, contract), contract, input_delay
         self._shape = () if size is None else (size,)
         # Without a contract it is enough to know which packets may still arrive.
-        self._oldest = channel.longest_delay if contract is None else contract.max_age
+        self._oldest = largest_age(contract, channel.longest_delay)
         self._back = np.arange(input_delay + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
         # A sample as old as the longest delay has arrived, or never will; under a contract all of these count.
-        oldest = channel.longest_delay - 1 if contract is None else contract.max_age
+        oldest = largest_age(contract, channel.longest_delay - 1)
         self._counts = self._back <= input_delay + oldest
         self.begin()
 

@@ -16,7 +16,7 @@ from ncs_gym.envs.episode_channels import EpisodeChannels, EveryEpisode
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.contract import contract_of, largest_age
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
 from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, setting, shown, warn_caller
@@ -138,11 +138,7 @@ class NetworkSettings:
 
     def _memory(self) -> int:
         """Returns how many actions the newest sample may lack: what the contracts allow, or without any the delays."""
-        uplink = [contract_of(each) for each in self.channels]
-        ages = [
-            each.longest_delay + each.send_period - 1 if contract is None else contract.max_age
-            for each, contract in zip(self.channels, uplink, strict=True)
-        ]
+        ages = [largest_age(contract_of(each), each.longest_delay + each.send_period - 1) for each in self.channels]
         if self.downlink is not None:
             return max(max(ages) + downlink_protocol(self.downlink, None).input_delay, 1)
         return max(*ages, 1)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Actuator, Command, Echo, Packet
+from ncs_gym.network.contract import largest_age
 from ncs_gym.network.wire import Kind, Message, Wire, WireError
 from shields.nodes.step_clock import SETTLED, StepClock
 from shields.nodes.transport import Datagram, Transport
@@ -262,7 +263,7 @@ class ControllerNode:
         self.decision: Decision
         # A sensor that is not asked may be silent for as long as the contract lets it.
         contract = loop.contract if loop.channel.on_request else None
-        self._patience = PATIENCE + loop.channel.longest_delay + (0 if contract is None else contract.max_age)
+        self._patience = PATIENCE + loop.channel.longest_delay + largest_age(contract, 0)
         self._prelude = _prelude(wire.input_delay)
         # Who was told nothing from this step on leaves before step 0.
         self._joined_by = -(wire.input_delay + PATIENCE + 2)

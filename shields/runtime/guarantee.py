@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ncs_gym.network.contract import largest_age
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.plants.past_inputs import inputs_under_way
@@ -119,7 +120,7 @@ class GuaranteeMonitor:
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * plant.half_widths / (2.0 if self._input_delay else 1.0)
         # Of the newest sample at present, while the contract of the certificate holds.
-        self._largest_age = np.inf if certificate.contract is None else certificate.contract.max_age - self._input_delay
+        self._largest_age = largest_age(certificate.contract) - self._input_delay
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
         self._under_way = inputs_under_way(plant) if self._is_local else 0

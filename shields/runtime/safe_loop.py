@@ -14,7 +14,7 @@ from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol
 from ncs_gym.network.actuator import as_echo
-from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
+from ncs_gym.network.contract import MAX_AGE, largest_age, warn_of_broken_contract
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.validation import (
@@ -172,7 +172,7 @@ class SafeLoop(CopiedWhole):
         certificate, mode, horizon = self._filter.certificate, self._filter.mode, self._filter.horizon
         fingerprint = f"of the plant with fingerprint {certificate.fingerprint[:16]}"
         age = f"the newest sample is {counted(self.measurement_age, 'step')} old"
-        if self._contract is not None and self.measurement_age > self._contract.max_age - self._input_delay:
+        if self.measurement_age > largest_age(self._contract) - self._input_delay:
             age += ", older than the contract allows"
         proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
         proved += "" if self._echo_age is not None else ", if everything that is decided is applied"

@@ -11,6 +11,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 from ncs_gym import Channel, ChannelContract, contract_of
+from ncs_gym.network.contract import largest_age
 from ncs_gym.validation import as_count, as_number
 from shields.certificate import Certificate
 
@@ -79,7 +80,7 @@ class Network:
     @property
     def age(self) -> float:
         """The largest age of the newest sample when an input takes effect [steps]; infinite without a limit."""
-        return inf if self.contract is None else self.contract.max_age
+        return largest_age(self.contract)
 
     @property
     def most_losses(self) -> float:
