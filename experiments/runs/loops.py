@@ -140,8 +140,8 @@ def fewer_losses(channel: Channel) -> str:
     if most is None or channel.mean_loss >= wanted - SHARE:
         return ""
     return (
-        f"of {wanted:.3g} of all packets {channel.mean_loss:.3g} are lost, since the channel loses at most {most} in a "
-        "row"
+        f"{channel.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at most "
+        f"{most} in a row"
     )
 
 

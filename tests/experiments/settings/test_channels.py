@@ -55,7 +55,7 @@ def test_independent_losses_are_bursts_for_every_period():
 
 def test_a_channel_that_loses_only_so_many_in_a_row_loses_fewer_than_asked_for():
     own = Channel(loss=0.3, max_consecutive_losses=5)
-    with pytest.warns(UserWarning, match=r"of 0.8 of all packets 0.7\d* are lost, since .* at most 5 in a row"):
+    with pytest.warns(UserWarning, match=r"0.7\d* of the packets are lost in the long run, not 0.8: .* 5 in a row"):
         channel = changed_channel(own, {"loss": 0.8, "burst_length": 5.0})
     assert channel.mean_loss < 0.8
     with pytest.raises(ValueError, match="at most 5 packets in a row, and no mean is longer"):
