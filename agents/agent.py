@@ -26,6 +26,7 @@ from agents.agent_file import (
     pretrained_folder,
     read_files,
     shield_from_json,
+    shield_to_json,
 )
 from agents.algorithms import algorithm_class, build_model, policy_arguments
 from agents.hyperparams import ALGORITHMS, ON_POLICY, complete_hyperparams, require_moderate_networks
@@ -54,6 +55,7 @@ class Agent:
         residual_gain: Normalized gain, shape (m, n), to whose action that of the model is added; None for none.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
+        least_safe_steps: Steps for which that shield sought to keep the box whatever the network does.
         kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
 
@@ -66,6 +68,7 @@ class Agent:
     residual_gain: np.ndarray | None = None
     shield_mode: str | None = None
     horizon: int | None = None
+    least_safe_steps: int = 0
     kwargs: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -138,7 +141,7 @@ class Agent:
             "hyperparams": self.hyperparams,
             "env": self.env,
             "channel": to_json(self.channel),
-            "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
+            "shield": shield_to_json(self.shield_mode, self.horizon, self.least_safe_steps),
             "plant": None if (plant := _plant_of(self.env, self.kwargs)) is None else plant.fingerprint,
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
@@ -252,7 +255,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent is of an unknown algorithm, {shown(algorithm)}")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs=kwargs | {"channel": content["channel"]})
-    shield_mode, horizon = shield_from_json(content.get("shield"))
+    shield_mode, horizon, least_safe_steps = shield_from_json(content.get("shield"))
     parameters, envs = parameters_of(weights), SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
@@ -282,6 +285,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         residual_gain=gain,
         shield_mode=shield_mode,
         horizon=horizon,
+        least_safe_steps=least_safe_steps,
         kwargs=kwargs,
     )
 

@@ -31,6 +31,8 @@ class SafetyCallback(BaseCallback):
     mean norm of applied minus proposed input since the last log, with a shield), `safety/guaranteed_rate` (steps after
     which the state is proved safe, since the last log, with a shield) and `safety/violation_steps` (total).
 
+    Totals begin anew where the model counts its steps anew (`learn` with `reset_num_timesteps`).
+
     Args:
         on_progress: Called with the number of steps taken since its last call.
         history: Totals of the training that this one goes on from; empty for one that begins.
@@ -51,21 +53,27 @@ class SafetyCallback(BaseCallback):
         super().__init__()
         self.history = list(history)
         self._on_progress, self._priced = on_progress, priced
+        self._first = TrainingPoint(0, float("nan"), 0, 0)
         self.violation_steps, self.interventions = self._last.violation_steps, self._last.interventions
-        self._corrections: float | None = None
-        self._guaranteed: int | None = None
 
     def _on_training_start(self) -> None:
         self._interval = self.locals["total_timesteps"] // _MAX_POINTS
+        if self.num_timesteps < self._last.steps:
+            self.history, self.violation_steps, self.interventions = [], 0, 0
+        self._first = TrainingPoint(self.num_timesteps, float("nan"), 0, 0)
 
     def _on_step(self) -> bool:
         batch = _counted(self)
-        self.violation_steps += int((np.asarray(batch["cost"]) > 0.0).sum())
-        self.interventions += int(np.sum(batch.get("shield_intervened", 0)))
-        if "shield_correction" in batch:
-            self._corrections = (self._corrections or 0.0) + float(np.sum(batch["shield_correction"]))
-        if "shield_guaranteed" in batch:
-            self._guaranteed = (self._guaranteed or 0) + int(np.sum(batch["shield_guaranteed"]))
+        violations = np.asarray(batch["cost"]) > 0.0
+        interventions = batch.get("shield_intervened", np.zeros(len(violations)))
+        self.violation_steps += int(violations.sum())
+        self.interventions += int(np.sum(interventions))
+        rates = {"violation_rate": violations, "intervention_rate": interventions}
+        rates |= {"mean_correction": batch.get("shield_correction"), "guaranteed_rate": batch.get("shield_guaranteed")}
+        for name, values in rates.items():
+            if values is not None:
+                self.logger.record_mean(f"safety/{name}", float(np.mean(values)))
+        self.logger.record("safety/violation_steps", self.violation_steps)
         return True
 
     def _on_rollout_end(self) -> None:
@@ -83,7 +91,7 @@ class SafetyCallback(BaseCallback):
 
     @property
     def _last(self) -> TrainingPoint:
-        return self.history[-1] if self.history else TrainingPoint(0, float("nan"), 0, 0)
+        return self.history[-1] if self.history else self._first
 
     @property
     def _present(self) -> TrainingPoint:
@@ -94,20 +102,10 @@ class SafetyCallback(BaseCallback):
 
     def add_point(self) -> None:
         """Adds a point to the curve, of what happened since the last one."""
-        last = self._last
-        taken = max(self.num_timesteps - last.steps, 1)
-        self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
-        self.logger.record("safety/intervention_rate", (self.interventions - last.interventions) / taken)
-        self.logger.record("safety/violation_steps", self.violation_steps)
-        if self._corrections is not None:
-            self.logger.record("safety/mean_correction", self._corrections / taken)
-            self._corrections = 0.0
-        if self._guaranteed is not None:
-            self.logger.record("safety/guaranteed_rate", self._guaranteed / taken)
-            self._guaranteed = 0
+        taken = self.num_timesteps - self._last.steps
         self.history.append(self._present)
         if self._on_progress is not None:
-            self._on_progress(self.num_timesteps - last.steps)
+            self._on_progress(taken)
 
 
 class DualAscentCallback(BaseCallback):

@@ -81,7 +81,8 @@ def train(
         on_progress: Called with the number of steps taken since its last call; `TrainingStopped` ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
         start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
-            optimizers and its normalization; replay buffers begin anew.
+            optimizers and its normalization; replay buffers begin anew, with random actions for `learning_starts` steps
+            that count. Give another seed: with the same one it meets the same starts and packet losses once more.
         history: Totals of the training of that agent: counts and the multiplier of PPO-Lagrangian go on from the last,
             and rates fall as in one training of all steps. Empty to count from 0, and for rates that begin anew.
         checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and when the
@@ -195,5 +196,6 @@ def _agent(
         residual_gain=loop.residual_gain,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
+        least_safe_steps=0 if loop.shield is None else loop.shield.least_safe_steps,
         kwargs={name: to_json(value) for name, value in loop.kwargs.items() if name != "channel"},
     )

@@ -48,6 +48,8 @@ def evaluate(settings: EvaluateSettings) -> None:
         say(f"{folder.name} does not say whether the agent was trained behind a shield: none is used; give --shield")
     require_horizon(settings, mode)
     least, horizon = settings.least_safe_steps, settings.horizon
+    if settings.shield == "as-trained" and mode == "lookahead" and not least and horizon is None:
+        least = agent.least_safe_steps
     if mode == "lookahead" and horizon is None and least < (agent.horizon or 0):
         horizon = agent.horizon
     certificate = certificate_of(loop, settings.certificate or certificate_file(folder))

@@ -14,8 +14,8 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import Rectangle
 
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands
-from experiments.report.text_tables import losses_text
 from experiments.runs.arms import Arm
+from experiments.runs.loops import losses_text
 
 # What the axes of a panel do not show; see `_other`.
 _Other = tuple[float | None, float, float | None, int | None]

@@ -12,8 +12,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.json_values import flat
 from experiments.plots.figure_style import ArmStyle
-from experiments.report.text_tables import losses_text
 from experiments.runs.arms import Arm
+from experiments.runs.loops import losses_text
 from shields import Report
 
 # Pixels of a figure per pixel of the page: the widest figures then fill it, and letters have the same size in all.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import floor, log10
 from typing import Any
 
-from experiments.runs.loops import SHARE
+from experiments.runs.loops import losses_text
 from experiments.terminal import text_table, wrapped
 
 _MOST_DECIMALS = 4
@@ -125,19 +125,6 @@ def sweep_table(cells: list[dict[str, Any]]) -> str:
     above = [f"in all rows: {', '.join(common)}"] if common else []
     below = [text] if (text := losses_text(cells)) else []
     return "\n\n".join([*map(wrapped, above), table, *map(wrapped, below)])
-
-
-def losses_text(cells: Sequence[dict[str, Any]]) -> str:
-    """Returns where channels lose fewer packets than a point of the grid says, in a sentence; nothing if none does."""
-    fewer = {}
-    for cell in cells:
-        if cell["mean_loss"] < cell["loss"] - SHARE:
-            bursts = f" in bursts of {cell['burst_length']:g}" if cell["burst_length"] else ""
-            fewer[f"{cell['loss']:g}{bursts}"] = f"{cell['mean_loss']:.3f}"
-    if not fewer:
-        return ""
-    listed = ", ".join(f"{truth} for {asked}" for asked, truth in fewer.items())
-    return f"Channels lose only so many packets in a row, so that fewer are lost than asked for: {listed}."
 
 
 def _name(side: str) -> str:

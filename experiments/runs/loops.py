@@ -145,6 +145,19 @@ def fewer_losses(channel: Channel) -> str:
     )
 
 
+def losses_text(cells: Sequence[dict[str, Any]]) -> str:
+    """Returns where channels lose fewer packets than a point of the grid says, in a sentence; nothing if none does."""
+    fewer = {}
+    for cell in cells:
+        if cell["mean_loss"] < cell["loss"] - SHARE:
+            bursts = f" in bursts of {cell['burst_length']:g}" if cell["burst_length"] else ""
+            fewer[f"{cell['loss']:g}{bursts}"] = f"{cell['mean_loss']:.3f}"
+    if not fewer:
+        return ""
+    listed = ", ".join(f"{truth} for {asked}" for asked, truth in fewer.items())
+    return f"Channels lose only so many packets in a row, so that fewer are lost than asked for: {listed}."
+
+
 def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:
     """Returns losses of a given probability that come in bursts of a given mean number of packets.
 

@@ -18,12 +18,13 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.plants.limits import in_units_of_range
+from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.family import Family, entry_name, matrices_of
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import as_names, as_number, shown
+from ncs_gym.validation import as_flag, as_names, as_number, shown
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -52,26 +53,32 @@ def plant_of_middle(
     at_rest: bool,
 ) -> P:
     """Returns what `LinearPlant.family` does, of plants of this class."""
+    at_rest, monotone = as_flag(at_rest, "at_rest"), as_flag(monotone, "monotone")
     if callable(members):
         family, plants, basis = _of_function(kind, members, ranges, monotone)
     elif ranges is None and not monotone:
         family, plants, basis = _of_plants(kind, members)
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
-    if _rest_matters(family, plants):
-        if not at_rest:
-            raise ValueError(
-                "the members differ in what acts on an operating point that is not zero: say at_rest=True if each is "
-                "at rest at its own one, as LinearPlant(offset=...) checks of a model in absolute coordinates"
-            )
+    rest_matters = _rest_matters(family, plants)
+    if rest_matters and not at_rest:
+        raise ValueError(
+            "the members differ in what acts on an operating point that is not zero (the middle of a disturbance with "
+            "two ends moves it, too): say at_rest=True if each is at rest at its own one, as LinearPlant(offset=...) "
+            "checks of a model in absolute coordinates"
+        )
+    if rest_matters or family.members[..., -1].any():
         basis += ", each being at rest at its operating point (given)"
-    first = _around_center(plants[0], family.center)
+    moved = [_around_center(each, family.center) for each in plants]
+    first = moved[0]
     middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
     middle[:, -1] = 0.0
     off = np.abs(family.members - middle)
     if family.interval is not None:
         off = np.abs(family.interval - middle).max(axis=0, keepdims=True)
-    bound = _around(first, _largest(first, off))
+    # Past inputs keep the limits of inputs only where they are that for every member.
+    reach = np.append(np.max([each.reach for each in moved], axis=0), 1.0)
+    bound = _around(first, _largest(reach, off, first.state_names))
     return replace(
         first,
         A=middle[:, : first.n],
@@ -105,7 +112,12 @@ def _around_center(plant: P, center: np.ndarray | None) -> P:
     moved, n = center - _resting_points([plant])[0], plant.n
     if not moved.any():
         return plant
-    box = in_units_of_range(plant.box, *(plant.box_ends - plant.box @ moved[:n]))
+    input_ends = plant.input_ends - moved[n:]
+    stored = is_row_of_past_input(plant)
+    ends = np.where(stored, plant.box_ends, plant.box_ends - plant.box @ moved[:n])
+    if (past := np.flatnonzero(stored)).size:
+        ends[:, past] = np.tile(input_ends / plant.input_half, len(past) // plant.m)
+    box = in_units_of_range(plant.box, *ends)
     mixed = in_units_of_range(plant.mixed_rows, *(plant.mixed_ends - plant.mixed_rows @ moved))
     return replace(
         plant,
@@ -113,7 +125,7 @@ def _around_center(plant: P, center: np.ndarray | None) -> P:
         operating_input=center[n:],
         box=box.rows,
         box_ends=np.stack([box.low, box.high]),
-        input_ends=plant.input_ends - moved[n:],
+        input_ends=input_ends,
         mixed_rows=mixed.rows,
         mixed_ends=np.stack([mixed.low, mixed.high]),
     )
@@ -169,8 +181,9 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     _require_alike(kind, plants)
     matrices = _matrices(plants)
     varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
-    room = ROOM * (varies * np.abs(matrices).max(axis=(0, 2)))[:, None]
-    room = room * np.append(np.isfinite(plants[0].reach), matrices[..., -1].any())
+    reach = np.max([each.reach for each in plants], axis=0)
+    room = ROOM * (varies * np.abs(matrices[..., :-1]).max(axis=(0, 2)))[:, None] * np.isfinite(reach)
+    room = np.column_stack([room, ROOM * _terms_of_step(plants, matrices)])
     interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
     family = Family(
         names=names,
@@ -182,7 +195,10 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     )
     checked = _check_monotone(family, room)
     shown_ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(names, ends, strict=True))
-    basis = f"for {shown_ranges}, entries of A and B being monotone in each (given, and checked at {checked:,} points)"
+    entries = "A, B and the step at the middle of the operating points" if matrices[..., -1].any() else "A and B"
+    basis = (
+        f"for {shown_ranges}, entries of {entries} being monotone in each (given, and checked at {checked:,} points)"
+    )
     return family, plants, basis
 
 
@@ -190,6 +206,13 @@ def _matrices(plants: list[P]) -> np.ndarray:
     """Returns [A, B, s] of plants around the middle of their operating points, shape (N, n, n + m + 1)."""
     shape = plants[0].n, plants[0].n + plants[0].m + 1
     return np.array([matrices_of(each, shape, _center_of(plants)) for each in plants])
+
+
+def _terms_of_step(plants: list[P], matrices: np.ndarray) -> np.ndarray:
+    """Returns the largest sum of terms that s of a member is made of, shape (n,); zero for past inputs."""
+    n, sizes = plants[0].n, np.abs(_resting_points(plants)) + np.abs(_center_of(plants))
+    terms = [np.abs(each[:, :-1]) @ size + size[:n] for each, size in zip(matrices, sizes, strict=True)]
+    return np.max(terms, axis=0) * (np.arange(n) < n - min(map(inputs_under_way, plants)))
 
 
 def _ends(name: str, value: Any) -> tuple[float, float]:
@@ -255,20 +278,21 @@ def _check_monotone(family: Family, room: np.ndarray) -> int:
     return each**k
 
 
-def _largest(plant: LinearPlant, off: np.ndarray) -> np.ndarray:
+def _largest(reach: np.ndarray, off: np.ndarray, state_names: Sequence[str]) -> np.ndarray:
     """Returns the half-widths of what the middle leaves out, shape (n,).
 
     Args:
-        plant: A member.
+        reach: w, the largest |x_j|, |u_j| and 1, shape (n + m + 1,); infinite for an unlimited state.
         off: How far entries of [A, B, s] are from the middle, shape (N, n, n + m + 1).
+        state_names: Names of the states.
 
     Raises:
         ValueError: If members differ in what an unlimited state does.
     """
-    reach, differs = np.append(plant.reach, 1.0), off.any(axis=(0, 1))
+    differs = off.any(axis=(0, 1))
     if free := np.flatnonzero(differs & np.isinf(reach)).tolist():
         raise ValueError(
-            f"the members differ in what {plant.state_names[free[0]]} does, which no row of the box with two ends "
+            f"the members differ in what {state_names[free[0]]} does, which no row of the box with two ends "
             "limits: give it limits, if generous ones"
         )
     reach = np.where(differs, reach, 0.0)

@@ -614,6 +614,8 @@ class LinearPlant(LimitValues, HardBounds):
             digest.update(
                 f"remainder{self.remainder.proved}".encode() + self.remainder.bound.shape_matrix.astype("<f8").tobytes()
             )
+        if self.members is not None:
+            digest.update(b"members" + self.members.members.astype("<f8").tobytes())
         if self.between_samples is not None and self.continuous_model is not None:
             digest.update(f"between_samples{self.between_samples}".encode())
             digest.update(self.continuous_model.astype("<f8").tobytes())

@@ -43,6 +43,17 @@ def inputs_under_way(plant: LinearPlant) -> int:
     return stored
 
 
+def is_row_of_past_input(plant: LinearPlant) -> np.ndarray:
+    """Returns which rows of the box `storing` added, shape (k,): nobody gave them, and no input ever reaches them."""
+    first, found = plant.n - inputs_under_way(plant), np.zeros(len(plant.box), np.bool_)
+    for j in range(first, plant.n):
+        i, row = (j - first) % plant.m, np.zeros(plant.n)
+        row[j] = 1.0 / (STORED_INPUT_REACH * plant.input_half[i])
+        ends = plant.input_ends[:, i] / plant.input_half[i]
+        found |= (plant.box == row).all(axis=1) & (ends == plant.box_ends.T).all(axis=1)
+    return found
+
+
 def with_past_inputs(plant: Kind, input_delay: int | None, du_max: ArrayLike | None) -> Kind:
     """Returns the plant with inputs that take effect later, and that change by no more than `du_max`; None for neither.
 

@@ -6,6 +6,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import KVWriter, Logger
 
 from agents import SafetyCallback, SB3VecEnv, evaluate
 from agents.loop import LoopConfig, ShieldSettings
@@ -169,30 +173,71 @@ def test_rates_and_evaluations_reach_tensorboard_and_change_nothing(algorithm, s
     np.testing.assert_array_equal([astuple(one) for one in plain.history], [astuple(one) for one in result.history])
 
 
-def test_mean_correction_is_that_of_every_step():
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.logger import Logger
+class Dumps(KVWriter):
+    """What reaches a log, and at which step."""
 
-    corrections, recorded = [], []
+    def __init__(self):
+        self.found = []
 
-    class Recorder(VectorWrapper):
-        def step(self, actions):
-            result = self.env.step(actions)
-            corrections.extend(np.linalg.norm(result[4]["input"] - result[4]["input_proposed"], axis=1))
-            return result
+    def write(self, key_values, key_excluded, step=0):
+        self.found.append((step, dict(key_values)))
 
-    class Recording(Logger):
-        def record(self, key, value, exclude=None):
-            if key == "safety/mean_correction":
-                recorded.append(value)
+    def close(self):
+        pass
 
-    model = PPO(
-        "MlpPolicy", SB3VecEnv(Recorder(shielded().vector(4))), n_steps=64, batch_size=128, n_epochs=1, device="cpu"
-    )
-    model.set_logger(Recording(None, []))
-    model.learn(512, callback=SafetyCallback())
-    assert len(corrections) == 512
-    np.testing.assert_allclose(recorded, np.mean(np.reshape(corrections, (2, 256)), axis=1), rtol=1e-9)
+
+class Steps(BaseCallback):
+    """What happened in every step of each environment."""
+
+    def __init__(self):
+        super().__init__()
+        self.rows = []
+
+    def _on_step(self):
+        names = "cost", "shield_intervened", "shield_correction", "shield_guaranteed"
+        self.rows.append([[float(info[name]) for name in names] for info in self.locals["infos"]])
+        return True
+
+
+def logged_alike(model, steps, log_interval, **more):
+    """Learns, and compares every log with the steps since the last one; returns the callback."""
+    dumps, seen, callback = Dumps(), Steps(), more.pop("callback", None) or SafetyCallback()
+    before = 0 if more.get("reset_num_timesteps", True) else model.num_timesteps
+    model.set_logger(Logger(None, [dumps]))
+    model.learn(steps, callback=[seen, callback], log_interval=log_interval, **more)
+    rows, start = np.array(seen.rows), 0
+    names = "violation_rate", "intervention_rate", "mean_correction", "guaranteed_rate"
+    logs = [(step, values) for step, values in dumps.found if "safety/violation_rate" in values]
+    assert len(logs) > 1
+    for step, values in logs:
+        stop = (step - before) // rows.shape[1]
+        found = [values[f"safety/{name}"] for name in names]
+        np.testing.assert_allclose(found, rows[start:stop].mean(axis=(0, 1)), rtol=1e-9)
+        start = stop
+    return callback
+
+
+@pytest.mark.parametrize("kind", ["SB3VecEnv", "make_vec_env"])
+def test_logs_are_about_all_steps_since_the_last_one(kind):
+    monitored = shielded("monitor")
+    env = SB3VecEnv(monitored.vector(4)) if kind == "SB3VecEnv" else make_vec_env(monitored.single, n_envs=4, seed=0)
+    tiny = {"n_steps": 32, "batch_size": 128, "n_epochs": 1, "device": "cpu", "seed": 0}
+    model = PPO("MlpPolicy", env, **tiny)
+    callback = logged_alike(model, 128 * 12, 3)
+    assert callback.violation_steps > 0
+    first = callback.violation_steps, callback.history[-1].steps
+    # Another callback where the model goes on, and the same one where it counts its steps anew.
+    goes_on = logged_alike(model, 128 * 6, 2, reset_num_timesteps=False)
+    assert [point.steps for point in goes_on.history][:2] == [first[1] + 128, first[1] + 256]
+    again = logged_alike(PPO("MlpPolicy", env, **tiny), 128 * 4, 1, callback=callback)
+    assert again.history[-1].steps == 128 * 4
+    assert again.violation_steps == again.history[-1].violation_steps < 128 * 4
+
+
+def test_logs_of_algorithms_without_rollouts_are_about_all_steps():
+    env = make_vec_env(shielded().single, n_envs=2, seed=0)
+    model = SAC("MlpPolicy", env, learning_starts=10_000, seed=0)
+    logged_alike(model, 1000, 1)
 
 
 def test_monitor_keeps_the_episodes_totals():

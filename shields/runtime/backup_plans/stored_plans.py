@@ -67,7 +67,9 @@ class Lookahead:
 
         If not, `keep` and `complete` leave the decision of mode "project" as it is.
         """
-        return bool(np.size(stored)) or self.planner.may_do_better(estimate, errors.shape, proposed, projected)
+        if not np.isnan(self.as_stored(stored)[0, 0]):
+            return True
+        return self.planner.may_do_better(estimate, errors.shape, proposed, projected)
 
     def keep(
         self, decided: Decision, valid: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray

@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import json
 import pickle
 from dataclasses import replace
 from fractions import Fraction
@@ -132,6 +133,26 @@ def test_input_that_is_disturbed_on_its_way_counts_by_the_limits_of_its_state():
     assert replace(quiet, disturbance_bound=[0.02, 0.0]).reach[1] == 1.0
     with pytest.raises(ValueError, match="belongs to a plant with another disturbance_bound"):
         replace(quiet, disturbance_bound=[0.01, 0.5])
+
+
+def test_a_state_counts_as_a_past_input_only_if_it_is_that_for_every_member():
+    def of(leak):
+        model = {"A": [[0.5, 0.1 + 0.2 * leak], [0.0, leak]], "B": [[0.0], [1.0]], "box": [2.0, 12.0], "u_max": 1.0}
+        return LinearPlant(**model | {"dt": 1.0} | QUIET | {"disturbance_bound": [0.01, 0.0]})
+
+    found = [
+        LinearPlant.family([of(0.0), of(0.9)]),
+        LinearPlant.family([of(0.9), of(0.0)]),
+        LinearPlant.family([of(-0.9), of(0.9)]),
+        LinearPlant.family(of, {"leak": (0.0, 0.9)}, monotone=True),
+    ]
+    wanted = [[0.09 * 12.0, 0.45 * 12.0]] * 2 + [[0.18 * 12.0, 0.9 * 12.0], [0.09 * 12.0, 0.45 * 12.0]]
+    for plant, (first, second) in zip(found, wanted, strict=True):
+        shape = plant.remainder.bound.shape_matrix
+        assert first**2 / shape[0, 0] + second**2 / shape[1, 1] <= 1.0
+        assert inputs_under_way(plant) == 0
+        assert plant.reach[1] == 12.0
+    np.testing.assert_allclose(found[0].remainder.bound.shape_matrix, found[1].remainder.bound.shape_matrix)
 
 
 def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_members():
@@ -266,6 +287,42 @@ def test_members_are_at_rest_where_somebody_says_so():
     assert "given" not in plant.remainder.sentence
 
 
+@pytest.mark.parametrize("more", [{}, {"input_delay": 2}, {"du_max": 0.5}, {"input_delay": 1, "du_max": 0.4}])
+def test_members_may_rest_with_other_inputs(more):
+    def cart(mass):
+        model = ([[0.0, 1.0], [0.0, -0.5 / mass]], [[0.0], [1.0 / mass]], [[1.0, 0.0]], [[0.0]])
+        limits = {"state_limits": ([0.0, -2.0], [2.0, 2.0]), "input_limits": (-2.0, 2.0)}
+        rests = {"operating_state": [1.0, 0.0], "operating_input": [0.3 * mass]}
+        return LinearPlant.from_statespace(model, dt=0.1, **limits, **rests, **QUIET, **more)
+
+    plant = LinearPlant.family(cart, {"mass": (0.95, 1.05)}, monotone=True, at_rest=True)
+    np.testing.assert_allclose(plant.operating_input, 0.3)
+    np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [-2.0, 2.0])
+    past = inputs_under_way(plant)
+    np.testing.assert_allclose(plant.reach[2 : 2 + past], 2.3)
+    moves = np.abs(plant.remainder.family.members[:, :2, -1]).max(axis=0)
+    np.testing.assert_allclose(moves, [0.05 * 0.3 * 0.00495, 0.05 * 0.3 * 0.0976], rtol=0.1)
+
+
+def test_rounding_of_operating_points_is_no_step():
+    def pushed(k):
+        decay = np.exp(-0.5 * k)
+        model = {"A": [[decay, 0.0], [0.0, 1.0]], "B": [[0.5 * (1.0 - decay) / k], [0.1]], "dt": 0.5}
+        bounds = {"disturbance_bound": (np.eye(2), [-0.01, 0.0], [0.03, 0.02]), "sensor_bound": 0.02}
+        return LinearPlant(**model, box=[1.0, 1.0], u_max=1.0, initial_bound=0.02, **bounds)
+
+    plant = LinearPlant.family(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    assert np.sqrt(plant.remainder.bound.shape_matrix[1, 1]) < 1e-9
+
+
+def test_other_members_are_another_plant(tmp_path):
+    TRUCK.save(tmp_path / "plant.json")
+    content = json.loads((tmp_path / "plant.json").read_text())
+    content["plant"]["remainder"]["family"]["members"][0][0][-1] += 5.0
+    (tmp_path / "other.json").write_text(json.dumps(content))
+    assert LinearPlant.load(tmp_path / "other.json").fingerprint != TRUCK.fingerprint
+
+
 def test_two_ended_disturbances_move_each_member():
     def pushed(k):
         return tank(k, disturbance_bound=([[1.0]], [-0.01], [0.03]))
@@ -310,6 +367,7 @@ REFUSED = {
     "ends": (lambda: LinearPlant.family(truck_trailer, {"mass": (4.0, 3.0)}, monotone=True), "low < high"),
     "ranges of plants": (lambda: LinearPlant.family(TRUCKS, MASSES), "about a function"),
     "one plant": (lambda: LinearPlant.family(TRUCKS[:1]), "two plants or more"),
+    "no truth value": (lambda: LinearPlant.family(TRUCKS, at_rest="no"), "at_rest must be"),
     "no plant": (lambda: LinearPlant.family([*TRUCKS, 3]), "must be of type LinearPlant"),
     "another box": (lambda: LinearPlant.family(two(box=[1.0, 1.0])), "member 1 has another box"),
     "another noise": (lambda: LinearPlant.family(two(disturbance_bound=0.1)), "another disturbance_bound"),

@@ -240,6 +240,23 @@ def test_decisions_are_the_same_after_pickling_and_do_not_depend_on_what_was_dec
             np.testing.assert_array_equal(one.plan, other.plan)
 
 
+class NoArray:
+    def __array__(self, *_, **__):
+        raise TypeError
+
+
+@pytest.mark.parametrize("name", ["cart-pole, polytope"])
+def test_what_is_no_plan_counts_as_none(name):
+    shield, rng = shield_of(name), np.random.default_rng(6)
+    cases = situations(shield, rng, 60)
+    expected = decisions(shield, cases)
+    assert "projected" in {one.reason for one in expected}
+    for stored in ([[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)], NoArray(), None, "plan", [[1e9]], np.ones((99, 1))):
+        for one, other in zip(expected, decisions(shield, cases, stored), strict=True):
+            assert one.reason == other.reason
+            np.testing.assert_array_equal(one.input, other.input)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_decisions_one_by_one_equal_those_of_a_batch(name):
     shield, rng, count = shield_of(name), np.random.default_rng(5), 60
