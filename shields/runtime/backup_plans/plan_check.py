@@ -50,11 +50,11 @@ class PlanTest:
         self._row_rounding = prediction.rounding[:, None, None] * (np.abs(prediction.rows) @ prediction.sizes[1:])
         roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
         self._end_rounding = np.array(roundings).T
+        # Of rows at every step: what estimate and first input do, shape (n + m, N, r), and what later inputs may do.
         effects = prediction.rows @ prediction.forced
         first, later = effects[..., : plant.m], effects[..., plant.m :]
-        self._by_first = (
-            np.concatenate([prediction.rows @ prediction.powers[1:], first], axis=2).reshape(-1, plant.n + plant.m).T
-        )
+        by_first = np.concatenate([prediction.rows @ prediction.powers[1:], first], axis=2)
+        self._by_first = np.ascontiguousarray(by_first.transpose(2, 0, 1))
         self._by_others = later @ np.tile(plant.input_middle, prediction.steps - 1) - prediction.middle
         self._reach_of_others = np.abs(later) @ np.tile(plant.input_half, prediction.steps - 1) + SLACK
         self._most = min(MOST_REMEMBERED, max(1, MOST_NUMBERS // (prediction.steps * len(prediction.rows))))
@@ -103,14 +103,24 @@ class PlanTest:
 
         Elsewhere none is certified: some row, on the way or at every end, is beyond its limit whatever inputs follow.
         """
-        count, k = len(estimates), len(self.prediction.plant.box)
-        values = (np.concatenate([estimates, firsts], axis=1) @ self._by_first).reshape(count, *self._by_others.shape)
-        limits = self._row_limits(estimates, tightening, slice(None), slice(None))
-        kept = np.abs(values + self._by_others) <= limits + self._reach_of_others
-        in_box: np.ndarray = np.all(kept[..., :k], axis=2)
-        ends = np.ones_like(in_box) if self.prediction.ends else np.all(kept, axis=2)
-        ends[:, 1:] &= np.logical_and.accumulate(in_box[:, :-1], axis=1)
-        return np.any(ends[:, shortest - 1 :], axis=1)
+        both, k = np.concatenate([estimates, firsts], axis=1), len(self.prediction.plant.box)
+        late = slice(shortest - 1, None)
+        in_box = self._may_keep(both, estimates, tightening, slice(None), slice(k))
+        on_the_way = np.ones_like(in_box)
+        np.logical_and.accumulate(in_box[:, :-1], axis=1, out=on_the_way[:, 1:])
+        ends = on_the_way[:, late]
+        if not self.prediction.ends:
+            ends &= in_box[:, late] & self._may_keep(both, estimates, tightening, late, slice(k, None))
+        return np.any(ends, axis=1)
+
+    def _may_keep(
+        self, both: np.ndarray, estimates: np.ndarray, tightening: Tightening, steps: slice, rows: slice
+    ) -> np.ndarray:
+        """Returns whether each of some rows is within its limits at some steps for some later inputs, (E, steps)."""
+        others, matrix = self._by_others[steps, rows], self._by_first[:, steps, rows]
+        values = (both @ matrix.reshape(len(matrix), -1)).reshape(len(both), *others.shape)
+        limits = self._row_limits(estimates, tightening, steps, rows) + self._reach_of_others[steps, rows]
+        return np.all(np.abs(values + others) <= limits, axis=2)
 
     @own_error_state
     def certified(

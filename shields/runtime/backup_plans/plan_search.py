@@ -119,18 +119,19 @@ class Planner:
         then K, or the saturated regulator. The first candidate that is certified and long enough counts, and is all
         that is looked at; the solver is not asked.
         """
-        tightening, plans = self.test.tightenings_of(shapes), self._none_for(len(estimates))
-        may_begin = self.test.may_begin(estimates, tightening, proposed, shortest)
+        tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
+        plans = self._best(estimates, tightening, continued[:, :1], proposed, shortest)
+        left = np.flatnonzero(plans.lengths < self.enough)
+        left = left[self.test.may_begin(estimates[left], tightening.some(left), proposed[left], shortest)]
         for next_of in (
-            lambda some: self._continued(estimates[some], proposed[some])[:, :1],
-            lambda some: self._continued(estimates[some], proposed[some])[:, 1:],
+            lambda some: continued[some, 1:],
             lambda some: self._limited(estimates[some], proposed[some], stored[some]),
         ):
-            left = np.flatnonzero(may_begin & (plans.lengths < self.enough))
             if not left.size:
                 break
             found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left], shortest)
             self.improve(plans, left, found)
+            left = left[plans.lengths[left] < self.enough]
         return plans
 
     def _none_for(self, count: int) -> Plans:
