@@ -312,7 +312,7 @@ def test_rounding_of_operating_points_is_no_step():
         return LinearPlant(**model, box=[1.0, 1.0], u_max=1.0, initial_bound=0.02, **bounds)
 
     plant = LinearPlant.family(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
-    assert np.sqrt(plant.remainder.bound.shape_matrix[1, 1]) < 1e-9
+    assert np.sqrt(plant.remainder.bound.shape_matrix[1, 1]) < 1e-5  # of a limit of 1
 
 
 def test_other_members_are_another_plant(tmp_path):
