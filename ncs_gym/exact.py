@@ -27,6 +27,8 @@ def product(*factors: np.ndarray) -> np.ndarray:
     Args:
         factors: Shapes (n, k), (k, l), .., the last one (l, p) or (l,).
     """
+    if not len(factors[0]):
+        return np.zeros((0, *factors[-1].shape[1:]))
     columns = [*factors[:-1], factors[-1].reshape(len(factors[-1]), -1)]
     exact = reduce(lambda left, right: left * right, map(_rational, columns))
     return _rounded(exact).reshape((len(factors[0]), *factors[-1].shape[1:]))

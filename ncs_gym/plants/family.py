@@ -114,11 +114,11 @@ def _around_center(plant: P, center: np.ndarray | None) -> P:
         return plant
     input_ends = plant.input_ends - moved[n:]
     stored = is_row_of_past_input(plant)
-    ends = np.where(stored, plant.box_ends, plant.box_ends - plant.box @ moved[:n])
+    ends = np.where(stored, plant.box_ends, plant.box_ends - exact.product(plant.box, moved[:n]))
     if (past := np.flatnonzero(stored)).size:
         ends[:, past] = np.tile(input_ends / plant.input_half, len(past) // plant.m)
     box = in_units_of_range(plant.box, *ends)
-    mixed = in_units_of_range(plant.mixed_rows, *(plant.mixed_ends - plant.mixed_rows @ moved))
+    mixed = in_units_of_range(plant.mixed_rows, *(plant.mixed_ends - exact.product(plant.mixed_rows, moved)))
     return replace(
         plant,
         operating_state=center[:n],
@@ -144,7 +144,7 @@ def _covering(bounds: list[Ellipsoid | None], plant: LinearPlant) -> Ellipsoid |
         return bounds[0]
     widths = np.where(np.isfinite(plant.reach[: plant.n]), plant.reach[: plant.n], 1.0)
     excess = (off / (widths * widths[:, None])).sum(axis=2).max(axis=0)
-    if excess.max() > SAME**2:
+    if excess.max() > SAME:
         raise ValueError("the members of a family may differ in A and B alone, and one has another disturbance_bound")
     return Ellipsoid(shapes[0] + np.diag((1.0 + ROUNDING) * excess * widths**2))
 
@@ -211,7 +211,7 @@ def _matrices(plants: list[P]) -> np.ndarray:
 def _terms_of_step(plants: list[P], matrices: np.ndarray) -> np.ndarray:
     """Returns the largest sum of terms that s of a member is made of, shape (n,); zero for past inputs."""
     n, sizes = plants[0].n, np.abs(_resting_points(plants)) + np.abs(_center_of(plants))
-    terms = [np.abs(each[:, :-1]) @ size + size[:n] for each, size in zip(matrices, sizes, strict=True)]
+    terms = [exact.product(np.abs(each[:, :-1]), size) + size[:n] for each, size in zip(matrices, sizes, strict=True)]
     return np.max(terms, axis=0) * (np.arange(n) < n - min(map(inputs_under_way, plants)))
 
 

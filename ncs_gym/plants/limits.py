@@ -34,6 +34,8 @@ _POINT_TO_GIVE = {
 NEARLY_SYMMETRIC = 1e-12
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
 EQUILIBRIUM_PRECISION = 1e-12
+# What is found of such a point is rounded to this, in units of the limits.
+POINT_PRECISION = 1e-11
 
 
 def as_box_rows(value: Any, n: int) -> np.ndarray:
@@ -192,7 +194,7 @@ def _output_rows(outputs: Any, center: np.ndarray) -> Rows:
         row = as_vector(row, len(center), "a row of output_limits")
         if np.abs(row).max() < SMALLEST_NUMBER:
             raise ValueError(f"every row of output_limits must limit something, got {shown(row.tolist())}")
-        ends = _from_center((low, high), np.array([row @ center]), "the ends in output_limits")
+        ends = _from_center((low, high), exact.product(row[None], center), "the ends in output_limits")
         found.append(in_units_of_range(row[None], *ends))
     return _joined(found)
 
@@ -218,7 +220,9 @@ def _mixed_rows(given: Any, state: np.ndarray, applied: np.ndarray) -> Rows:
                 f"every limit in mixed_limits must be about an input, got {shown(row.tolist())}: output_limits are "
                 "those of states alone"
             )
-        ends = _from_center((low, high), np.array([row @ np.concatenate([state, applied])]), "the ends in mixed_limits")
+        ends = _from_center(
+            (low, high), exact.product(row[None], np.concatenate([state, applied])), "the ends in mixed_limits"
+        )
         found.append(in_units_of_range(row[None], *ends))
     return _joined(found)
 
@@ -314,7 +318,7 @@ def _with_residual(bound: Ellipsoid, missing: np.ndarray, rows: np.ndarray) -> E
     n = len(missing)
     if not missing.any():
         return bound
-    gram = rows.T @ rows
+    gram = exact.product(rows.T, rows)
     lacking = np.diag(n * np.square(2.0 * np.abs(missing)))
     return Ellipsoid(outer_sum(bound.shape_matrix, lacking, gram + np.eye(n) * np.trace(gram) / n))
 
@@ -454,6 +458,17 @@ def _is_between_ends(bound: Any) -> bool:
     return first is not None and first.ndim == 2
 
 
+def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
+    """Returns values, shape (k,), rounded to about `POINT_PRECISION` of limits; `per_limit`, (k,), is 1 over these.
+
+    What LAPACK finds differs between processors in the last bits, and a point is part of what identifies a plant. Steps
+    are powers of two, so that rounding itself is exact.
+    """
+    sizes = np.where(per_limit > 0.0, 1.0 / np.where(per_limit > 0.0, per_limit, 1.0), np.maximum(np.abs(values), 1e-9))
+    steps = np.exp2(np.round(np.log2(POINT_PRECISION * sizes)))
+    return np.rint(values / steps) * steps
+
+
 def _around_middle_of_disturbance(
     A: np.ndarray,
     B: np.ndarray,
@@ -495,19 +510,24 @@ def _around_middle_of_disturbance(
     sizes = np.vstack([np.hstack([rows, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
     found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
     x, u = found[:n], reach * found[n:]
-    missing = exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))
+
+    def missing_at(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))
+
     terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(middle) + np.abs(x)
-    if not (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
+    if not (np.abs(missing_at(x, u)) <= EQUILIBRIUM_PRECISION * terms).all():
         raise ValueError(
             f"{name}: no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} "
             "per step, whatever the input: give symmetric ends around zero"
         )
-    ends, inputs = ends - rows @ x, inputs - u[None]
+    x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
+    missing = missing_at(x, u)
+    ends, inputs = ends - exact.product(rows, x), inputs - u[None]
     mixed = {}
     if fields.get("mixed_rows") is not None:
         coupled = as_mixed_rows(fields["mixed_rows"], n + m)
         mixed = {"mixed_ends": as_row_ends(fields.get("mixed_ends"), len(coupled), "mixed_ends")}
-        mixed["mixed_ends"] = mixed["mixed_ends"] - coupled @ np.concatenate([x, u])
+        mixed["mixed_ends"] = mixed["mixed_ends"] - exact.product(coupled, np.concatenate([x, u]))
     if not all(((each[0] < 0.0) & (each[1] > 0.0)).all() for each in (ends, inputs, *mixed.values())):
         raise ValueError(
             f"{name}: the middle of this disturbance moves the operating point to {shown((point[0] + x).tolist())} "

@@ -66,6 +66,30 @@ def all_plants():
     return found
 
 
+def plants_around_points():
+    """Plants whose operating point is found or moves limits: disturbances with two ends, limits of sums, families."""
+    rng, found = np.random.default_rng(0), {}
+
+    def of(index, k=1.0, **more):
+        A = np.array([[0.9, 0.1 * k, 0.0], [0.0, 1.0, 0.2], [-0.1, 0.0, 0.7 * k]]) + 1e-3 * index
+        limits = {"state_limits": ([-1.0, -3.0, 0.1], [2.0, 5.0, 1e3]), "input_limits": ([-0.4, 0.0], [1.0, 70.0])}
+        limits["output_limits"] = [([1.0, 0.7, 1e-3], -20.0, 30.0)]
+        ends = [-0.01, 0.0, -0.3], [0.03, 0.002, 0.1]
+        bounds = {"disturbance_bound": (np.eye(3), *ends), "sensor_bound": 0.01, "initial_bound": 0.01}
+        rests = {"operating_state": [0.3, 0.7, 33.3], "operating_input": [0.1, 30.1]}
+        B = [[0.2 * k, 0.01], [0.0, 0.03], [0.1, 0.5]]
+        return LinearPlant(A=A, B=B, dt=0.1, **limits, **bounds, **rests, **more)
+
+    for index in rng.integers(0, 99, 6).tolist():
+        found[f"point {index}"] = of(index)
+        found[f"family {index}"] = LinearPlant.family([of(index), of(index, 1.01)], at_rest=True)
+    return found
+
+
+def print_points():
+    print(json.dumps({name: plant.fingerprint for name, plant in plants_around_points().items()}))
+
+
 def derived(plant):
     """Every number that a proof takes from a plant, as text."""
     bounds = (plant.disturbance, plant.sensor_error_with(0.01), plant.initial_error)
@@ -132,6 +156,14 @@ def test_plants_are_the_same_numbers_under_other_kernels_and_their_certificates_
     numbers, *verdicts = under(kernels, *call(print_plants_and_verdicts, tmp_path), wide=wide).splitlines()
     assert json.loads(numbers) == {name: derived(plant) for name, (plant, _) in all_plants().items()}
     assert verdicts == [f"{name} True" for name in sorted(IDS)]
+
+
+@on_x86
+@pytest.mark.parametrize("wide", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+def test_operating_points_that_are_found_are_the_same_under_other_kernels(wide):
+    expected = {name: plant.fingerprint for name, plant in plants_around_points().items()}
+    assert json.loads(under("Prescott", *call(print_points), wide=wide)) == expected
 
 
 @on_x86
