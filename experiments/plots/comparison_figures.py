@@ -96,10 +96,8 @@ def scatter_figure(summary: dict[str, dict[str, Any]]) -> CaptionedFigure:
 
 def _vertical_bars(summary: dict[str, dict[str, Any]]) -> str:
     """Returns what markers and their vertical bars are, given the summaries of arms, as the beginning of a sentence."""
-    runs, over = (
-        max(arm["runs"] for arm in summary.values()),
-        {arm["eval_return_ci95_over"] for arm in summary.values()},
-    )
+    runs = max(arm["runs"] for arm in summary.values())
+    over = {arm["eval_return_ci95_over"] for arm in summary.values()}
     text = f"Small dots are runs, markers the mean of {runs} of them; " if runs > 1 else "A marker is one run; "
     if over == {"episodes"}:
         return text + "vertical bars are Student's 95 % interval of the mean return over episodes,"

@@ -69,7 +69,7 @@ def plant_of_middle(
         )
     if rest_matters or family.members[..., -1].any():
         basis += ", each being at rest at its operating point (given)"
-    moved = [_around_center(each, family.center) for each in plants]
+    moved = [_around_center(each, _center_of(plants)) for each in plants]
     first = moved[0]
     middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
     middle[:, -1] = 0.0
@@ -106,9 +106,8 @@ def _center_of(plants: list[P]) -> np.ndarray:
     return 0.5 * (points.min(axis=0) + points.max(axis=0))  # exact where all are the same
 
 
-def _around_center(plant: P, center: np.ndarray | None) -> P:
+def _around_center(plant: P, center: np.ndarray) -> P:
     """Returns a plant whose limits are those in deviations from another state and input, shape (n + m,)."""
-    assert center is not None
     moved, n = center - _resting_points([plant])[0], plant.n
     if not moved.any():
         return plant

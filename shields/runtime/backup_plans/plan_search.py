@@ -100,15 +100,22 @@ class Planner:
         self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray, projected: np.ndarray
     ) -> bool:
         """Returns whether `beginning_with` or `find` might find a plan, for one environment that has none stored."""
-        if self.enough > 1 or self.test.prediction.ends:
-            return True
         x_hat, u = estimate[None], proposed[None]
-        if self.test.may_begin(x_hat, self.test.tightenings_of(shape[None]), u, self.enough)[0]:
-            return True
         beginnings = np.full((1, 4, 1, len(proposed)), np.nan)
         beginnings[0, 0, 0] = projected
-        projected_at, *others_at = _distances(self._completed(x_hat, beginnings), u)[0]
-        return min(others_at) < projected_at
+        if self._begins_closer(x_hat, u, beginnings)[0]:
+            return True
+        return bool(self.test.may_begin(x_hat, self.test.tightenings_of(shape[None]), u, self.enough)[0])
+
+    def _begins_closer(self, estimates: np.ndarray, proposed: np.ndarray, beginnings: np.ndarray) -> np.ndarray:
+        """Returns where a candidate of `find` begins closer than the projected input, or need not, shape (E,).
+
+        The projected inputs are the first of the first beginnings, NaN where there are none; shape (E, 4, any, m).
+        """
+        if self.enough > 1 or self.test.prediction.ends:
+            return np.ones(len(estimates), np.bool_)
+        projected_at, *others_at = _distances(self._completed(estimates, beginnings[:, :, :1]), proposed).T
+        return np.isnan(beginnings[:, 0, 0, 0]) | np.any(others_at < projected_at, axis=0)
 
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray, shortest: int
@@ -133,11 +140,6 @@ class Planner:
             self.improve(plans, left, found)
             left = left[plans.lengths[left] < self.enough]
         return plans
-
-    def _none_for(self, count: int) -> Plans:
-        """Returns that no plan was found for so many environments."""
-        inputs = np.zeros((count, self.horizon, self._plant.m))
-        return Plans(inputs, np.zeros(count, np.int64), np.full(count, np.inf))
 
     def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
         """Returns proposals followed by what is stored for later and then K, or by the saturated regulator."""
@@ -177,12 +179,9 @@ class Planner:
         """
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
-        begins_closer = np.ones(len(estimates), np.bool_)
-        if self.enough == 1 and not self.test.prediction.ends:
-            firsts = self._completed(estimates, beginnings[:, :, :1])
-            projected_at, *others_at = _distances(firsts, proposed).T
-            begins_closer = np.isnan(projected[:, 0]) | np.any(others_at < projected_at, axis=0)
-        plans, some = self._none_for(len(estimates)), np.flatnonzero(begins_closer)
+        nothing = np.zeros((len(estimates), self.horizon, self._plant.m))
+        plans = Plans(nothing, np.zeros(len(estimates), np.int64), np.full(len(estimates), np.inf))
+        some = np.flatnonzero(self._begins_closer(estimates, proposed, beginnings))
         if some.size:
             known = (each[some] for each in (estimates, shapes, proposed, projected, stored, beginnings))
             self.improve(plans, some, self._found(*known))
