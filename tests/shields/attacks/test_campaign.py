@@ -38,7 +38,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", 
 MODES = ("project", "switch", "boundary", "lookahead", SILENCE)
 # Environments and steps behind one network in the part, and behind each of them in the whole.
 SIZES = {
-    "SafetyShield": ((None, 60), (None, 400)),
+    "SafetyShield": ((None, 120), (None, 400)),
     "VectorSafetyShield": ((20, 30), (100, 150)),
     "SafeLoop": ((1, 150), (1, 600)),
 }
@@ -90,7 +90,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
             far = {claim: gauge for claim, gauge in outcome.largest.items() if gauge < SHARE[through] * CLOSE[claim]}
             assert not far
     counts = sum((outcome.counts for outcome in outcomes), Counter())
-    assert counts["overridden"] < counts["steps"]
+    assert counts["overridden"] < counts["steps"] or counts["guaranteed"] == 0  # a single start that is not proved
     if "lookahead" not in mode:  # there a plan may save every proposal
         assert counts["overridden"] > 0 or through == "SafetyShield"  # which has few steps
         assert counts["guaranteed"] == counts["steps"]

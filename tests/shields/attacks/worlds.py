@@ -164,6 +164,15 @@ def starts_of(case: Case, mode: str, rng: np.random.Generator, count: int) -> np
     return np.where(rng.random(count) < 0.3, starts, spread)
 
 
+def corners_of(plant: Any, rng: np.random.Generator, count: int | None) -> dict[str, Any]:
+    """Which members of a family episodes have, as an option of `reset`: those with all parameters at their ends."""
+    family = plant.remainder and plant.remainder.family
+    if family is None:
+        return {}
+    corners = family.parameters[rng.integers(len(family.parameters), size=count)]
+    return {"parameters": dict(zip(family.names, corners.T, strict=True))}
+
+
 def planning(case: Case, mode: str) -> dict[str, Any]:
     """Settings of a shield or loop in this mode."""
     if mode == SILENCE:
@@ -212,7 +221,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         """Starts episodes, and watches them from there."""
         if not options:
             states = starts_of(case, mode, rng, size)
-            options = {"state": states.T if many else states[:, 0]}
+            options = {"state": states.T if many else states[:, 0], **corners_of(plant, rng, count)}
         _, info = shield.reset(seed=seed if watch.states is None else None, options=options)
         watch.begin(column(info["state"]), column(info["shield_guaranteed"]), kept(info), begun)
         counts["starts outside S"] += np.count_nonzero(watch.held & (watch.safe.gauges(watch.states) > 1.0))
