@@ -561,7 +561,10 @@ class LinearPlant(LimitValues, HardBounds):
         if len(self.mixed_rows):
             self._require_symmetric("box_ends and input_ends")
         u_max = np.minimum(-self.input_low, self.input_high)
-        return replace(self, box=self.symmetric_box, box_ends=None, input_ends=(-u_max, u_max))
+        given = self.remainder  # bounded for more states and inputs than are left
+        remainder = given and Remainder(given.bound, given.proved, given.basis, given.family)
+        limits = {"box": self.symmetric_box, "box_ends": None, "input_ends": (-u_max, u_max)}
+        return replace(self, **limits, remainder=remainder)
 
     @cached_property
     def symmetric_box(self) -> np.ndarray:

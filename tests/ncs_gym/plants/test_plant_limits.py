@@ -54,6 +54,15 @@ def test_largest_symmetric_limits_are_those_of_the_nearer_ends():
     assert plant.fingerprint == LinearPlant(**ROOM, box=2.0, u_max=2.0).fingerprint
 
 
+def test_symmetric_limits_inside_those_of_a_remainder_have_it_too():
+    plants = [LinearPlant(**ROOM | {"A": [[a]]}, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0)) for a in (0.8, 0.82)]
+    family = LinearPlant.family(plants, at_rest=True)
+    assert not family.is_symmetric
+    assert family.symmetric.is_symmetric
+    assert family.symmetric.remainder.bound is family.remainder.bound
+    assert family.symmetric.members is family.members
+
+
 def test_limits_that_are_symmetric_but_for_rounding_are_the_short_form():
     point = {"operating_state": [0.1], "operating_input": [0.1]}
     plant = LinearPlant(**ROOM | point, state_limits=(-0.1, 0.3), input_limits=(-0.2, 0.4))
