@@ -311,16 +311,15 @@ def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
 
 def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
     def threads():
+        import importlib
         import os
 
         import torch
 
-        return os.environ["OMP_NUM_THREADS"], torch.get_num_threads()
+        importlib.import_module("agents.sb3_vec_env")  # as every training does, which sets torch's
+        return os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads()
 
-    import torch
-
-    found = ray.get(ray_backend.as_remote(threads, HALF_A_CORE).remote())
-    assert found == (os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads())
+    assert ray.get(ray_backend.as_remote(threads, HALF_A_CORE).remote()) == threads()
 
 
 def test_listener_that_is_no_ray_is_one_sentence_in_bounded_time(monkeypatch):
