@@ -12,6 +12,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant, certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
+from ncs_gym.network.channel import in_time
 from ncs_gym.validation import as_count, own_error_state
 from shields.certificate import Certificate
 from shields.certificate_text import counted, labeled
@@ -71,7 +72,7 @@ class Silence:
     def __str__(self) -> str:
         def until(steps: int) -> str:
             most, number = " or more" if steps >= MOST_STEPS else "", self.max_age + steps
-            seconds = "" if self.dt is None else f" ({number * self.dt:.3g} s)"
+            seconds = "" if self.dt is None else f" ({in_time(number * self.dt)})"
             return f"{counted(number, 'step')}{seconds}{most} old"
 
         kept = (

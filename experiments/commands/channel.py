@@ -13,7 +13,7 @@ from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant, PacketLog, contract_of
-from ncs_gym.network.channel import in_steps
+from ncs_gym.network.channel import in_steps, in_time
 from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.reading import MOST_PACKETS
 from shields import Certificate, silence_of
@@ -42,7 +42,13 @@ def channel(settings: ChannelSettings) -> None:
     require_place(settings.out)
     plant = None if settings.plant is None else LinearPlant.load(settings.plant)
     promise, least = _promise(settings, plant), settings.least_safe_steps
-    known = settings.sampling_period or (plant.dt if plant is not None else promise.dt if promise is not None else None)
+    step = plant.dt if plant is not None else promise.dt if promise is not None else None
+    known = settings.sampling_period or step
+    if step is not None and known != step:
+        raise ValueError(
+            f"--sampling-period {known:g} s: a control step of the {'environment' if plant is None else 'plant'} takes "
+            f"{step:g} s, and its contract counts these: leave the option out, or --env, --plant and --certificate"
+        )
     log = PacketLog.load(settings.file, settings.ping_period, known or 1.0)
     dt = known or log.period
     contract = None if promise is None else promise.contract
@@ -97,6 +103,7 @@ def _numbers(log: PacketLog, dt: float, asked: tuple[int, ...]) -> dict[str, Any
         "steps": len(ages),
         "steps_with_a_packet": samples,
         "left_out": log.left_out(dt),
+        "tells_losses": log.tells_losses,
         "lost": len(log.sent) - len(arrived),
         "most_lost_in_a_row": int((edges[1::2] - edges[::2]).max(initial=0)),
         "delay_quantiles": [float(each) for each in np.quantile(arrived, [0.5, 0.9, 0.99, 1.0])],
@@ -118,30 +125,29 @@ def _replay(log: PacketLog, dt: float) -> int | None:
 def _text(log: PacketLog, found: dict[str, Any]) -> str:
     dt = found["sampling_period"]
     empty = found["steps"] - found["steps_with_a_packet"]
-    median, ninety, ninety_nine, longest = map(_time, found["delay_quantiles"])
+    median, ninety, ninety_nine, longest = map(in_time, found["delay_quantiles"])
     first, second = found["kept_by_halves"]
     again = "none" if found["replay"] is None else f"max_age = {found['replay']}"
     too_old = f", more than the {MAX_AGE} of any contract" if found["kept"] > MAX_AGE else ""
     lines = [
         log.read_as,
-        f"{found['packets']:,} packets in {_time(found['span'])}, {found['steps']:,} control steps of {_time(dt)}: "
+        f"{found['packets']:,} packets in {in_time(found['span'])}, {found['steps']:,} control steps of {in_time(dt)}: "
         f"{_placed(empty, found['left_out'])}.",
         log.disagreement,
-        f"Lost: {found['lost']:,} packets ({100.0 * found['lost'] / found['packets']:.3g} %), at most "
-        f"{found['most_lost_in_a_row']:,} in a row.",
+        _lost(found),
         f"Delays: median {median}, 90 % {ninety}, 99 % {ninety_nine}, longest {longest}.",
-        f"Contract kept by the record: max_age = {found['kept']}{too_old} ({_time(found['kept'] * dt)}; first half "
+        f"Contract kept by the record: max_age = {found['kept']}{too_old} ({in_time(found['kept'] * dt)}; first half "
         f"{first}, second half {second}); by its replay around and around: {again}.",
     ]
     header = ["max_age", "time", "broken", "per hour", "[95 % CI]", "longest", "half 1", "half 2"]
     cells = [
         [
             str(row["max_age"]),
-            _time(row["max_age"] * dt),
+            in_time(row["max_age"] * dt),
             f"{row['times']:,}",
             rate_text(row["per_hour"]),
             f"[{', '.join(map(rate_text, row['per_hour_ci95']))}]",
-            _time(row["longest"] * dt) if row["longest"] else "-",
+            in_time(row["longest"] * dt) if row["longest"] else "-",
             *map(rate_text, row["halves"]),
         ]
         for row in found["contracts"]
@@ -153,16 +159,17 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
     return "\n".join([*map(wrapped, filter(None, lines)), "", text_table([header, *cells]), "", wrapped(note)])
 
 
+def _lost(found: dict[str, Any]) -> str:
+    if not found["tells_losses"]:
+        return "Lost: the record does not say. Ages do not need it: they count from the newest sample that arrived."
+    share = 100.0 * found["lost"] / found["packets"]
+    return f"Lost: {found['lost']:,} packets ({share:.3g} %), at most {found['most_lost_in_a_row']:,} in a row."
+
+
 def _placed(empty: int, left_out: int) -> str:
     if not empty and not left_out:
         return "one in each"
     return f"{empty:,} steps have no packet, {left_out:,} packets are not the first of their step and are left out"
-
-
-def _time(seconds: float) -> str:
-    if seconds < 0.9995:
-        return f"{1000.0 * seconds:.3g} ms"
-    return f"{seconds:.4g} s" if seconds < 3600.0 else f"{seconds / 3600.0:,.4g} h"
 
 
 def _compared(promise: _Promise, found: dict[str, Any]) -> str:
@@ -182,7 +189,7 @@ def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:
     return (
         f"If a shield promises {in_steps(least)} (shield_safe_steps) at every step at which the contract is kept, the "
         f"box is kept at least until the newest sample is {in_steps(oldest)} old, "
-        f"{_time(oldest * found['sampling_period'])}. In the record it was older "
+        f"{in_time(oldest * found['sampling_period'])}. In the record it was older "
         f"{how_often(_row(found, oldest))}."
     )
 

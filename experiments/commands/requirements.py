@@ -23,6 +23,7 @@ from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
 from experiments.terminal import say, text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant, PacketLog
+from ncs_gym.network.channel import in_time
 from ncs_gym.network.requests import spare_samples
 from ncs_gym.reading import json_values, read_file
 from shields import Certificate, Network, Requirement, Requirements
@@ -342,8 +343,8 @@ def _boundary_text(largest: LargestAge) -> str:
         return f"{where}: no certificate was found for any age of the newest sample that was asked."
     if largest.certified == inf:
         return f"{where}: a certificate needs no samples at all."
-    period = 1000.0 * network.sampling_period
-    text = f"{where}: the newest sample may be {largest.certified:g} steps ({largest.certified * period:g} ms) old"
+    time = in_time(largest.certified * network.sampling_period)
+    text = f"{where}: the newest sample may be {largest.certified:g} steps ({time}) old"
     beyond = "" if largest.none_found is None else f"; for {_shown_age(largest.none_found)} no certificate was found"
     return f"{text}{beyond}."
 

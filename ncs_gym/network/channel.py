@@ -221,6 +221,13 @@ def in_steps(number: int) -> str:
     return "1 step" if number == 1 else f"{number} steps"
 
 
+def in_time(seconds: float) -> str:
+    """Returns a duration with its unit: milliseconds, seconds or hours."""
+    if seconds < 0.9995:
+        return f"{1000.0 * seconds:.3g} ms"
+    return f"{seconds:.4g} s" if seconds < 3600.0 else f"{seconds / 3600.0:,.4g} h"
+
+
 def _bursts(loss: dict[str, Any]) -> GilbertElliott:
     """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one."""
     try:

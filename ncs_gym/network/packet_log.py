@@ -17,7 +17,7 @@ from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_
 # coarser than the second fraction they cannot be placed.
 _SAME, _COARSE = 1e-6, 1e-2
 # A pause is longer than so many usual periods; span and number disagree by more than this fraction.
-_PAUSE, _DISAGREE = 2.0, 0.01
+_PAUSE, _DISAGREE = 1.5, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,7 @@ class PacketLog(ReadOnlyArrays):
         sent: When each was sent, shape (k,), ascending [s].
         delays: How long each was on its way, shape (k,); NaN for a lost one [s].
         read_as: How a file was read, in sentences; empty for a log that was not read from a file.
+        tells_losses: Whether all lost packets are in it; False for a file that has no line of them, and no numbers.
 
     Raises:
         ValueError: If there are fewer than two packets or more than two million, they are not in order or all sent at
@@ -47,6 +48,7 @@ class PacketLog(ReadOnlyArrays):
     sent: np.ndarray
     delays: np.ndarray
     read_as: str = ""
+    tells_losses: bool = True
 
     def __post_init__(self) -> None:
         sent, delays = as_setting(self.sent), as_setting(self.delays)
@@ -81,7 +83,7 @@ class PacketLog(ReadOnlyArrays):
         """
         period = None if period is None else as_number(period, "period", low=0.0, low_open=True)
         record = read_record(path, period, as_number(step, "step", low=0.0, low_open=True))
-        return cls(record.sent, record.delays, record.read_as)
+        return cls(*record)
 
     @property
     @own_error_state
@@ -107,7 +109,10 @@ class PacketLog(ReadOnlyArrays):
         if not len(pauses):
             return f"{sentence}."
         many = "in one pause" if len(pauses) == 1 else f"in {len(pauses):,} pauses"
-        return f"{sentence}. Nothing was sent {many}, {pauses.max():.4g} s at the longest, which count as lost."
+        return (
+            f"{sentence}. There is no packet {many}, {pauses.max():.4g} s at the longest: for a loop it is as if "
+            "samples were lost there."
+        )
 
     @own_error_state
     def trace(self, dt: float) -> tuple[int, ...]:

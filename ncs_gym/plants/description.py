@@ -72,6 +72,8 @@ def _sized(size: float, unit: str) -> str:
 
 def _between(name: str, low: float, high: float, center: float, unit: str) -> str:
     """Returns the limits of a quantity, given its ends from the operating point and that point."""
+    farthest = max((abs(end) for end in (low, high) if abs(end) < np.inf), default=np.inf)
+    center = 0.0 if abs(center) <= _ZERO * farthest else center
     if center == 0.0 and low == -high:
         return f"|{name}| <= {_sized(high, unit)}"
     point = f" (operating point {center:.6g})" if center else ""

@@ -79,7 +79,8 @@ def linear_model(
             disturbance is declared beside the remainder.
 
     Warns:
-        NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far and the nearest point that stays.
+        NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far and the nearest point that stays; or a
+            function is at rest at `operating_state`, as if it were one of absolute values.
 
     Raises:
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
@@ -120,11 +121,39 @@ def linear_model(
             "half-widths of the box in one step: shrink the box, the input limits or dt"
         )
     remainder = Remainder(bound, jacobian_bounds is not None, basis)
-    return LinearPlant(A=A, B=B, remainder=remainder, **common, **settings)
+    plant = LinearPlant(A=A, B=B, remainder=remainder, **common, **settings)
+    if isinstance(moving, FunctionProcess) and _rests_at_operating_point(moving, plant, drawn):
+        warn_caller(
+            "the function is at rest at operating_state with operating_input, as one of absolute values is, and not "
+            "what it is near zero: if it takes absolute values, give lambda x, u: f(x0 + x, u0 + u) - x0, one of "
+            "deviations",
+            NoEquilibriumWarning,
+        )
+    return plant
 
 
 class NoEquilibriumWarning(UserWarning):
-    """The point that deviations are counted from does not stay where it is, and the remainder has to hold that."""
+    """The point that deviations are counted from does not stay where it is, or is not where they seem to be counted."""
+
+
+def _rests_at_operating_point(process: FunctionProcess, plant: LinearPlant, steps: _Steps) -> bool:
+    """Returns whether a function that should be one of deviations is at rest where an absolute one is.
+
+    That says nothing of one which does the same there, as a linear one.
+    """
+    x0, u0 = plant.operating_state, plant.operating_input
+    if not x0.any() and not u0.any():
+        return False
+    try:
+        moved = process.step(plant, x0, u0) - x0
+        near = [
+            process.step(plant, x0 + x, u0 + u) - x0
+            for x, u in zip(steps.states.T[:REPEATED], steps.inputs.T[:REPEATED], strict=True)
+        ]
+    except Exception:  # whatever a function of deviations does so far away
+        return False
+    off = np.abs(np.array([moved, *(np.array(near) - steps.moved.T[:REPEATED])])) / plant.half_widths
+    return bool(off[0].max() <= NO_EQUILIBRIUM < off[1:].max())
 
 
 def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.ndarray], common: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -127,7 +128,10 @@ class Family(ReadOnlyArrays):
     def of_function(self, parameters: np.ndarray) -> np.ndarray:
         """Returns [A, B, s] of the plant that the function returns, shape (n, n + m + 1), whatever it is."""
         assert self.function is not None
-        plant, shape = self.function(**dict(zip(self.names, parameters.tolist(), strict=True))), self.members.shape[1:]
+        shape = self.members.shape[1:]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # those at the corners of the ranges were shown
+            plant = self.function(**dict(zip(self.names, parameters.tolist(), strict=True)))
         return matrices_of(plant, shape, np.zeros(shape[1] - 1) if self.center is None else self.center)
 
     def _fitting(self, fixed: np.ndarray) -> np.ndarray:

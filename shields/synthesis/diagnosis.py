@@ -123,7 +123,7 @@ def infeasibility_around(plant: LinearPlant, contract: ChannelContract | None, r
         contract: Channel contract, if there is one.
         reason: Why a gain that bears the radii was given up.
     """
-    tolerance = _tolerance_around(plant, contract)
+    tolerance = tolerance_around(plant, contract)
     if tolerance.margin == 0.0:
         return _unstabilized()
     if tolerance.margin >= 1.0:
@@ -535,21 +535,21 @@ def is_feasible(plant: LinearPlant, contract: ChannelContract | None, *, polytop
     """
     try:
         if needs_resting_point(plant):
-            return _tolerance_around(plant, contract, SUFFICIENT_MARGIN).margin >= SUFFICIENT_MARGIN
+            return tolerance_around(plant, contract, SUFFICIENT_MARGIN).margin >= SUFFICIENT_MARGIN
         problem, _ = design_problem(plant, contract)
     except Infeasible:
         return False
     return _margin(problem, polytope=polytope, enough=SUFFICIENT_MARGIN) >= SUFFICIENT_MARGIN
 
 
-class _Tolerance(NamedTuple):
+class Tolerance(NamedTuple):
     """The factor on all radii that the best gain bears, and the limits, as in `distances`, that it reaches first."""
 
     margin: float
     binding: tuple[int, ...] = ()
 
 
-def _tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enough: float = np.inf) -> _Tolerance:
+def tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enough: float = np.inf) -> Tolerance:
     """Returns what the best gain bears that is found for limits with two ends, around the resting point that suits it.
 
     Args:
@@ -563,19 +563,19 @@ def _tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enou
     rest = farthest_from_limits(plant)
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
 
-    def tolerance(K: np.ndarray, at_least: float = 0.0) -> _Tolerance:
+    def tolerance(K: np.ndarray, at_least: float = 0.0) -> Tolerance:
         needs = needs_of(Feedback(K, errors.promised, plant.disturbance.shape_matrix, rest), plant)
         if needs is None:
-            return _Tolerance(at_least)
+            return Tolerance(at_least)
         farthest = farthest_equilibrium(plant, needs)
-        return _Tolerance(max(farthest.distance, at_least), tuple(farthest.binding.tolist()))
+        return Tolerance(max(farthest.distance, at_least), tuple(farthest.binding.tolist()))
 
     start = max_margin_gain(problem, problem.covering_error_shape)
     gains = [(K, 0.0) for K in regulators(plant)]
     if start is not None:  # the problem is without limits of states and inputs together
         margin = 0.0 if len(plant.mixed_rows) else start.margin
         gains.insert(0, (problem.to_physical(start.L, start.K)[1], margin))
-    best = _Tolerance(0.0)
+    best = Tolerance(0.0)
     for K, at_least in gains:
         best = max(best, tolerance(K, at_least), key=lambda each: each.margin)
         if best.margin >= enough:

@@ -12,6 +12,7 @@ import shields
 from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, Packet, TraceChannel, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
+from ncs_gym.network.channel import in_time
 from shields import CertificateError, VectorSafetyShield, certificate_for
 from shields.silence import MOST_STEPS, way_back
 from shields.synthesis.faces import Extremes, Faces
@@ -201,7 +202,7 @@ def test_box_is_kept_in_silence_whatever_an_agent_does():
 def test_it_is_said_in_words_that_fit_a_terminal():
     found = registered("drifts")[2]
     text = " ".join(str(found).split())
-    assert f"is {6 + found.anywhere} steps ({0.1 * (6 + found.anywhere):.3g} s) old" in text
+    assert f"is {6 + found.anywhere} steps ({in_time(0.1 * (6 + found.anywhere))}) old" in text
     assert "after 12, 60 and 600 steps" in text
     assert max(map(len, str(found).splitlines())) <= 80
 

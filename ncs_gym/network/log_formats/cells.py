@@ -214,6 +214,11 @@ def is_date(cell: str) -> bool:
         return False
 
 
+def has_zone(cell: str) -> bool:
+    """Returns whether a date names its time zone."""
+    return datetime.fromisoformat(cell).tzinfo is not None
+
+
 def number_in(cell: str, *, dated: bool = False) -> Decimal | None:
     """Returns the number in a cell, or seconds since 1970 if it is a date, None for a mark of what is lost.
 

@@ -89,21 +89,23 @@ def _without_wraps(sent: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return numbers + size * np.cumsum(np.append(0, np.where(fits, wraps, 0.0))).astype(np.int64)
 
 
-def with_absent(sent: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_absent(sent: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Returns the packets of a record without numbers with those that a regular sender sent and that have no line.
 
-    A receiver's log has lines of what it received alone. Nothing is added where times between packets are no multiples
-    of the usual one, nor to longer pauses, in which nothing was sent, nor where more would be added than there are, as
-    between bursts.
+    A receiver's log has lines of what it received alone. Nothing is added to longer pauses, in which nothing was sent.
+
+    Returns:
+        When each was sent, and how long it took, shape (k,) each [s]; None if the sender is not regular: times between
+        packets are no multiples of the usual one, or more would be added than there are, as between bursts.
     """
     usual = median_gap(sent)
     periods = np.diff(sent) / usual if usual else np.zeros(len(sent) - 1)
     whole = np.rint(periods)
     if len(whole) < _FEWEST or np.mean(np.abs(periods - whole) <= _IRREGULAR) < _REGULAR_SHARE:
-        return sent, delays
+        return None
     missing = np.where((whole >= 2.0) & (whole <= _LONGEST_ABSENCE), whole - 1.0, 0.0).astype(np.int64)
     if missing.sum() > len(sent):
-        return sent, delays
+        return None
     require_packets(len(sent) + int(missing.sum()))
     return _with_lost(sent, delays, missing)
 

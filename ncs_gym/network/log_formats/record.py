@@ -23,11 +23,13 @@ class Record(NamedTuple):
         sent: When each packet was sent, shape (k,), ascending [s].
         delays: How long each was on its way, shape (k,); NaN for a lost one [s].
         read_as: How the file was read, in sentences.
+        tells_losses: Whether it says which packets were lost; False where those without a line are not noticed.
     """
 
     sent: np.ndarray
     delays: np.ndarray
     read_as: str
+    tells_losses: bool = True
 
 
 def require_time(numbers: np.ndarray, sent: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from ncs_gym.network.log_formats.cells import (
     YEARS,
     Column,
     count_in,
+    has_zone,
     is_date,
     number_in,
     require_moment,
@@ -59,12 +60,14 @@ def of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column], 
     order = np.argsort(lines.sent, kind="stable")
     sent, delays = lines.sent[order], lines.delays[order]
     _require_receiver(sent, delays, lines.places[order])
-    missing, restarts, absent, usual = 0, 0, 0, median_gap(sent)
+    missing, restarts, absent, usual, tells_losses = 0, 0, 0, median_gap(sent), True
     if len(lines.numbers):
         sent, delays, missing, restarts = with_missing(sent, delays, lines.numbers[order])
-    else:
-        sent, delays = with_absent(sent, delays)
+    elif completed := with_absent(sent, delays):
+        sent, delays = completed
         absent = len(sent) - len(order)
+    else:
+        tells_losses = bool(np.isnan(delays).any())
     _require_likely_units(columns, lines, sent, delays)
     read_as = _first_sentence(columns, lines)
     if lines.marked:
@@ -79,7 +82,12 @@ def of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column], 
             f" {many(absent, 'packet')} without a line, where one is usually sent every {1000.0 * usual:.4g} ms, "
             "stand for lost ones."
         )
-    return Record(sent, delays, read_as + _last_sentences(columns, names))
+    if not tells_losses:
+        read_as += (
+            " It does not say which packets were lost: no line marks one, packets have no number, and the times "
+            "between them are not regular enough to notice those without a line."
+        )
+    return Record(sent, delays, read_as + _last_sentences(columns, names), tells_losses)
 
 
 def _until(columns: dict[str, Column]) -> Column:
@@ -96,6 +104,7 @@ def _lines_of(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column],
     sent_at, until, has_arrivals = columns["sent"], _until(columns), "received" in columns
     sent, arrived, delays, marked, at_zero, numbers, flagged, places = [], [], [], [], [], [], [], []
     origin, units, scale, until_scale, dated = Decimal(0), ("", ""), Decimal(1), Decimal(1), False
+    zones: set[bool] = set()
     for line, cells in rows:
         cells += (width - len(cells)) * [""]
         if not sent and (dated := is_date(cells[sent_at.index])):
@@ -110,6 +119,14 @@ def _lines_of(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column],
         flagged.append(says_lost(line, cells, columns))
         if start is None:
             _refuse_line(line, has_arrivals)
+        if dated:
+            moments = [cells[each.index] for each in ([sent_at, until] if has_arrivals else [sent_at])]
+            zones.update(has_zone(each) for each in moments if is_date(each))
+            if len(zones) > 1:
+                raise ValueError(
+                    f"line {line}: some times name their time zone and others, which would be read in UTC, do not: "
+                    "write it into all of them"
+                )
         if not sent:
             units = _units_in(columns, start)
             scale, until_scale = (UNITS[unit] for unit in units)
@@ -166,10 +183,10 @@ def _require_likely_units(columns: dict[str, Column], lines: _Lines, sent: np.nd
             "the names of the columns (sent_ms), and the days of a spreadsheet as seconds"
         )
     delay_is_guessed = not until.unit and ("received" not in columns or guessed)
-    if delay_is_guessed and float(np.nanmedian(np.append(delays, -np.inf))) >= 1.0:
+    if delay_is_guessed and (median := float(np.nanmedian(np.append(delays, -np.inf)))) >= 1.0:
         raise ValueError(
-            "the names of the columns say no unit, and most packets would take more than a second: name it, as in "
-            "sent_ms and received_ms, or sent_s and received_s"
+            f"the names of the columns say no unit, and packets would take {median:.4g} s as a rule: name it, as in "
+            "sent_ms and received_ms, or sent_s and received_s; if it is seconds, is one clock set by the other?"
         )
 
 

@@ -357,7 +357,7 @@ def test_synthesize_then_verify(tmp_path):
     assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
     assert "Beyond the contract" not in made.stdout + checked.stdout  # it has none
     exceeded = ncs("verify", Path(shields.__file__).parent / "packaged_certificates" / "Pendulum-v0.json").stdout
-    assert "until the newest is 3 steps (0.15 s) old" in " ".join(exceeded.partition("Beyond")[2].split())
+    assert "until the newest is 3 steps (150 ms) old" in " ".join(exceeded.partition("Beyond")[2].split())
 
 
 @pytest.mark.cases(1)

@@ -57,7 +57,7 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     asked = ("--send-periods", 1, "--losses", 2, 14, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
     found = ncs("requirements", "--plant", plant_file, *asked)
     assert found.returncode == 0, found.stderr
-    assert "may be 10 steps (1000 ms) old" in (said := " ".join(found.stdout.split()))
+    assert "may be 10 steps (1 s) old" in (said := " ".join(found.stdout.split()))
     assert "The widest contract with a certificate, 10 steps of 0.1 s, the record breaks 3 times, " in said
     assert "Read as a table: 'sent' in s, 'received' in s." in said
     assert json.loads((tmp_path / "r/summary.json").read_text())["log"].startswith("Read as a table")

@@ -405,6 +405,33 @@ def test_summary_that_disagrees_is_named(written):
     assert "4 packets and 3 answers, its lines 4 and 2" in log.read_as
 
 
+def test_losses_that_a_record_cannot_tell_are_told_as_unknown(written):
+    """A receiver's log of a sender with so much jitter, and the same with numbers or with a mark."""
+    rng = np.random.default_rng(7)
+    sent = 0.02 * np.arange(2000) + rng.uniform(-0.004, 0.004, 2000)
+    came = np.flatnonzero(np.append(rng.random(1999) >= 0.02, True))
+    lost = 2000 - len(came) - came[0]
+    log = PacketLog.load(written("sent,received\n" + "".join(f"{sent[k]},{sent[k] + 0.006}\n" for k in came)))
+    assert not log.tells_losses
+    assert "It does not say which packets were lost" in log.read_as
+    assert "as if samples were lost" in log.disagreement
+    numbered = PacketLog.load(
+        written("seq,sent,received\n" + "".join(f"{k},{sent[k]},{sent[k] + 0.006}\n" for k in came))
+    )
+    assert numbered.tells_losses
+    assert np.isnan(numbered.delays).sum() == lost
+    marks = ["" if k not in set(came) else f"{sent[k] + 0.006}" for k in range(2000)]
+    marked = PacketLog.load(written("sent,received\n" + "".join(f"{sent[k]},{marks[k]}\n" for k in range(2000))))
+    assert marked.tells_losses
+    assert np.isnan(marked.delays).sum() == 2000 - len(came)
+
+
+def test_times_with_and_without_their_zone_are_not_compared(written):
+    rows = "".join(f"2025-06-15T17:06:{k}+02:00,2025-06-15T17:06:{k}.0078\n" for k in range(10, 40))
+    with pytest.raises(ValueError, match="line 2: some times name their time zone and others"):
+        PacketLog.load(written("sent,received\n" + rows))
+
+
 def test_span_and_number_of_packets_that_disagree_are_named(written):
     rows = "".join(
         f"{sent},{sent + 0.01}\n" for sent in [0.1 * i for i in range(100)] + [75.0 + 0.1 * i for i in range(9)]
@@ -435,7 +462,7 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent_ms,delay\n0,5\n20,6\n", "'sent_ms' is in ms and 'delay' has no unit: name it delay_ms or delay_s"),
         ("sent,delay_ms\n0,5\n20,6\n", "'delay_ms' is in ms and 'sent' has no unit: name it sent_ms or sent_s"),
         ("sent,delay\n1700000000000,5\n1700000000020,6\n", "'sent' is in ms and 'delay' has no unit"),
-        ("sent_s,latency\n0,5.5\n0.02,6\n", "most packets would take more than a second"),
+        ("sent_s,latency\n0,5.5\n0.02,6\n", "packets would take 5.5 s as a rule"),
         *(
             (f"sent_ms,delay_ms,{name}\n0,5,0\n20,6,{cell}\n", f"'{name}' may say which packets were lost")
             for name, cell in {

@@ -55,7 +55,8 @@ def test_largest_symmetric_limits_are_those_of_the_nearer_ends():
 
 
 def test_symmetric_limits_inside_those_of_a_remainder_have_it_too():
-    plants = [LinearPlant(**ROOM | {"A": [[a]]}, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0)) for a in (0.8, 0.82)]
+    limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
+    plants = [LinearPlant(**ROOM | limits | {"A": [[pole]]}) for pole in (0.8, 0.82)]
     family = LinearPlant.family(plants, at_rest=True)
     assert not family.is_symmetric
     assert family.symmetric.is_symmetric
