@@ -133,7 +133,7 @@ class Agent:
         Raises:
             ValueError: If the environment was made with something that a file does not keep.
         """
-        _require_kept(self.kwargs, self.env)
+        require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
         self.model.save(buffer)
         content = {
@@ -214,7 +214,7 @@ def pretrained(env_id: str) -> Agent:
     return Agent.load(pretrained_folder(env_id))
 
 
-def _require_kept(kwargs: Mapping[str, Any], env_id: str) -> None:
+def require_kept(kwargs: Mapping[str, Any], env_id: str) -> None:
     """Raises ValueError unless keyword arguments of an environment are those that files of agents keep."""
     for name, value in kwargs.items():
         try:
@@ -248,7 +248,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
             "that registers it, or on the command line give --env module:id, with the name of that module"
         )
     kwargs = content.get("kwargs", {})
-    _require_kept(kwargs, env_id)
+    require_kept(kwargs, env_id)
     if not _is_for_plant_of(env_id, kwargs, content["plant"]):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
@@ -375,7 +375,7 @@ def _normalization_for(
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {
     *("task", "disturbance", "noise", "initial_set", "terminate_on_violation", "allow_assumption_violation", "process"),
-    *("contract", "downlink", "downlink_contract", "observe", "horizon", "between_samples"),
+    *("contract", "downlink", "downlink_contract", "observe", "horizon", "between_samples", "max_episode_steps"),
 }
 _PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 _USE = """## Use

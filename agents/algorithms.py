@@ -106,6 +106,8 @@ def _arguments(
         own["batch_size"] = min(own["batch_size"], hyperparams["n_steps"] * env.num_envs)
     if (stored := hyperparams.get("stored_action", "proposed")) not in ("proposed", "applied"):
         raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
+    if stored == "applied" and name not in ON_POLICY and own.get("n_steps", 1) != 1:
+        raise ValueError('stored_action="applied" is stored step by step: n_steps must be 1')
     if stored == "applied":
         own["replay_buffer_class"] = AppliedActionBuffer
     if (deviation := hyperparams.get("noise_std")) is not None:

@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ncs_gym import Channel
 from ncs_gym.envs.json_settings import from_json
-from ncs_gym.validation import AroundEnvironment, as_matrix, as_number, shown
+from ncs_gym.validation import AroundEnvironments, as_matrix, as_number, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import plan_horizon
@@ -167,7 +167,7 @@ class LoopConfig:
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
 
 
-class CostPenalty(AroundEnvironment, VectorWrapper):
+class CostPenalty(AroundEnvironments, VectorWrapper):
     """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
 
     Args:
@@ -190,7 +190,7 @@ class CostPenalty(AroundEnvironment, VectorWrapper):
         return observation, rewards - self.penalty * cost, terminated, truncated, info
 
 
-class ResidualActions(AroundEnvironment, VectorWrapper):
+class ResidualActions(AroundEnvironments, VectorWrapper):
     """Applies u = gain x_hat plus the agent's part, clipped to the limits (Silver et al. 2018).
 
     Args:

@@ -17,8 +17,20 @@ class TrainingStopped(RuntimeError):
     """Ends a training from a callback as Ctrl-C does: what was learned is kept."""
 
 
-@dataclass(frozen=True)
-class TrainingPoint:
+class _Totals:
+    """Mixin of dataclasses of numbers, in which NaN is equal to NaN."""
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return all(one == two or (one != one and two != two) for one, two in pairs)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPoint(_Totals):
     """Totals of a training run up to some step.
 
     Attributes:
@@ -43,8 +55,8 @@ def history_document(history: Sequence[TrainingPoint]) -> str:
     return json.dumps(points, allow_nan=False) + "\n"
 
 
-@dataclass(frozen=True)
-class Episode:
+@dataclass(frozen=True, eq=False)
+class Episode(_Totals):
     """One finished episode of an evaluation.
 
     Attributes:

@@ -108,7 +108,8 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         require_batched_infos(info, "SB3VecEnv")
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos = [{key: value[e] for key, value in _dense(info).items()} for e in range(self.num_envs)]
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._keep_first_infos(np.ones(self.num_envs, np.bool_), info)
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
         self._resetting = np.zeros(self.num_envs, np.bool_)
         return observation
@@ -136,16 +137,22 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
             infos[e] = self._last_info(e, dense, last[e], bool(truncated[e] and not terminated[e]))
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
-            if self._masks and self._mode is not AutoresetMode.SAME_STEP:
+            if self._mode is AutoresetMode.SAME_STEP:
+                self._keep_first_infos(done, info)
+            elif self._masks:
                 fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
                 observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
-                for e in np.flatnonzero(done).tolist():
-                    self.reset_infos[e] = {key: value[e] for key, value in _dense(reset_info).items()}
+                self._keep_first_infos(done, reset_info)
             elif self._mode is AutoresetMode.NEXT_STEP:
                 self._resetting = done
                 return observation, rewards.astype(np.float32), done, infos
         self._resetting = np.zeros(self.num_envs, np.bool_)
         return observation, rewards.astype(np.float32), done, infos
+
+    def _keep_first_infos(self, chosen: np.ndarray, info: dict[str, Any]) -> None:
+        """Keeps the infos of the first observations of some environments' episodes, bool (N,)."""
+        for e in np.flatnonzero(chosen).tolist():
+            self.reset_infos[e] = {key: value[e] for key, value in _dense(info).items()}
 
     def _last_info(self, e: int, dense: dict[str, np.ndarray], observation: np.ndarray, cut: bool) -> dict[str, Any]:
         """Returns the info of environment e, whose episode ends in this step."""
@@ -207,7 +214,10 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         """
         inner = self.vector_env.unwrapped
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
-            raise AttributeError(f"the environments of {type(inner).__name__} have no methods of their own to call")
+            hint = f": call vec_env.vector_env.{method_name}" if hasattr(self.vector_env, method_name) else ""
+            raise AttributeError(
+                f"the environments of {type(inner).__name__} have no methods of their own to call{hint}"
+            )
         results = inner.call(method_name, *method_args, **method_kwargs)
         return [results[e] for e in self._get_indices(indices)]
 

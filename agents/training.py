@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent import Agent, Normalization
+from agents.agent import Agent, Normalization, require_kept
 from agents.algorithms import build_model, normalized_env
 from agents.callbacks import DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
@@ -23,7 +23,7 @@ from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym.envs.json_settings import to_json
-from ncs_gym.validation import reason_of
+from ncs_gym.validation import reason_of, warn_caller
 from shields.atomic_write import write_atomically
 
 # Observations that the normalization of an agent to go on from counts as.
@@ -88,13 +88,22 @@ def train(
         checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and when the
             training is interrupted (Ctrl-C); None for none.
 
+    Warns:
+        UserWarning: If files of agents do not keep a keyword argument of the environment.
+
     Raises:
         ValueError: If the agent to go on from does not fit, the algorithm or a hyperparameter is unknown,
-            stable-baselines3 does not take a value, or no step is left to learn in.
+            stable-baselines3 does not take a value, no step is left to learn in, or checkpoints cannot be saved.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     hyperparams = complete_hyperparams(algorithm, hyperparams)
     before = history[-1].steps if history else 0
+    try:
+        require_kept(_settings(loop), loop.env)
+    except ValueError as error:
+        if checkpoints is not None:
+            raise
+        warn_caller(f"the agent cannot be saved: {error}", UserWarning)
     envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams, before)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     beside: list[BaseCallback] = []
@@ -197,5 +206,10 @@ def _agent(
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
         least_safe_steps=0 if loop.shield is None else loop.shield.least_safe_steps,
-        kwargs={name: to_json(value) for name, value in loop.kwargs.items() if name != "channel"},
+        kwargs=_settings(loop),
     )
+
+
+def _settings(loop: LoopConfig) -> dict[str, Any]:
+    """Returns the keyword arguments of an environment as files of agents keep them; the channel has its own place."""
+    return {name: to_json(value) for name, value in loop.kwargs.items() if name != "channel"}

@@ -152,6 +152,29 @@ class AroundEnvironment:
         object.__setattr__(self, name, value)
 
 
+class AroundEnvironments(AroundEnvironment):
+    """Mixin of wrappers of vector environments: their specification says that they are there, as single ones' does.
+
+    Gymnasium's vector wrappers leave themselves out, so that `gym.make_vec` would make environments without a shield or
+    a network of it. With this it is refused: vector wrappers are put around what `make_vec` makes.
+    """
+
+    env: Any
+
+    @property
+    def spec(self) -> Any:
+        """Specification of the environments, with the wrappers around them; a copy, or None where there is none."""
+        from gymnasium.envs.registration import WrapperSpec
+
+        if (inside := self.env.spec) is None:
+            return None
+        kind, kwargs = type(self), getattr(self, "_saved_kwargs", None)
+        own = WrapperSpec(kind.__name__, f"{kind.__module__}:{kind.__name__}", kwargs)
+        spec = copy.deepcopy(inside)
+        spec.additional_wrappers += (own,)
+        return spec
+
+
 def require_not_inside(name: str, inside: Any, outside: str, until: Any = None) -> None:
     """Raises AttributeError if setting an attribute outside would have no effect, because something inside has it.
 

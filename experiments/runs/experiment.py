@@ -81,9 +81,14 @@ def run_of_arm(
         folder = pretrained_folder(loop.env)
         agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
     training_loop, loop = arm.loops(loop, certificate, settings)
+    if arm.is_trained and index == 0:
+        require_trainable(settings, training_loop)
     scenarios = other_scenarios(getattr(settings, "scenarios", ()))
     for scenario in scenarios:  # what cannot be simulated is refused before anything is trained
-        under(scenario, loop).single().close()
+        try:
+            under(scenario, loop).single().close()
+        except ValueError as error:
+            raise ValueError(f"--scenarios {scenario}: {error}") from None
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
     origin += "" if certificate.polytope is None else " with a polytope"
     return TrainingRun(

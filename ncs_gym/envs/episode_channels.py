@@ -14,7 +14,7 @@ from gymnasium.vector import VectorWrapper
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel, require_duration
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
-from ncs_gym.validation import AroundEnvironment, shown
+from ncs_gym.validation import AroundEnvironment, AroundEnvironments, shown
 
 
 class EveryEpisode(NamedTuple):
@@ -104,7 +104,9 @@ class EpisodeChannels:
             source, later = self._sources[e], self._own[e]
             if isinstance(source, EveryEpisode):
                 source, later = source.draw if source.first is None else source.first, EveryEpisode(source.draw)
-            self.now[e] = self._checked(source(rng), "what was drawn") if callable(source) else source
+            if callable(source):
+                source = self._checked(from_json(source(rng), (Channel,), "what was drawn"), "what was drawn")
+            self.now[e] = source
             self._sources[e] = later
         return self.now
 
@@ -170,7 +172,7 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
-        RecordConstructorArgs.__init__(self, channel=to_json(channel), downlink=to_json(downlink))
+        RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         if not env.has_wrapper_attr("episode_channel"):
             raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")
@@ -185,13 +187,15 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
             ValueError: See `RandomChannel`.
         """
         self._drawn = _drawn(channel, downlink)
+        self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
+        self._cached_spec = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; a channel among the options takes the place of a drawn one."""
         return self.env.reset(seed=seed, options=self._drawn | (options or {}))
 
 
-class VectorRandomChannel(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
+class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorArgs):
     """`RandomChannel` for an `NCSVectorEnv`: one is drawn for every episode of every one, in any autoreset mode.
 
     Args:
@@ -204,22 +208,35 @@ class VectorRandomChannel(AroundEnvironment, VectorWrapper, RecordConstructorArg
     """
 
     def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
-        RecordConstructorArgs.__init__(self, channel=to_json(channel), downlink=to_json(downlink))
+        RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
+        self._drawn: dict[str, Callable[[np.random.Generator], Any]] = {}
         self.draw_from(channel, downlink)
 
     def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
-        """See `RandomChannel.draw_from`."""
-        self._drawn = _drawn(channel, downlink)
+        """See `RandomChannel.draw_from`; also for episodes that begin by autoreset.
+
+        Raises:
+            ValueError: See `RandomChannel`; or if another of channel and downlink was drawn until now.
+        """
+        drawn = _drawn(channel, downlink)
+        if self._drawn and drawn.keys() != self._drawn.keys():
+            raise ValueError(f"draw_from takes the place of what was given: give {' and '.join(self._drawn)}")
+        self._drawn = drawn
+        self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; channels among the options take the place of drawn ones, in these episodes."""
         own = options or {}
-        drawn = {name: EveryEpisode(draw, own.get(name)) for name, draw in self._drawn.items()}
+        drawn = {name: EveryEpisode(partial(self._draw, name), own.get(name)) for name in self._drawn}
         # gymnasium's annotation leaves out the lists that its own vector environments take.
         return self.env.reset(seed=seed, options=own | drawn)  # pyright: ignore[reportArgumentType]
+
+    def _draw(self, name: str, rng: np.random.Generator) -> Any:
+        """Returns what is drawn now, whenever the environments began to ask for it."""
+        return self._drawn[name](rng)
 
 
 def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:

@@ -12,10 +12,33 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.validation import AroundEnvironment, as_number, as_numbers, require_batched_infos, shown
+from ncs_gym.validation import (
+    AroundEnvironment,
+    AroundEnvironments,
+    as_number,
+    as_numbers,
+    require_batched_infos,
+    shown,
+)
 
 
-class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
+class _WithCost:
+    """Mixin of what subtracts the cost of packets."""
+
+    _cost: float
+
+    @property
+    def cost(self) -> float:
+        """Of a packet, in units of the reward; it may be changed while an agent is trained."""
+        return self._cost
+
+    @cost.setter
+    def cost(self, value: float) -> None:
+        self._cost = as_number(value, "cost", low=0.0)
+        self._saved_kwargs, self._cached_spec = {"cost": self._cost}, None
+
+
+class RequestActions(_WithCost, AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """Lets an agent decide when samples are taken, at a price (docs/requests.md).
 
     The action has one entry more, in [-1, 1]: a sample is asked for where it is positive. The observation has two
@@ -34,9 +57,9 @@ class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: gym.Env, cost: float = 0.0) -> None:
-        RecordConstructorArgs.__init__(self, cost=cost)
-        self.cost = as_number(cost, "cost", low=0.0)
+        RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
+        self.cost = cost
         self._inner = _on_request(env)
         self._most = self._inner.request_limits
         self.action_space = _with_request(env.action_space)
@@ -66,7 +89,7 @@ class RequestActions(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
         return np.concatenate([observation, more]).astype(self.observation_space.dtype)
 
 
-class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorArgs):
+class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordConstructorArgs):
     """`RequestActions` for an `NCSVectorEnv`, possibly behind a shield.
 
     Args:
@@ -78,9 +101,9 @@ class VectorRequestActions(AroundEnvironment, VectorWrapper, RecordConstructorAr
     """
 
     def __init__(self, env: Any, cost: float = 0.0) -> None:
-        RecordConstructorArgs.__init__(self, cost=cost)
-        self.cost = as_number(cost, "cost", low=0.0)
+        RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
+        self.cost = cost
         self._inner = _on_request(env)
         if not isinstance(self._inner, NCSVectorEnv):
             raise ValueError(f"expected an NCSVectorEnv inside, got {type(self._inner).__name__}")

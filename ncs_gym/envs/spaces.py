@@ -151,6 +151,7 @@ class Observer:
         self._task, self._observe, self._horizon, self._has_warned = task, observe, horizon, False
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         self._low, self._high = (low[:, None], high[:, None]) if many else (low, high)
+        self._axis = ", shape (entries, N)" if many else ", shape (entries,)"
 
     def observation(self, known: Known, own: Any) -> np.ndarray:
         """Returns entries clipped to the space, shape (entries,) or (entries, N), float32.
@@ -165,7 +166,12 @@ class Observer:
         parts = [known.estimate, own]
         for name in self._observe:
             parts.append(self._observed(known, name))
-        entries = np.concatenate(parts)
+        try:
+            entries = np.concatenate(parts)
+        except ValueError:
+            raise ValueError(
+                f"{type(self._task).__name__}: observe must return an array of entries{self._axis}, got {shown(own)}"
+            ) from None
         if len(entries) != len(self._low):
             bounds = len(self._low) - len(entries) + len(own)
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -120,7 +121,7 @@ def zero_of(space: spaces.Space) -> Any:
 
 
 def snapshot(sample: Any) -> Any:
-    """Returns a sample that stays as it is, whatever environment or agent write into their own later."""
+    """Returns a sample or an action that stays as it is, whatever environment or agent write into their own later."""
     if isinstance(sample, np.ndarray):
         return sample.copy(order="K")
     if isinstance(sample, dict):
@@ -128,7 +129,7 @@ def snapshot(sample: Any) -> Any:
     if isinstance(sample, tuple):
         entries = map(snapshot, sample)
         return type(sample)(*entries) if hasattr(sample, "_fields") else tuple(entries)
-    return sample
+    return copy.deepcopy(sample)  # lists, tensors
 
 
 class Entries:

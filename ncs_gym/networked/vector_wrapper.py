@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import Space
 from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Dict, Tuple
 from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, iterate
@@ -26,10 +27,10 @@ from ncs_gym.networked.network_settings import (
 )
 from ncs_gym.networked.observations import is_batched, joined, quantized, snapshot, zero_of
 from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
-from ncs_gym.validation import require_batched_infos, shown
+from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 
-class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
+class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordConstructorArgs):
     """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
 
     Each environment has a network of its own; all draw from one generator, so that N = 1 is what `Networked` does (with
@@ -83,6 +84,11 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
         if not is_batched(env.single_observation_space):
             raise ValueError(
                 f"VectorNetworked takes observations that are arrays, not {shown(env.single_observation_space)}: put "
+                "Networked around each environment"
+            )
+        if isinstance(env.single_action_space, Dict | Tuple) or not is_batched(env.single_action_space):
+            raise ValueError(
+                f"VectorNetworked takes actions that are one array, not {shown(env.single_action_space)}: put "
                 "Networked around each environment"
             )
         require_no_restarts(env)
@@ -229,8 +235,9 @@ class VectorNetworked(ReadNetwork, VectorWrapper, RecordConstructorArgs):
             sends = arrivals.exchange(rng, self._steps, part, sample, self._earned if settings.delay_reward else None)
             self._packets += sends
         if settings.delay_reward:
-            newest = np.max([each.earned for each in self._arrivals], axis=0)
-            earned = np.where(done, self._earned, newest)
+            newest = np.argmax([each.stamp for each in self._arrivals], axis=0)
+            taken = np.array([each.earned for each in self._arrivals])[newest, np.arange(self.num_envs)]
+            earned = np.where(done, self._earned, taken)
             rewards = np.where(restarted, rewards, earned - self._told)
             self._told = np.where(restarted, 0.0, earned)
         if len(rows := restarted.nonzero()[0]):

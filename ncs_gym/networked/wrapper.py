@@ -199,9 +199,9 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         applied, action_age = action, 0
         if self._actuator is not None:
             require_action(self.action_space, action)
-            applied, action_age = self._actuator.exchange(rng, step, _kept(action))
+            applied, action_age = self._actuator.exchange(rng, step, snapshot(action))
         if self._keeps_actions:
-            self._decided.append(_kept(action))
+            self._decided.append(snapshot(action))
         if self._requests is not None:
             self._requests.decide(self._oldest)
         observation, reward, terminated, truncated, info = self.env.step(applied)
@@ -226,7 +226,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
                 self._packets += 1
             arrivals.take(link.carry(rng, step, packet))
         if settings.delay_reward:
-            earned = self._earned if terminated or truncated else max(each.earned for each in self._arrivals)
+            newest = max(self._arrivals, key=lambda each: each.stamp)
+            earned = self._earned if terminated or truncated else newest.earned
             reward, self._told = earned - self._told, earned
         return self._seen(), reward, terminated, truncated, self._with_network(info, applied, action_age)
 
@@ -291,7 +292,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             "measurement_age": age,
             "packet_arrived": arrived,
             "action_age": action_age,
-            "action_applied": applied.copy() if isinstance(applied, np.ndarray) else applied,
+            "action_applied": snapshot(applied),
             "packets": self._packets,
             **self._network,
         }
@@ -367,11 +368,6 @@ class _Actuator:
         elif self._idle == "neutral" or self._stamp < 0:
             return self._neutral, -1
         return self._action, step - self._stamp
-
-
-def _kept(action: Any) -> Any:
-    """Returns an action that stays as it is when its array is written over."""
-    return action.copy() if isinstance(action, np.ndarray) else action
 
 
 def nothing(actions: gym.Space) -> Any:

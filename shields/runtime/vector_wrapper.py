@@ -15,7 +15,7 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.validation import own_error_state, require_batched_infos
+from ncs_gym.validation import AroundEnvironments, own_error_state, require_batched_infos
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
@@ -44,7 +44,7 @@ class Clock(NamedTuple):
     ticks: int
 
 
-class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
+class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWrapper):
     """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
 
     Every info value has N as its first axis; `shield_reason` is an array of str objects, read-only while
@@ -54,7 +54,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], VectorWrapper):
     Args:
         env: An `NCSVectorEnv`, possibly wrapped; not by wrappers that change actions.
         certificate: A certificate, its `document`, or the path of its file; None synthesizes one for the environment's
-            plant and contract, once per process. A spec holds the document, so that it is JSON.
+            plant and contract, once per process.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.

@@ -12,6 +12,7 @@ from agents.agent_file import AgentError
 from agents.evaluation import evaluate
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
+from agents.results import TrainingPoint
 from agents.training import train
 from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate
@@ -127,6 +128,25 @@ def test_folder_keeps_how_the_environment_was_made(tmp_path):
     assert "least_safe_steps=2" in card
     with pytest.raises(ValueError, match="files of agents do not keep disturbance=<function"):
         replace(agent, kwargs={"disturbance": lambda *given: None}).save(tmp_path)
+
+
+def test_training_whose_agent_cannot_be_saved_is_told_so_before_it(tmp_path):
+    loop = LoopConfig(env=CRUISE, kwargs={"max_episode_steps": 50, "autoreset_mode": "SameStep"})
+    small = {"n_envs": 2, "n_steps": 16, "batch_size": 8}
+    with pytest.raises(ValueError, match="files of agents do not keep autoreset_mode='SameStep'"):
+        train(loop, 32, 0, hyperparams=small, checkpoints=tmp_path)
+    with pytest.warns(UserWarning, match="the agent cannot be saved: files of agents do not keep autoreset_mode"):
+        train(loop, 32, 0, hyperparams=small)
+    loop = LoopConfig(env=CRUISE, kwargs={"max_episode_steps": 50})
+    train(loop, 32, 0, hyperparams=small).agent.save(tmp_path)
+    assert Agent.load(tmp_path).env_kwargs["max_episode_steps"] == 50
+
+
+def test_totals_that_are_no_numbers_are_equal():
+    one, other = (TrainingPoint(8, float("nan"), 0, 0, float("nan")) for _ in range(2))
+    assert one == other
+    assert replace(one, episode_return=1.0) != other
+    assert [one] != [replace(one, steps=9)]
 
 
 def test_card_without_a_shield_names_none(folder, agent, certificate):

@@ -150,6 +150,46 @@ def test_what_is_drawn_from_changes_in_worker_processes_too(kind):
         envs.close()
 
 
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_infos_of_their_starts_say_so(mode):
+    envs = gym.make_vec(ID, num_envs=2, max_episode_steps=4, autoreset_mode=mode)
+    draws = VectorRandomChannel(envs, [Channel(loss=0.1)])
+    env = SB3VecEnv(draws)
+    env.seed(0)
+    env.reset()
+    draws.draw_from(lambda rng: {"loss": 0.5})
+    seen = []
+    for _ in range(13):
+        observation, _, _, infos = env.step(np.zeros((2, 1), np.float32))
+        seen.append(infos[1]["channel_loss"])
+        if "episode" in infos[1]:
+            assert env.reset_infos[1]["channel_loss"] == 0.5
+            np.testing.assert_allclose(observation[1][:2], env.reset_infos[1]["estimate"], rtol=1e-6)
+    assert seen == [0.1] * 4 + [0.5] * 9
+    with pytest.raises(ValueError, match="takes the place of what was given: give channel"):
+        draws.draw_from(downlink=[Channel()])
+    with pytest.raises(AttributeError, match=r"call vec_env\.vector_env\.draw_from"):
+        env.env_method("draw_from", [Channel()])
+
+
+def test_specification_of_vector_wrappers_makes_no_environments_without_them():
+    envs = gym.make_vec(ID, num_envs=2)
+    made_of = [VectorSafetyShield(envs), VectorRandomChannel(envs, [Channel()]), CostPenalty(envs, 1.0)]
+    made_of.append(VectorNetworked(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"), Channel(delay=1)))
+    for env in made_of:
+        assert env.spec.additional_wrappers[-1].name == type(env).__name__
+        assert not env.unwrapped.spec.additional_wrappers
+        with pytest.raises((gym.error.Error, ValueError)):
+            gym.make_vec(env.spec)
+
+
+def test_what_random_channels_draw_from_is_that_of_their_spec():
+    env = RandomChannel(gym.make(ID), [Channel(loss=0.1)])
+    assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.1
+    env.draw_from([Channel(loss=0.5)])
+    assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.5
+
+
 def test_penalty_of_a_shield_may_change_and_is_that_of_its_spec():
     for env in (shield(), shields()):
         env.penalty = 0.5

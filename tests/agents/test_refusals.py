@@ -64,6 +64,7 @@ HYPERPARAMS = [
     ("SAC", {"noise_type": "normal"}, "SAC: noise_type needs noise_std"),
     ("SAC", {"buffer_size": -1}, "buffer_size must be a whole number >= 1, got -1"),
     ("SAC", {"stored_action": "both"}, "stored_action must be"),
+    ("TD3", {"stored_action": "applied", "n_steps": 3}, "stored step by step: n_steps must be 1"),
     ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values, got 'policy_kwargs': "),
     ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values, got 'learning_rate': nan"),
     *(("PPO", {"policy_kwargs": {"net_arch": value}}, "net_arch must be widths >= 1") for value in

@@ -82,7 +82,7 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers
     gym.registry.pop("Plants/Truck-v0")
     del sys.modules["own_plants"]
     unknown = ncs("evaluate", model, cwd=folder)  # in a process that does not know the module
-    assert_one_sentence(unknown, "on the command line give --env module:Plants/Truck-v0, with the name of that module")
+    assert_one_sentence(unknown, "on the command line give --env module:id, with the name of that module")
 
 
 def test_own_plant_is_drawn(folder):

@@ -8,8 +8,11 @@ from itertools import count
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
+from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import DelayObservation, TimeLimit
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import DelayObservation, TimeLimit, TransformReward
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from ncs_gym import Channel, GilbertElliott, Networked, RandomChannel, RequestActions, TraceChannel, VectorNetworked
@@ -287,6 +290,49 @@ def test_rewards_travel_with_samples_if_asked_to_and_nothing_is_lost():
     for k, each in enumerate(later[1:-1], 1):
         newest = k - each[-1]["measurement_age"]
         assert sum(other[1] for other in later[1 : k + 1]) == sum(range(1, newest + 1))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("is_vector", [False, True])
+def test_rewards_travel_with_the_newest_of_several_samples(sign, is_vector):
+    channels = {"count": Channel(), "odd": Channel(delay=5)}
+
+    def make():
+        return TransformReward(Counter("dict", length=12), lambda reward: sign * reward)
+
+    if is_vector:
+        env, action = VectorNetworked(SyncVectorEnv([make, make]), channels, delay_reward=True), np.zeros((2, 1))
+    else:
+        env, action = Networked(make(), channels, delay_reward=True), np.zeros(1)
+    env.reset(seed=0)
+    rewards = [np.ravel(env.step(action)[1])[-1] for _ in range(12)]
+    assert rewards == [sign * k for k in range(1, 13)]
+
+
+@pytest.mark.parametrize("kind", ["dict", "tuple", "list", "tensor"])
+def test_actions_on_their_way_stay_as_they_are(kind):
+    """Whatever the agent writes into its own."""
+    box = spaces.Box(-100.0, 100.0, (1,), np.float32)
+    own = {"dict": spaces.Dict(a=box), "tuple": spaces.Tuple([box])}.get(kind, box)
+    buffer = [0.0] if kind == "list" else torch.zeros(1) if kind == "tensor" else np.zeros(1, np.float32)
+    action = {"dict": {"a": buffer}, "tuple": (buffer,)}.get(kind, buffer)
+    acted = []
+
+    class Listening(Counter):
+        action_space = own
+
+        def step(self, action):
+            acted.append(float((action["a"] if kind == "dict" else action[0] if kind == "tuple" else action)[0]))
+            return super().step(np.zeros(1))
+
+    env = Networked(Listening(), downlink=Channel(delay=2))
+    env.reset(seed=0)
+    told = []
+    for k in range(6):
+        buffer[0] = k + 1.0
+        told.append(env.step(action)[-1]["action_applied"])
+    assert acted == [0.0, 0.0, 1.0, 2.0, 3.0, 4.0]
+    assert [float(np.ravel(each["a"] if kind == "dict" else each[0])[0]) for each in told] == acted
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "Taxi-v4", "Blackjack-v1"])
