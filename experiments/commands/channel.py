@@ -49,7 +49,7 @@ def channel(settings: ChannelSettings) -> None:
             f"--sampling-period {known:g} s: a control step of the {'environment' if plant is None else 'plant'} takes "
             f"{step:g} s, and its contract counts these: leave the option out, or --env, --plant and --certificate"
         )
-    log = PacketLog.load(settings.file, settings.ping_period, known or 1.0)
+    log = PacketLog.load(settings.file, settings.ping_period, known or 1.0, settings.ignore)
     dt = known or log.period
     contract = None if promise is None else promise.contract
     oldest = None if promise is None else promise.oldest

@@ -62,7 +62,7 @@ def requirements(settings: RequirementsSettings) -> None:
     """Runs `ncs requirements`."""
     plant, today = _plant_and_network(settings)
     asked = _values(settings, plant, today)
-    log = None if settings.log is None else PacketLog.load(settings.log, None, plant.dt)
+    log = None if settings.log is None else PacketLog.load(settings.log, None, plant.dt, settings.ignore)
     with claim_folder("requirements", settings):
         store = _Store(settings.out)
         found = shields.requirements(

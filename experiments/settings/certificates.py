@@ -242,6 +242,7 @@ class RequirementsSettings(BackendSettings):
         keep: Percentage of the largest share that the cheapest network is to keep.
         log: Record of packets, as `ncs channel` reads it: also says how often its newest sample was older than
             certificates allow.
+        ignore: Names of columns of --log that are not looked at.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Accepted by every command; the search is deterministic and does not use it.
     """
@@ -261,6 +262,7 @@ class RequirementsSettings(BackendSettings):
     tolerance: bool = False
     keep: float = 90.0
     log: Path | None = None
+    ignore: tuple[str, ...] = ()
     force: bool = False
     seed: int = 0
 
@@ -282,6 +284,7 @@ class ChannelSettings:
             packets.
         ping_period: Time between packets whose file does not say when they were sent, as of ping without -D [s]; by
             default that of ping's summary, or 1.
+        ignore: Names of columns of the table that are not looked at.
         env: Id of an environment whose contract is compared with the record.
         certificate: File of a certificate whose contract is compared with the record, in place of an environment's.
         plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
@@ -293,6 +296,7 @@ class ChannelSettings:
     file: tyro.conf.Positional[Path]
     sampling_period: float | None = None
     ping_period: float | None = None
+    ignore: tuple[str, ...] = ()
     env: str | None = None
     certificate: Path | None = None
     plant: Path | None = None

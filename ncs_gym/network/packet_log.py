@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,7 +12,7 @@ import numpy as np
 from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel, replayed_ages
 from ncs_gym.network.log_formats import read_record
 from ncs_gym.reading import MOST_STEPS, require_packets
-from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state
+from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state, shown
 
 # Times that differ by less than this fraction of a step are the same; where the resolution of the times themselves is
 # coarser than the second fraction they cannot be placed.
@@ -67,7 +68,13 @@ class PacketLog(ReadOnlyArrays):
 
     @classmethod
     @own_error_state
-    def load(cls, path: str | os.PathLike[str], period: float | None = None, step: float = 1.0) -> Self:
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        period: float | None = None,
+        step: float = 1.0,
+        ignore: Sequence[str] = (),
+    ) -> Self:
         """Returns the packets in a file; `read_as` says how it was read (docs/requirements.md has the formats).
 
         Args:
@@ -76,13 +83,16 @@ class PacketLog(ReadOnlyArrays):
             period: Time between packets whose file does not say when they were sent [s]; by default that of ping's
                 summary, or 1.
             step: Duration of the steps of `ncs loop` [s].
+            ignore: Names of columns of a table that are not looked at.
 
         Raises:
             ValueError: If the file cannot be read, its columns or numbers are ambiguous, it has more than 256 MiB, or
                 more than two million packets with those that were lost (`ncs_gym.reading`).
         """
         period = None if period is None else as_number(period, "period", low=0.0, low_open=True)
-        record = read_record(path, period, as_number(step, "step", low=0.0, low_open=True))
+        if isinstance(ignore, str):
+            raise ValueError(f"ignore must be a list of names of columns, got {shown(ignore)}")
+        record = read_record(path, period, as_number(step, "step", low=0.0, low_open=True), ignore)
         return cls(*record)
 
     @property

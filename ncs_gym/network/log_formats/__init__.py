@@ -8,6 +8,7 @@ from __future__ import annotations
 import codecs
 import csv
 import os
+from collections.abc import Sequence
 
 from ncs_gym.network.log_formats.irtt import of_json
 from ncs_gym.network.log_formats.ping import is_ping, of_ping
@@ -20,13 +21,14 @@ from ncs_gym.validation import reason_of, shown
 _LONGEST_ROW = 4096
 
 
-def read_record(path: str | os.PathLike[str], period: float | None, step: float) -> Record:
+def read_record(path: str | os.PathLike[str], period: float | None, step: float, ignore: Sequence[str] = ()) -> Record:
     """Returns the record in a file.
 
     Args:
         path: The file.
         period: Time between packets where the file does not say it; None if that is not known [s].
         step: Duration of the steps of `ncs loop` [s].
+        ignore: Names of columns of a table that are not looked at.
 
     Raises:
         ValueError: If the file cannot be read, or is none of the formats, or ambiguous.
@@ -45,7 +47,7 @@ def read_record(path: str | os.PathLike[str], period: float | None, step: float)
         rows = text.splitlines()
         if any(len(row) > _LONGEST_ROW for row in rows):
             raise ValueError(f"a row of a table has at most {_LONGEST_ROW:,} characters, a longer one is no record")
-        return of_table(rows, period, step)
+        return of_table(rows, period, step, ignore)
     except csv.Error as error:
         raise ValueError(f"{shown(path)} is no CSV file: {reason_of(error)}") from error
     except ValueError as error:

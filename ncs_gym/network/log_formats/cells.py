@@ -85,7 +85,9 @@ def columns_of(names: Sequence[str]) -> dict[str, Column]:
         suffix = SUFFIX.search(small)
         role = _ROLE_OF.get(small) or _ROLE_OF.get(SUFFIX.sub("", small))
         if role in columns:
-            raise ValueError(f"the columns {shown(columns[role].name)} and {shown(name)} may both be what was {role}")
+            raise ValueError(
+                f"the columns {shown(columns[role].name)} and {shown(name)} may both be what was {role}: ignore one"
+            )
         if role is not None:
             columns[role] = Column(index, name, suffix[1] if suffix and small not in _ROLE_OF else "")
     return columns
@@ -144,7 +146,7 @@ def require_no_loss(name: str, cells: set[str]) -> None:
     if len(cells) > 1 and (is_divided or _OF_LOSS.search(plain(name)) or not cells.isdisjoint(_SAYS_LOST)):
         raise ValueError(
             f"the column {shown(name)} may say which packets were lost: name it lost if 1 stands for a lost one, ok if "
-            "0 does, or leave it out"
+            "0 does, or ignore it (ignore=..., --ignore) if it says something else"
         )
 
 

@@ -49,14 +49,16 @@ class _Head(NamedTuple):
     first: int
 
 
-def of_table(lines: Sequence[str], period: float | None, step: float) -> Record:
+def of_table(lines: Sequence[str], period: float | None, step: float, ignore: Sequence[str] = ()) -> Record:
     """Returns the packets of a table whose columns have names, or of one number per line."""
     if lines and re.fullmatch(r"sep=.", lines[0].strip()):  # for spreadsheets
         lines = ["", *lines[1:]]
     names, separator, rest, first = _head_of(lines)
     if all(is_number(name) for name in names):
         return _without_names(lines, len(names), separator, period)
-    columns = columns_of(names)
+    if unknown := [name for name in ignore if name not in names]:
+        raise ValueError(f"there is no column {shown(unknown[0])} to ignore: it has {shown(names)[1:-1]}")
+    columns = columns_of(["" if name in ignore else name for name in names])
     is_list = set(columns) - {"lost", "kept"} == {"delay"}
 
     def rows() -> Iterator[tuple[int, list[str]]]:
@@ -72,10 +74,10 @@ def of_table(lines: Sequence[str], period: float | None, step: float) -> Record:
     if {"episode", "sent", "received"} <= columns.keys():
         _require_steps(columns, unused)
         return _of_steps(rows(), columns, step)
-    moments = [name for name in unused.values() if SUFFIX.sub("", plain(name)) in MOMENTS]
+    moments = [name for name in unused.values() if name not in ignore and SUFFIX.sub("", plain(name)) in MOMENTS]
     if "delay" in columns or {"sent", "received"} <= columns.keys():
         for index, name in unused.items():
-            if name not in moments:
+            if name not in moments and name not in ignore:
                 require_no_loss(name, cells[index])
     if "sent" in columns and ("received" in columns or "delay" in columns):
         return of_times(rows(), columns, names)

@@ -426,6 +426,20 @@ def test_losses_that_a_record_cannot_tell_are_told_as_unknown(written):
     assert np.isnan(marked.delays).sum() == 2000 - len(came)
 
 
+def test_columns_that_say_something_else_are_ignored(written):
+    rows = "".join(f"{k / 50},{k / 50 + 0.01},{64 * (1 + k % 2)},{k}\n" for k in range(60))
+    record = written("sent,received,size,received_ms\n" + rows)
+    for ignore, words in (((), "may both be what was received"), (["received_ms"], "'size' may say which packets")):
+        with pytest.raises(ValueError, match=words):
+            PacketLog.load(record, ignore=ignore)
+    log = PacketLog.load(record, ignore=["size", "received_ms"])
+    np.testing.assert_allclose(log.delays, 0.01)
+    with pytest.raises(ValueError, match="there is no column 'sizes' to ignore"):
+        PacketLog.load(record, ignore=["sizes"])
+    with pytest.raises(ValueError, match="ignore must be a list"):
+        PacketLog.load(record, ignore="size")
+
+
 def test_times_with_and_without_their_zone_are_not_compared(written):
     rows = "".join(f"2025-06-15T17:06:{k}+02:00,2025-06-15T17:06:{k}.0078\n" for k in range(10, 40))
     with pytest.raises(ValueError, match="line 2: some times name their time zone and others"):
