@@ -138,8 +138,8 @@ def cells_of(arms):
 @pytest.mark.parametrize("algo", ["PPO", "TRPO", "A2C", "SAC"])
 def test_settings_reach_every_run(certificate, algo):
     expected = complete_hyperparams(algo, tuned_hyperparams(CRUISE, algo)) | {"n_envs": 3}
-    for run in runs_of(certificate, steps=7, episodes=9, algo=algo, hyperparams={"n_envs": 3}):
-        assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, expected)
+    for run in runs_of(certificate, steps=5007, episodes=9, algo=algo, hyperparams={"n_envs": 3}):
+        assert (run.steps, run.episodes, run.algorithm, run.settings) == (5007, 9, algo, expected)
 
 
 def result(returns, violations, interventions=0, index=0):
