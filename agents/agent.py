@@ -406,10 +406,11 @@ def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | 
         "other settings": ", ".join(f"{name}={value!r}" for name, value in agent.kwargs.items()) or "those of the id",
         "shield": _shield_text(shield),
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),
+        "residual": _residual_text(agent),
         "SHA-256 of the weights": f"`{agent.checksum}`",
         "saved with": _versions(),
     }
-    table = [f"| {name} | {value} |" for name, value in rows.items()]
+    table = [f"| {name} | {value} |" for name, value in rows.items() if value]
     parts = [f"# {agent.algorithm} in {agent.env}\n", "| | |", "|---|---|", *table, ""]
     if shield is not None:
         parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
@@ -446,6 +447,13 @@ def _figures(evaluation: Evaluation) -> list[str]:
         f"- interventions of the shield: {interventions} of {steps} steps",
         f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
     ]
+
+
+def _residual_text(agent: Agent) -> str:
+    if agent.residual_gain is None:
+        return ""
+    gain = agent.residual_gain.tolist()
+    return f"`Agent` adds {gain} x_hat [input limits]; the weights alone are a part of the policy"
 
 
 def _shield_text(shield: ShieldSettings | None) -> str:

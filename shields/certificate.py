@@ -26,6 +26,8 @@ from shields.json_documents import content_of, document_of, read_content, write_
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 3"
+# Parts of a point that are smaller than this share of the set are shown as zero.
+_DUST = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,8 +151,8 @@ class Certificate(ReadOnlyArrays):
     """A robust control invariant set S inside the safe box, its gain, and the numbers that prove it.
 
     It may also have a polytope around E(L) that the same gain keeps invariant, which is S then (`safe_set`). Where
-    the gain keeps a polytope but no ellipsoid, that is all that is proved, and E(L) is merely an ellipsoid inside
-    (`keeps_ellipsoid`).
+    the gain keeps a polytope but no ellipsoid, that is all that is proved, and E(L) around `resting_state` is merely an
+    ellipsoid inside (`keeps_ellipsoid`).
 
     A certificate is not trusted until `shields.verify` has checked it in exact arithmetic. Two certificates are equal
     if their files are, every digit of them. `print(certificate)` says what it is for.
@@ -247,12 +249,12 @@ class Certificate(ReadOnlyArrays):
 
     @cached_property
     def ellipsoid(self) -> Ellipsoid:
-        """The ellipsoid E(L), invariant itself if `keeps_ellipsoid`."""
+        """The ellipsoid E(L), of deviations from `resting_state`; invariant itself if `keeps_ellipsoid`."""
         return Ellipsoid(self.L)
 
     @property
     def keeps_ellipsoid(self) -> bool:
-        """Whether E(L) is claimed to be invariant; otherwise the polytope alone is, and E(L) lies inside it."""
+        """Whether E(L) is claimed to be invariant; otherwise the polytope alone is, and x_c + E(L) lies inside it."""
         return all(proof.shares is not None for proof in self.proofs)
 
     @property
@@ -328,12 +330,15 @@ class Certificate(ReadOnlyArrays):
             inside = "inside it the ellipsoid" if self.keeps_ellipsoid else "inside it, not invariant, the ellipsoid"
             kind = "|g x| <= 1" if self.polytope.is_symmetric else "low <= g x <= high"
             safe_set = f"the polytope {kind} of {len(self.polytope.rows)} rows g; {inside} "
-        widths = ", ".join(f"{width:.4g}" for width in np.sqrt(np.diag(self.L)))
+        widths = ", ".join(f"{width:.4g}" for width in self._widths)
+        ellipsoid = "x'Mx <= 1, that reaches |x_i|"
+        if self._rests_elsewhere:
+            ellipsoid = "(x - x_c)'M(x - x_c) <= 1, that reaches |x_i - x_c,i|"
         rows = [
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
-            ("safe set", f"{safe_set}x'Mx <= 1, that reaches |x_i| <= {widths}"),
+            ("safe set", f"{safe_set}{ellipsoid} <= {widths}"),
             ("claim", f"in the safe box {claim}"),
-            ("size", size_of(recorded)),
+            ("size", size_of(self)),
             ("polytope", missing_polytope_of(recorded) if self.polytope is None else ""),
             ("fallback", self._fallback_text()),
             ("contract", contract_text(self.contract)),
@@ -341,10 +346,24 @@ class Certificate(ReadOnlyArrays):
         ]
         return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
 
+    @property
+    def _rests_elsewhere(self) -> bool:
+        """Whether its sets are around another point than the plant's operating one."""
+        return bool(self.resting_state.any() or self.resting_input.any())
+
+    @property
+    def _widths(self) -> np.ndarray:
+        """How far E(L) reaches in each state, shape (n,)."""
+        return np.sqrt(np.diag(self.L))
+
     def _fallback_text(self) -> str:
-        if not (self.resting_state.any() or self.resting_input.any()):
+        if not self._rests_elsewhere:
             return "u = K x_hat"
-        x_c, u_c = (", ".join(f"{each:.4g}" for each in point) for point in (self.resting_state, self.resting_input))
+        points = (self.resting_state, self._widths), (self.resting_input, np.abs(self.K) @ self._widths)
+        x_c, u_c = (
+            ", ".join(f"{0.0 if abs(each) <= _DUST * size else each:.4g}" for each, size in zip(*point, strict=True))
+            for point in points
+        )
         return f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
 
     def without_polytope(self) -> Certificate:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ncs_gym import ChannelContract
 from ncs_gym.validation import printable
 
+if TYPE_CHECKING:
+    from shields.certificate import Certificate
+
 _WIDTH, _INDENT = 80, 14
 
 
-def size_of(recorded: dict[str, Any]) -> str:
-    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it, as far as known.
-
-    Args:
-        recorded: The provenance of a certificate.
-    """
+def size_of(certificate: Certificate) -> str:
+    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it, as far as known."""
+    recorded = certificate.provenance
     unknown, polytope_share = recorded.get("share_of_box_unknown"), recorded.get("polytope_share_of_box")
     other = _text(
         recorded.get("share_with_gain_of_ellipsoid"), " ({:.3g} % with the gain of the largest ellipsoid)", 100.0
@@ -29,6 +29,9 @@ def size_of(recorded: dict[str, Any]) -> str:
     polytope = "{:.3g} % of the safe box's volume" + past + other + "; the ellipsoid "
     of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
     at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
+    if certificate.polytope is not None and not polytope_share:
+        not_known = "a share of the safe box that is not computed; the ellipsoid "
+        of_box, at_rest = not_known + of_box, not_known + at_rest
     shares = (
         _text(polytope_share, polytope, 100.0)
         + _text(recorded.get("share_of_box"), of_box, 100.0)

@@ -26,6 +26,7 @@ from experiments.settings import AttackSettings
 from experiments.settings.certificates import FEWEST_ENVS
 from experiments.terminal import wrapped
 from ncs_gym.network import downlink_protocol
+from ncs_gym.reading import json_values, read_file
 from ncs_gym.registration import EPISODE_STEPS
 from ncs_gym.uncertainty.disturbances import as_noise
 from ncs_gym.validation import reason_of
@@ -48,12 +49,14 @@ def attack(settings: AttackSettings) -> None:
         cases = _with_covariances(cases)
     if not settings.unshielded:
         _require_claims(cases)
+    # Smaller batches, so that each kind of each case comes in once within the budget; those in the folder are kept.
+    each = max(int(settings.steps / (len(cases) * kinds * EPISODE_STEPS)), FEWEST_ENVS)
+    there = None if settings.force else _envs_in(settings.out)
+    settings = replace(settings, envs=min(settings.envs, each, there or each))
     with claim_folder("attack", settings):
         horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
         plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
-        # Smaller batches, so that each kind of each case comes in once within the budget.
-        each = int(settings.steps / (len(cases) * kinds * EPISODE_STEPS))
-        settings = replace(settings, horizon=horizon, plant=plant, envs=min(settings.envs, max(each, FEWEST_ENVS)))
+        settings = replace(settings, horizon=horizon, plant=plant)
         certificates = _certificates(cases, settings.out / "certificates", settings.safe_set)
         numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
         batches = [
@@ -86,6 +89,15 @@ def attack(settings: AttackSettings) -> None:
             require_within(counts, limits)
         elif not settings.unshielded:
             require_safe(total, looks_ahead=looks_ahead)
+
+
+def _envs_in(folder: Path) -> int | None:
+    """Returns the episodes of a batch of the campaign that a folder has; None for none."""
+    try:
+        envs = json_values(read_file(folder / "settings.json"))["settings"]["envs"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return envs if type(envs) is int and envs >= FEWEST_ENVS else None
 
 
 def shortened(settings: AttackSettings) -> AttackSettings:

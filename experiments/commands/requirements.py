@@ -51,7 +51,7 @@ _AXES = {
 _SHARES = {
     "ellipsoid": "ellipsoid's share of the box [%]",
     "polytope": "polytope's share of the box [%]",
-    "certificate": "100: a certificate, whose share of an open box is not known",
+    "certificate": "100: a certificate, whose share of the box is not known",
 }
 # Progress is counted in these parts of an age that is searched: workers report a thousand at a time.
 _PARTS = 1000
@@ -415,7 +415,9 @@ def _cheapest_text(found: Requirements, settings: RequirementsSettings, bearing:
             )
         return f"No certificate was found for any of these networks: {advice}."
     what = "Cheapest" if bearing is None else "Cheapest that bears the losses and delays of today"
-    return f"{what}, with at least {settings.keep:g} % of the largest share: {_description(cheapest)}."
+    known = cheapest.certificate is not None and kind_of_share(cheapest.certificate) != "certificate"
+    kept = f"with at least {settings.keep:g} % of the largest share" if known else "with a certificate"
+    return f"{what}, {kept}: {_description(cheapest)}."
 
 
 def _description(point: Requirement) -> str:

@@ -34,7 +34,7 @@ def synthesize(settings: SynthesizeSettings) -> None:
         if interrupt.certificate is None:
             raise
         interrupt.certificate.save(settings.out)
-        size = size_of(interrupt.certificate.provenance)
+        size = size_of(interrupt.certificate)
         raise SynthesisInterrupted(
             f"interrupted: the best certificate so far, which verifies ({size}), was saved to {settings.out}"
         ) from interrupt

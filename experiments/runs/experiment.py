@@ -113,7 +113,7 @@ def run_of_arm(
 
 def certificate_line(certificate: Certificate, verification: Report) -> str:
     """Returns one line about a certificate and its exact verification."""
-    size = size_of(certificate.provenance)
+    size = size_of(certificate)
     conditions = f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic"
     return f"{conditions} ({size})" if size else conditions
 

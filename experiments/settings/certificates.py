@@ -116,7 +116,7 @@ class AttackSettings(BackendSettings):
         steps: Budget, by default one of about two minutes; the campaign whose results the documentation reports has
             1e9, of which 1e8 take twenty minutes. Whole batches of `envs` episodes are run as long as they fit. Where
             it does not allow one per attack case and mode of the shield, batches are smaller, and cases are left out if
-            they get too small.
+            they get too small. Batches of a folder keep their size when steps are added.
         out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
         random_plants: Number of random plants, each behind four kinds of channels.
         envs: Number of episodes in a batch, simulated side by side.

@@ -34,6 +34,13 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, frozen, own_error_state, setting, shown
 
 
+def _with_columns(values: np.ndarray, mask: np.ndarray, new: Any) -> np.ndarray:
+    """Returns an array (..., N) with others where `mask` (N,) says so, of a type that holds both."""
+    found = values.astype(np.result_type(values, new))
+    found[..., mask] = new
+    return found
+
+
 class NCSVectorEnv(SpecOfJson, VectorEnv):
     """N copies of `NCSEnv` with the same semantics, spaces and info keys; every info value has N as its first axis.
 
@@ -386,10 +393,11 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         if count == self.num_envs or not (self._uplinks.is_plain and self._downlinks.is_plain):
             self._network = channel_infos(self._uplinks, self._downlinks, many=True)
         if count == self.num_envs:
-            self._task_state, self._disturbance_memory = task_state, memory
+            self._task_state, self._disturbance_memory = np.array(task_state), np.array(memory)
             self._channel_state = VectorChannelState(channels or self._channel, rng, count)
         else:
-            self._task_state[..., mask], self._disturbance_memory[..., mask] = task_state, memory
+            self._task_state = _with_columns(self._task_state, mask, task_state)
+            self._disturbance_memory = _with_columns(self._disturbance_memory, mask, memory)
             self._channel_state.begin(rng, rows, channels)
         self._prepare_estimator(all_begin=count == self.num_envs)
         self._state[:, mask] = states

@@ -33,6 +33,8 @@ THINNEST = 1e-4
 SMALLEST_WEIGHT = 1e-9
 # The operating point is no equilibrium if a step moves it by more, in half-widths of the box.
 NO_EQUILIBRIUM = 1e-6
+# A function is nearly at rest where a step moves it by no more than this part of the longest one in the box.
+NEARLY_AT_REST = 0.01
 # Results keep this many digits, so that other machines find the same numbers.
 DIGITS = 9
 
@@ -124,8 +126,8 @@ def linear_model(
     plant = LinearPlant(A=A, B=B, remainder=remainder, **common, **settings)
     if isinstance(moving, FunctionProcess) and _rests_at_operating_point(moving, plant, drawn):
         warn_caller(
-            "the function is at rest at operating_state with operating_input, as one of absolute values is, and not "
-            "what it is near zero: if it takes absolute values, give lambda x, u: f(x0 + x, u0 + u) - x0, one of "
+            "the function is nearly at rest at operating_state with operating_input, as one of absolute values, and "
+            "not what it is near zero: if it takes absolute values, give lambda x, u: f(x0 + x, u0 + u) - x0, one of "
             "deviations",
             NoEquilibriumWarning,
         )
@@ -153,7 +155,8 @@ def _rests_at_operating_point(process: FunctionProcess, plant: LinearPlant, step
     except Exception:  # whatever a function of deviations does so far away
         return False
     off = np.abs(np.array([moved, *(np.array(near) - steps.moved.T[:REPEATED])])) / plant.half_widths
-    return bool(off[0].max() <= NO_EQUILIBRIUM < off[1:].max())
+    little = NEARLY_AT_REST * float((np.abs(steps.moved - steps.states).T / plant.half_widths).max())
+    return bool(off[0].max() <= little < off[1:].max())
 
 
 def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.ndarray], common: Any) -> str:

@@ -235,7 +235,7 @@ class PlantSimulation:
         if self._is_linear:
             return self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
         step = self.process.step if self.size is None else self.process.step_many
-        x_next = step(self._model, guarded(state), u)
+        x_next = np.array(step(self._model, guarded(state), u))  # which others may write over
         if self._is_disturbed:
             x_next = x_next + self.draw_disturbance(rng, x_next, steps, memory)
         if self.process.is_written:

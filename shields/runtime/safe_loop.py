@@ -180,7 +180,7 @@ class SafeLoop(CopiedWhole):
         is_started, delay = self._phase is not _Phase.STOPPED, counted(self._input_delay, "step")
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
-            ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
+            ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate))))),
             ("contract", contract_text(self._contract, self._input_delay)),
             ("downlink", f"inputs take effect {delay} after the decision" if self._input_delay else ""),
             ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),

@@ -159,7 +159,9 @@ def nearby_certificate(
     polytope: bool = True,
     progress: Progress = lambda line: None,
 ) -> Certificate | None:
-    """Returns a verified certificate, found faster and with a slightly smaller set than `synthesize`; None if none is.
+    """Returns a verified certificate, found faster than by `synthesize`, of a smaller set; None if none is.
+
+    Around a resting point it is the first that is found, whose set may be much smaller.
 
     Args:
         plant: The plant with its bounds.

@@ -217,7 +217,7 @@ def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> Sy
     message = f"interrupted: the synthesis was at {stage}"
     if best is None or not verify(best, plant).valid:
         return SynthesisInterrupted(f"{message} and had no certificate yet")
-    size = size_of(best.provenance)
+    size = size_of(best)
     best = replace(best, provenance=best.provenance | {"interrupted_at": stage})
     return SynthesisInterrupted(f"{message}, its best certificate has {size}", best)
 

@@ -128,7 +128,7 @@ class Requirement:
         """Share of the safe box that the ellipsoid in the certified set fills, 0 without a certificate.
 
         Where limits have two ends, that of the polytope itself. Where the box has too many corners to know its volume,
-        the share of its largest ellipsoid; 1 where nothing is known, as of an open box.
+        the share of its largest ellipsoid; 1 where nothing is known, as of a box that is open.
         """
         return share_of(self.certificate)
 

@@ -149,6 +149,13 @@ def test_totals_that_are_no_numbers_are_equal():
     assert [one] != [replace(one, steps=9)]
 
 
+def test_card_of_a_residual_agent_has_its_gain(agent, tmp_path):
+    agent.save(tmp_path)
+    assert "residual" not in (tmp_path / "README.md").read_text()
+    replace(agent, residual_gain=np.array([[0.3, 0.1]])).save(tmp_path)
+    assert "`Agent` adds [[0.3, 0.1]] x_hat [input limits]" in (tmp_path / "README.md").read_text()
+
+
 def test_card_without_a_shield_names_none(folder, agent, certificate):
     agent.save(folder, ShieldSettings(certificate))
     agent.save(folder)

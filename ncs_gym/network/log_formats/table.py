@@ -180,6 +180,7 @@ def _of_steps(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column],
     delays = [arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)]
     episodes = "one episode" if len(arrivals) == 1 else f"{len(arrivals):,} episodes, one after the other"
     read_as = f"Read as a log of ncs loop: {episodes}, in steps of {dt:g} s; a step without a packet lost it."
+    read_as += " The sample of step 0, which is the first estimate, is left out."
     return Record(dt * np.arange(len(delays)), dt * np.array(delays), read_as)
 
 

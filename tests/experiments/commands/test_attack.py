@@ -371,6 +371,19 @@ def test_interrupted_campaign_goes_on(campaign):
     assert len(stored(out)) == 10
 
 
+def test_more_steps_keep_the_batches_that_are_there(tmp_path, small, without_workers):
+    """Batches of the smaller budget are smaller, and stay so."""
+    attack(settings(tmp_path, steps=6 * 5 * 200))
+    first = {name: (tmp_path / "runs" / name).read_bytes() for name in stored(tmp_path)}
+    assert document(tmp_path)["settings"]["envs"] == 5
+    attack(settings(tmp_path, steps=15 * 5 * 200))
+    assert {name: (tmp_path / "runs" / name).read_bytes() for name in first} == first
+    assert len(stored(tmp_path)) == 15
+    assert document(tmp_path)["total"]["episodes"] == 15 * 5
+    attack(settings(tmp_path, steps=15 * 5 * 200, force=True))
+    assert document(tmp_path)["settings"]["envs"] == 12
+
+
 def test_batch_that_fails_is_named_and_what_is_finished_is_kept(tmp_path, small, monkeypatch, without_workers):
     def fails_once(batch, *reporting):
         if (batch.case, batch.index) == (CRUISE, 1):

@@ -172,7 +172,7 @@ def test_operating_point_that_does_not_stay_is_told_with_the_nearest_one_that_do
         linear_model(
             lambda x, u: 0.9 * x + 9.0 * u, [0.5], [0.6], 0.1, samples=500, **point | {"operating_state": [45]}
         )
-    point = {"operating_state": [1.0], "operating_input": [0.5], **settings}
+    point = {"operating_state": [0.999], "operating_input": [0.5], **settings}  # rounded
     with pytest.warns(NoEquilibriumWarning, match="if it takes absolute values"):
         linear_model(lambda x, u: tank(x - 1.0, u) + 1.0, [0.5], [0.6], 0.1, samples=500, **point)
     with pytest.warns(NoEquilibriumWarning, match="no point nearby stays"):

@@ -162,3 +162,39 @@ def test_whole_numbers_are_rewards_and_the_array_stays_the_tasks_own():
     rewards = envs.step(np.ones((3, 1), np.float32))[1]
     assert (rewards.dtype, rewards.tolist()) == (np.float64, [1.0, 1.0, 1.0])
     assert rewards is not paid
+
+
+class Table(PayingMany):
+    """Takes the states of episodes out of a table, or draws them, and keeps whole numbers of them."""
+
+    vectorized = True
+    table = np.array([[-0.5, 0.0, 0.5, 1.0]])
+
+    def begin(self, rng, plant, size=None):
+        return rng.uniform(0.2, 0.8, (1, size or 1)) if self.pays is None else self.table[:, : size or 1]
+
+    def advance(self, rng, plant, task_state, u):
+        return np.round(task_state).astype(int) if self.pays is None else task_state
+
+    def reward(self, plant, task_state, state, u):
+        return 0.0 * state[0]
+
+    def observe(self, task_state):
+        return task_state
+
+    def observation_bound(self, plant, horizon):
+        return np.array([1.0])
+
+
+@pytest.mark.parametrize("pays", [None, "table"])
+def test_what_a_task_begins_with_stays_its_own_and_as_it_was_drawn(pays):
+    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=4, plant=truck_trailer(mass=4000.0), task=Table(pays))
+    envs.reset(seed=0)
+    envs.step(np.zeros((4, 1), np.float32))
+    seen = envs.reset(options={"reset_mask": np.array([False, False, True, True])})[0][:, -1]
+    np.testing.assert_array_equal(Table.table, [[-0.5, 0.0, 0.5, 1.0]])
+    if pays is None:
+        assert set(seen[:2]) <= {0.0, 1.0}
+        assert ((seen[2:] >= 0.2) & (seen[2:] <= 0.8)).all()
+    else:
+        np.testing.assert_array_equal(seen, [-0.5, 0.0, -0.5, 0.0])

@@ -81,6 +81,17 @@ def test_limit_with_one_end_alone_is_kept():
 
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
+def test_ellipsoid_is_inside_the_polytope_around_the_resting_point_as_the_certificate_says(name):
+    plant, found = PLANTS[name], certificate(name)
+    boundary = found.resting_state + found.ellipsoid.sample_boundary(np.random.default_rng(0), 2000)
+    assert found.polytope.gauge(boundary).max() <= 1.0 + 1e-9
+    assert max(map(max, map(plant.constraint_values, boundary))) <= 1e-9
+    text = " ".join(str(found).split())
+    assert ("(x - x_c)'M(x - x_c) <= 1, that reaches |x_i - x_c,i| <=" in text) == found.resting_state.any()
+    assert "e-1" not in text.partition("fallback")[2].partition("contract")[0]  # what is left of rounding
+
+
+@pytest.mark.parametrize("name", ASYMMETRIC)
 def test_share_of_the_box_is_that_of_random_points(name):
     plant, found = PLANTS[name], certificate(name)
     if "polytope_share_of_box" not in found.provenance:  # limits of sums: a box that is no product

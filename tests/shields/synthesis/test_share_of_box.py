@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from experiments.runs.experiment import certificate_line
-from ncs_gym import cart_pole, truck_trailer
+from ncs_gym import LinearPlant, cart_pole, truck_trailer
 from ncs_gym.plants.past_inputs import inputs_under_way
-from shields import verify
+from shields import synthesize, verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
 from tests.certificates import certificate_of
@@ -51,8 +51,21 @@ def test_too_many_corners_are_a_reason_not_a_number(certificate):
     box = np.concatenate([np.eye(6), np.full((1, 6), 0.1)])
     record = share_of_box(replace(plant, box=box), 0.5 * np.eye(6))
     assert set(record) == {"share_of_box_unknown"}
-    assert "unknown share of the safe box (a box of 7 rows in 6 dimensions" in size_of(record)
-    assert "%" not in size_of(record)
+    text = size_of(replace(certificate, provenance=record))
+    assert "unknown share of the safe box (a box of 7 rows in 6 dimensions" in text
+    assert "%" not in text
+
+
+def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
+    """A limit that cuts off nothing of the box, which is no product by it."""
+    plant = LinearPlant(
+        A=[[0.9, 0.2], [-0.1, 0.9]], B=[[0.0], [0.3]], dt=0.1, box=[1.0, 1.0], u_max=1.0,
+        output_limits=[([1.0, 1.0], -2.5, 2.5)], disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
+    )  # fmt: skip
+    certificate = synthesize(plant)
+    share = 100.0 * certificate.provenance["share_of_box"]
+    size = f"a share of the safe box that is not computed; the ellipsoid {share:.4g} % of the safe box's volume"
+    assert size in " ".join(str(certificate).split())
 
 
 @pytest.mark.parametrize("steps", [1, pytest.param(2, marks=pytest.mark.slow)])
