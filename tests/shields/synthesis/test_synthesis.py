@@ -283,5 +283,5 @@ def test_synthesis_gives_what_tests_have_checked_in(name):
     kept, made = certificate_of(plant, contract, "polytope"), synthesize(plant, contract=contract)
     assert verified(made, plant).valid
     assert made.keeps_ellipsoid == kept.keeps_ellipsoid
-    for share in ("volume_of_box_ellipsoid", "share_of_box", "polytope_share_of_box"):  # with delays only the first
+    for share in ("volume_of_box_ellipsoid", "share_of_box", "polytope_share_of_box"):  # with delays not the second
         assert made.provenance.get(share) == pytest.approx(kept.provenance.get(share), abs=2e-3)
