@@ -123,7 +123,7 @@ def infeasibility_around(plant: LinearPlant, contract: ChannelContract | None, r
         contract: Channel contract, if there is one.
         reason: Why a gain that bears the radii was given up.
     """
-    tolerance = tolerance_around(plant, contract)
+    tolerance = _tolerance_around(plant, contract)
     if tolerance.margin == 0.0:
         return _unstabilized()
     if tolerance.margin >= 1.0:
@@ -534,22 +534,39 @@ def is_feasible(plant: LinearPlant, contract: ChannelContract | None, *, polytop
         polytope: Whether it is enough that it keeps a polytope.
     """
     try:
-        if needs_resting_point(plant):
-            return tolerance_around(plant, contract, SUFFICIENT_MARGIN).margin >= SUFFICIENT_MARGIN
-        problem, _ = design_problem(plant, contract)
+        return margin_of(plant, contract, polytope=polytope, enough=SUFFICIENT_MARGIN) >= SUFFICIENT_MARGIN
     except Infeasible:
         return False
-    return _margin(problem, polytope=polytope, enough=SUFFICIENT_MARGIN) >= SUFFICIENT_MARGIN
 
 
-class Tolerance(NamedTuple):
+def margin_of(
+    plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool = True, enough: float = np.inf
+) -> float:
+    """Returns the factor on all radii that the best gain bears that is found; 0 for none.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract, if there is one.
+        polytope: Whether it is enough that it keeps a polytope.
+        enough: A factor beyond which no larger one is sought.
+
+    Raises:
+        Infeasible: If there is no error set, or no equilibrium within limits with two ends.
+    """
+    if needs_resting_point(plant):
+        return _tolerance_around(plant, contract, enough).margin
+    problem, _ = design_problem(plant, contract)
+    return _margin(problem, polytope=polytope, enough=enough)
+
+
+class _Tolerance(NamedTuple):
     """The factor on all radii that the best gain bears, and the limits, as in `distances`, that it reaches first."""
 
     margin: float
     binding: tuple[int, ...] = ()
 
 
-def tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enough: float = np.inf) -> Tolerance:
+def _tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enough: float = np.inf) -> _Tolerance:
     """Returns what the best gain bears that is found for limits with two ends, around the resting point that suits it.
 
     Args:
@@ -563,19 +580,19 @@ def tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enoug
     rest = farthest_from_limits(plant)
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
 
-    def tolerance(K: np.ndarray, at_least: float = 0.0) -> Tolerance:
+    def tolerance(K: np.ndarray, at_least: float = 0.0) -> _Tolerance:
         needs = needs_of(Feedback(K, errors.promised, plant.disturbance.shape_matrix, rest), plant)
         if needs is None:
-            return Tolerance(at_least)
+            return _Tolerance(at_least)
         farthest = farthest_equilibrium(plant, needs)
-        return Tolerance(max(farthest.distance, at_least), tuple(farthest.binding.tolist()))
+        return _Tolerance(max(farthest.distance, at_least), tuple(farthest.binding.tolist()))
 
     start = max_margin_gain(problem, problem.covering_error_shape)
     gains = [(K, 0.0) for K in regulators(plant)]
     if start is not None:  # the problem is without limits of states and inputs together
         margin = 0.0 if len(plant.mixed_rows) else start.margin
         gains.insert(0, (problem.to_physical(start.L, start.K)[1], margin))
-    best = Tolerance(0.0)
+    best = _Tolerance(0.0)
     for K, at_least in gains:
         best = max(best, tolerance(K, at_least), key=lambda each: each.margin)
         if best.margin >= enough:

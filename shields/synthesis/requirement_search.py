@@ -16,12 +16,8 @@ from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.synthesis.certification import carried_over, nearby_certificate
-from shields.synthesis.design_problem import design_problem
-from shields.synthesis.diagnosis import tolerance_around
-from shields.synthesis.max_margin_gain import max_margin_gain
+from shields.synthesis.diagnosis import margin_of
 from shields.synthesis.network_requirements import LargestAge, Network, Requirement, Requirements, share_of
-from shields.synthesis.polytope_gain import ellipsoid_margin, most_tolerant_gain
-from shields.synthesis.resting_point import needs_resting_point
 
 # Ages that one search goes through, each from the certificate of the last; other processes have the others.
 _AGES_PER_SEARCH = 6
@@ -81,7 +77,7 @@ class Search:
 
     def _tolerance(self, age: float, certificate: Certificate) -> float:
         """Returns nearly the largest factor on all radii for which a certificate verifies; at least 1."""
-        margin = _margin(self.plant, _contract(age, self.quantization_step))
+        margin = margin_of(self.plant, _contract(age, self.quantization_step))
         for share in _FACTOR_STEPS:
             factor = float(f"{share * margin:.3g}")
             if factor <= 1.0:
@@ -123,15 +119,6 @@ class BoundarySearch(Search):
                 low, best = age, certificate
         report(len(self.ages))
         return answers
-
-
-def _margin(plant: LinearPlant, contract: ChannelContract | None) -> float:
-    """Returns the factor on all radii that the best gain bears that is found; 0 for none."""
-    if needs_resting_point(plant):
-        return tolerance_around(plant, contract).margin
-    problem, _ = design_problem(plant, contract)
-    gain = max_margin_gain(problem, problem.covering_error_shape)
-    return 0.0 if gain is None else max(ellipsoid_margin(problem, gain), most_tolerant_gain(problem, gain).margin)
 
 
 def _contract(age: float, quantization_step: float) -> ChannelContract | None:

@@ -183,6 +183,16 @@ def test_specification_of_vector_wrappers_makes_no_environments_without_them():
             gym.make_vec(env.spec)
 
 
+def test_cost_of_packets_may_change_and_is_that_of_the_spec():
+    env = RequestActions(gym.make(ID, **ASKS), cost=0.1)
+    assert gym.make(env.spec).cost == 0.1
+    env.cost = 0.3
+    assert gym.make(env.spec).cost == 0.3
+    with pytest.raises(ValueError, match="cost must be a number >= 0"):
+        env.cost = -3.0
+    assert env.cost == 0.3
+
+
 def test_what_random_channels_draw_from_is_that_of_their_spec():
     env = RandomChannel(gym.make(ID), [Channel(loss=0.1)])
     assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.1

@@ -242,3 +242,14 @@ def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
             share = point.certificate.provenance.get("polytope_share_of_box", 1.0)
             assert point.share == share
             assert 0.5 < share <= 1.0
+
+
+def test_factor_on_radii_is_found_for_limits_with_two_ends():
+    plant = LinearPlant(
+        A=[[0.9]], B=[[0.4]], dt=1.0, operating_state=[1.0], operating_input=0.25, state_limits=(0.2, 2.0),
+        input_limits=(0.0, 1.0), disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
+    )  # fmt: skip
+    (point,) = requirements(plant, tolerance=True).points
+    assert point.tolerance > 1.0
+    scaled = with_radii(plant, disturbance=point.tolerance, noise=point.tolerance)
+    assert verify(synthesize(scaled, contract=ChannelContract(0)), scaled).valid
