@@ -20,14 +20,13 @@ from shields.synthesis.ellipsoid_certificates import LOST, Progress, certify, la
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
-    gains_around,
+    fallbacks_around,
     most_tolerant_polytope,
     polytope_share,
-    rest_for,
     with_largest_polytope,
     with_polytope,
 )
-from shields.synthesis.resting_point import farthest_from_limits, limits_around, needs_resting_point, resting_at
+from shields.synthesis.resting_point import needs_resting_point, resting_at
 from shields.verification import verify
 
 # A refusal should take so long at most [s], of its thread's own time: searches after the first for a polytope, and then
@@ -161,8 +160,6 @@ def nearby_certificate(
 ) -> Certificate | None:
     """Returns a verified certificate, found faster than by `synthesize`, of a smaller set; None if none is.
 
-    Around a resting point it is the first that is found, whose set may be much smaller.
-
     Args:
         plant: The plant with its bounds.
         contract: Channel contract; None for none.
@@ -172,7 +169,7 @@ def nearby_certificate(
         progress: Called with a line of text now and then.
     """
     if needs_resting_point(plant):
-        return _nearby_around(plant, contract, start, progress)
+        return _nearby_around(plant, contract, start, alternations, progress)
     try:
         certificate = nearby_ellipsoid(plant, contract, start, alternations, progress)
     except Infeasible:
@@ -182,23 +179,24 @@ def nearby_certificate(
 
 
 def _nearby_around(
-    plant: LinearPlant, contract: ChannelContract | None, start: Certificate | None, progress: Progress
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    start: Certificate | None,
+    alternations: int,
+    progress: Progress,
 ) -> Certificate | None:
-    """Returns what `nearby_certificate` does, of a polytope around a resting point: the first that is found."""
+    """Returns what `nearby_certificate` does, of a polytope around a resting point."""
     carried = None if start is None else carried_over(start, plant, contract)
-    if carried is not None:
+    if carried is not None and not alternations:
         return carried
     try:
-        rest = farthest_from_limits(plant)
-        problem, errors = design_problem(plant, contract, limits_around(plant, rest))
-        for K in gains_around(plant, problem, progress, quick=True):
-            suited = rest_for(K, plant, errors, rest)
-            found = certify_polytope(plant, K, contract, progress, suited.rest) if suited.distance >= 1.0 else None
+        for each in fallbacks_around(plant, contract, progress, quick=True):
+            found = certify_polytope(plant, each.K, contract, progress, each.rest)
             if found is not None:
-                return found
+                return found if carried is None else max([found, carried], key=polytope_share)
     except Infeasible:
         pass
-    return None
+    return carried
 
 
 def _certificates(

@@ -230,27 +230,10 @@ def around_resting_point(
     progress("resting point")
     if fixed is not None:
         known = [each for each in known if np.array_equal(each.resting_state, fixed.state)]
-    rest = fixed or farthest_from_limits(plant)
-    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
-    shapes = np.array([proof.Sigma for proof in proofs_of(errors)])
-    points = points_of_box(plant, _POINTS_OF_REST_LOG2)
-
-    def feedback(K: np.ndarray, at: Rest) -> Feedback:
-        return Feedback(K, shapes, _disturbance_around(plant, at), at)
-
-    gains = gains_around(plant, problem, progress)
-    suited = [(K, Farthest(rest, 1.0, np.empty(0, int)) if fixed else rest_for(K, plant, errors, rest)) for K in gains]
-    tried = [feedback(K, at.rest) for K, at in sorted(suited, key=lambda pair: pair[1].distance < 1.0)]
-    if points is not None and tried:
-        shares = [share_of_points(each, plant, points) for each in tried]
-        tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
-        K, first = tried[0].K, tried[0].rest
-        progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
-        better = tried[0]
-        if not fixed:
-            better = feedback(K, improved(plant, first, lambda at: share_of_points(feedback(K, at), plant, points)))
-        larger = gains_of_larger_polytopes(better, plant, progress) if search_gain else ()
-        tried = [*(feedback(each, better.rest) for each in larger), better, *tried]
+    tried = fallbacks_around(plant, contract, progress, fixed)
+    if search_gain and tried:
+        larger = gains_of_larger_polytopes(tried[0], plant, progress)
+        tried = [*(tried[0]._replace(K=K) for K in larger), *tried]
     tried = _different(tried)
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
@@ -270,6 +253,54 @@ def around_resting_point(
         return max(known, key=polytope_share)
     reason = reasons[0] if reasons else "no gain was found"
     raise Infeasible(reason, "P", 0.0) if fixed else infeasibility_around(plant, contract, reason)
+
+
+def fallbacks_around(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Progress,
+    fixed: Rest | None = None,
+    *,
+    quick: bool = False,
+) -> list[Feedback]:
+    """Returns what may keep a polytope around a resting point: those that keep the most of the box first.
+
+    Where no share of the box is known, those whose resting point leaves what the gain needs come first.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract; None for none.
+        progress: Called with a line of text now and then.
+        fixed: The resting point; the one that suits each gain by default.
+        quick: Whether to leave out the gain of the largest ellipsoid, which takes longest, and gains for which no
+            resting point leaves what they need.
+
+    Raises:
+        Infeasible: If the plant has no error set, or no resting point.
+    """
+    rest = fixed or farthest_from_limits(plant)
+    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    shapes = np.array([proof.Sigma for proof in proofs_of(errors)])
+
+    def feedback(K: np.ndarray, at: Rest) -> Feedback:
+        return Feedback(K, shapes, _disturbance_around(plant, at), at)
+
+    gains = gains_around(plant, problem, progress, quick=quick)
+    suited = [(K, Farthest(rest, 1.0, np.empty(0, int)) if fixed else rest_for(K, plant, errors, rest)) for K in gains]
+    if quick:
+        suited = [(K, at) for K, at in suited if at.distance >= 1.0]
+    tried = [feedback(K, at.rest) for K, at in sorted(suited, key=lambda pair: pair[1].distance < 1.0)]
+    points = points_of_box(plant, _POINTS_OF_REST_LOG2)
+    if points is None or not tried:
+        return tried
+    shares = [share_of_points(each, plant, points) for each in tried]
+    tried = [tried[k] for k in np.argsort(-np.array(shares), kind="stable")]
+    if fixed:
+        return tried
+    progress(f"resting point: {100.0 * max(shares):.1f} % of the box")
+    K = tried[0].K
+    rest = improved(plant, tried[0].rest, lambda at: share_of_points(feedback(K, at), plant, points))
+    return [feedback(K, rest), *tried]
 
 
 def _different(fallbacks: Sequence[Feedback]) -> list[Feedback]:

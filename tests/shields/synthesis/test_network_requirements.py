@@ -244,6 +244,19 @@ def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
             assert 0.5 < share <= 1.0
 
 
+def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps():
+    plant = LinearPlant.from_statespace(
+        ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]), dt=0.005,
+        state_limits=([-0.1, -4.0], [0.3, 4.0]), u_max=12.0, disturbance_bound=[0.0, 0.25], sensor_bound=5e-4,
+        initial_bound=[1e-3, 0.05],
+    )  # fmt: skip
+    points = requirements(plant, losses=[0, 2, 4]).points
+    for point in points:
+        kept = synthesize(plant, contract=point.network.contract).provenance["polytope_share_of_box"]
+        assert point.share == pytest.approx(kept, abs=0.02)
+    assert [point.share for point in points] == sorted((point.share for point in points), reverse=True)
+
+
 def test_factor_on_radii_is_found_for_limits_with_two_ends():
     plant = LinearPlant(
         A=[[0.9]], B=[[0.4]], dt=1.0, operating_state=[1.0], operating_input=0.25, state_limits=(0.2, 2.0),
