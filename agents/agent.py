@@ -37,7 +37,7 @@ from agents.sb3_vec_env import SB3VecEnv
 from agents.sb3_zip import parameters_of, read_model, require_same_spaces
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
-from ncs_gym.validation import reason_of, shown
+from ncs_gym.validation import counted, reason_of, shown
 from shields.atomic_write import write_atomically
 
 
@@ -441,10 +441,10 @@ def _figures(evaluation: Evaluation) -> list[str]:
     returns = [episode.episode_return for episode in episodes]
     interventions = sum(episode.interventions for episode in episodes)
     return [
-        f"- mean return: {np.mean(returns):.4g}, of {len(episodes)} episodes and {steps} steps",
+        f"- mean return: {np.mean(returns):.4g}, of {counted(len(episodes), 'episode')} and {counted(steps, 'step')}",
         f"- episodes in which the true state violated the safe box: {violating} of {len(episodes)}",
         f"- violating steps: {sum(episode.violation_steps for episode in episodes)} of {steps}",
-        f"- interventions of the shield: {interventions} of {steps} steps",
+        f"- interventions of the shield: {interventions} of {counted(steps, 'step')}",
         f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
     ]
 
@@ -459,6 +459,6 @@ def _residual_text(agent: Agent) -> str:
 def _shield_text(shield: ShieldSettings | None) -> str:
     if shield is None:
         return "none"
-    horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"
+    horizon = "" if shield.horizon is None else f", plans of at most {counted(shield.horizon, 'step')}"
     horizon += f", {shield.least_safe_steps} safe steps sought" if shield.least_safe_steps else ""
     return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

@@ -23,7 +23,7 @@ from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym.envs.json_settings import to_json
-from ncs_gym.validation import reason_of, warn_caller
+from ncs_gym.validation import counted, reason_of, warn_caller
 from shields.atomic_write import write_atomically
 
 # Observations that the normalization of an agent to go on from counts as.
@@ -170,7 +170,10 @@ def _trainable(
     model.num_timesteps = before
     if algorithm not in ON_POLICY:
         if steps <= hyperparams["learning_starts"]:
-            raise ValueError(f"{steps} steps train nothing: learning starts after {hyperparams['learning_starts']}")
+            raise ValueError(
+                f"a training of {counted(steps, 'step')} trains nothing: learning starts after "
+                f"{hyperparams['learning_starts']}"
+            )
         model.learning_starts += before  # type: ignore[attr-defined]  # the replay buffer is filled first, as always
     return envs, env, model
 

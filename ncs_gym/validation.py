@@ -235,6 +235,11 @@ def printable(text: str) -> str:
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
+def counted(number: int, noun: str) -> str:
+    """Returns a number of things in words: 1 step, 2 steps."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def as_numbers(value: Any) -> np.ndarray | None:
     """Returns `value` as a float64 array; None for what is not real numbers, whatever it raises when asked."""
     if type(value) is np.ndarray and value.dtype == np.float64:

@@ -6,7 +6,7 @@ import textwrap
 from typing import TYPE_CHECKING, Any
 
 from ncs_gym import ChannelContract
-from ncs_gym.validation import printable
+from ncs_gym.validation import counted, printable
 
 if TYPE_CHECKING:
     from shields.certificate import Certificate
@@ -83,11 +83,6 @@ def missing_polytope_of(recorded: dict[str, Any]) -> str:
     """Returns why there is no polytope."""
     reason = recorded.get("no_polytope")
     return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else "none was sought"
-
-
-def counted(number: int, noun: str) -> str:
-    """Returns a number of things."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _text(value: Any, pattern: str, scale: float = 1.0) -> str:

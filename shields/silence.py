@@ -13,9 +13,9 @@ import numpy as np
 from ncs_gym import LinearPlant, certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import in_time
-from ncs_gym.validation import as_count, own_error_state
+from ncs_gym.validation import as_count, counted, own_error_state
 from shields.certificate import Certificate
-from shields.certificate_text import counted, labeled
+from shields.certificate_text import labeled
 from shields.polytope import Polytope
 from shields.runtime.rows_within_step import rows_within_step
 from shields.synthesis.faces import Extremes, Faces
@@ -84,8 +84,8 @@ class Silence:
         outages = _listed([str(way.outage) for way in self.ways_back])
         steps = _listed(["not within 10,000" if each is None else f"{each:,}" for each in ways])
         back = (
-            f"after {outages} steps without a sample the error is in its certified set again {steps} steps after the "
-            "first sample, if samples come as rarely as the contract allows"
+            f"after {outages} steps without a sample the error is in its certified set again "
+            f"{steps} steps after the first sample, if samples come as rarely as the contract allows"
         )
         return labeled("  silence     ", kept) + "\n" + labeled("  way back    ", back)
 

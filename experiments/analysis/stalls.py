@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from ncs_gym.network.channel import in_steps
 from ncs_gym.network.contract import MAX_AGE
+from ncs_gym.validation import counted
 
 # The record is cut into so many parts, into twice as many, and so on, to see how unevenly stalls are spread.
 _FEWEST_PARTS, _MOST_PARTS = 4, 4096
@@ -98,7 +98,8 @@ def how_often(row: dict[str, Any]) -> str:
 def silences_text(oldest: int, row: dict[str, Any], contract: str = "the contract") -> str:
     """Returns how often the box may be left behind a shield, given the oldest age and its row."""
     return (
-        f"From any belief that {contract} allows the box is kept until the newest sample is {in_steps(oldest)} old, "
+        f"From any belief that {contract} allows the box is kept until the newest sample is "
+        f"{counted(oldest, 'step')} old, "
         f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "
         "between and no late sample comes meanwhile, the box is left no more often."
     )

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, bootstrap, sem, t, trim_mean
 
+from ncs_gym.validation import counted
+
 # A number per run or episode.
 Values = Sequence[float] | np.ndarray
 
@@ -132,7 +134,7 @@ def gaussian_sentences(summary: dict[str, Any]) -> list[str]:
         sentences.append(
             f"{name}: the state left the safe set in {arm['episodes_outside_set']:,} of {arm['episodes']:,} evaluation "
             f"episodes [{low:.2f}, {high:.2f} %]; under Gaussian noise the probability of that is at most "
-            f"{rounded_up(bound)} for an episode of {summary['steps']:,} steps."
+            f"{rounded_up(bound)} for an episode of {counted(summary['steps'], 'step')}."
         )
     if bound >= 1.0:
         sentences.append("A bound of 1 says nothing: it takes a plant with a smaller delta.")

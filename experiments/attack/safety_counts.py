@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from experiments.analysis.statistics import clopper_pearson, rounded_up
 from experiments.errors import SafetyBroken
 from experiments.terminal import text_table, wrapped
+from ncs_gym.validation import counted
 
 # Episodes start on the boundary of S; the largest level is taken from this step on.
 SETTLING_STEPS = 20
@@ -71,7 +72,7 @@ class SafetyCounts:
     def outcome(self) -> str:
         """How many episodes were broken, in one line; empty if none was."""
         broken = self.broken_episodes
-        return f"{broken:,} of {self.episodes:,} episodes left the set or the box" if broken else ""
+        return f"{broken:,} of {counted(self.episodes, 'episode')} left the set or the box" if broken else ""
 
     @property
     def margin(self) -> float:
@@ -178,12 +179,14 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
             _row(" " + name.rpartition(", ")[2], counts[name], columns) for name in counts if plants[name] == plant
         ]
     rows.append(_row("all", total, columns))
-    steps = f"{total.steps:,} steps, {total.steps // total.episodes} in each episode"
+    steps = f"{counted(total.steps, 'step')}, {total.steps // total.episodes} in each episode"
     seen = dict.fromkeys(name.rpartition(", ")[2] for name in counts)
     legend = [f"{kind}: {_CHANNELS[kind]}" for kind in seen if kind in _CHANNELS]
     legend += [text for name, texts in _LEGENDS.items() if is_shown[name] for text in texts]
     if total.forced:
-        legend.append(f"{total.overdue:,} steps had a sample older than the contract allows of a channel that keeps it")
+        legend.append(
+            f"{counted(total.overdue, 'step')} had a sample older than the contract allows of a channel that keeps it"
+        )
     return "\n".join([f"{steps}\n", text_table(rows, rules=(2, len(rows) - 1)), *map(wrapped, legend)])
 
 
@@ -213,7 +216,7 @@ def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, floa
     for name, case in counts.items():
         if case.interval[0] > limits[name]:
             raise SafetyBroken(
-                f"{name}: {case.broken_episodes:,} of {case.episodes:,} episodes left S, more than the bound "
+                f"{name}: {case.broken_episodes:,} of {counted(case.episodes, 'episode')} left S, more than the bound "
                 f"{rounded_up(limits[name])} on their probability allows"
             )
 
@@ -226,7 +229,9 @@ def require_safe(total: SafetyCounts, *, looks_ahead: bool) -> None:
     """
     exits = 0 if looks_ahead else total.exits
     if total.overdue:
-        raise SafetyBroken(f"at {total.overdue:,} steps the newest sample was older than a contract that was kept")
+        raise SafetyBroken(
+            f"at {counted(total.overdue, 'step')} the newest sample was older than a contract that was kept"
+        )
     if exits or total.violations or total.unproved:
-        outside_set = "" if looks_ahead else f"{exits:,} steps outside S, "
+        outside_set = "" if looks_ahead else f"{counted(exits, 'step')} outside S, "
         raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")

@@ -13,9 +13,10 @@ from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant, PacketLog, contract_of
-from ncs_gym.network.channel import in_steps, in_time
+from ncs_gym.network.channel import in_time
 from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.reading import MOST_PACKETS
+from ncs_gym.validation import counted
 from shields import Certificate, silence_of
 from shields.atomic_write import write_atomically
 from shields.packaged_certificates import certificate_of_package
@@ -131,8 +132,8 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
     too_old = f", more than the {MAX_AGE} of any contract" if found["kept"] > MAX_AGE else ""
     lines = [
         log.read_as,
-        f"{found['packets']:,} packets in {in_time(found['span'])}, {found['steps']:,} control steps of {in_time(dt)}: "
-        f"{_placed(empty, found['left_out'])}.",
+        f"{counted(found['packets'], 'packet')} in {in_time(found['span'])}, "
+        f"{counted(found['steps'], 'control step')} of {in_time(dt)}: {_placed(empty, found['left_out'])}.",
         log.disagreement,
         _lost(found),
         f"Delays: median {median}, 90 % {ninety}, 99 % {ninety_nine}, longest {longest}.",
@@ -163,13 +164,16 @@ def _lost(found: dict[str, Any]) -> str:
     if not found["tells_losses"]:
         return "Lost: the record does not say. Ages do not need it: they count from the newest sample that arrived."
     share = 100.0 * found["lost"] / found["packets"]
-    return f"Lost: {found['lost']:,} packets ({share:.3g} %), at most {found['most_lost_in_a_row']:,} in a row."
+    return (
+        f"Lost: {counted(found['lost'], 'packet')} ({share:.3g} %), at most {found['most_lost_in_a_row']:,} in a row."
+    )
 
 
 def _placed(empty: int, left_out: int) -> str:
     if not empty and not left_out:
         return "one in each"
-    return f"{empty:,} steps have no packet, {left_out:,} packets are not the first of their step and are left out"
+    without, later = counted(empty, "step"), counted(left_out, "packet")
+    return f"{without} without a packet, {later} not the first of their step and left out"
 
 
 def _compared(promise: _Promise, found: dict[str, Any]) -> str:
@@ -179,7 +183,7 @@ def _compared(promise: _Promise, found: dict[str, Any]) -> str:
         return f"The {certificate} needs no contract: it holds through any silence."
     row = _row(found, contract.max_age)
     share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
-    said = f"The {promise.whose}'s contract, a newest sample of at most {in_steps(contract.max_age)}, was broken"
+    said = f"The {promise.whose}'s contract, a newest sample of at most {counted(contract.max_age, 'step')}, was broken"
     return f"{said} {how_often(row)}{share}."
 
 
@@ -187,8 +191,8 @@ def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:
     """Returns how often samples were older than contract and promised steps allow together."""
     oldest = contract.max_age + least
     return (
-        f"If a shield promises {in_steps(least)} (shield_safe_steps) at every step at which the contract is kept, the "
-        f"box is kept at least until the newest sample is {in_steps(oldest)} old, "
+        f"If a shield promises {counted(least, 'step')} (shield_safe_steps) at every step at which the contract is "
+        f"kept, the box is kept at least until the newest sample is {counted(oldest, 'step')} old, "
         f"{in_time(oldest * found['sampling_period'])}. In the record it was older "
         f"{how_often(_row(found, oldest))}."
     )

@@ -42,6 +42,7 @@ from experiments.settings.arguments import id_alone
 from experiments.terminal import wrapped
 from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.validation import counted
 from shields import Certificate, SafetyFilter, verify
 from shields.runtime.starts import starts_known
 
@@ -79,9 +80,9 @@ def compare(settings: CompareSettings) -> None:
             "report.html": comparison_report(summary, verification, figures, findings),
         }
         write_results(settings.out, summary, files, figures)
-        count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+        count = counted(settings.seeds, "run")
         trained = max(arm["train_steps"] for arm in summary["arms"].values())
-        per_run = f"{trained:,} training steps per arm, {settings.episodes} episodes per run"
+        per_run = f"{trained:,} training steps per arm, {counted(settings.episodes, 'episode')} per run"
         print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
         short = [_smoke_text(settings)] if settings.smoke else []
         print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
@@ -169,7 +170,7 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
     """Returns what a comparison shows, in sentences."""
     findings = [
         f"{name} is not enough: {arm['train_violation_steps']:,} violating steps in training, "
-        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes in evaluation."
+        f"{arm['eval_violating_episodes']:,} of {counted(arm['eval_episodes'], 'episode')} in evaluation."
         for name, arm in summary["arms"].items()
         if Arm.of(name).penalizes_violations and arm["train_violation_steps"] + arm["eval_violating_episodes"]
     ]

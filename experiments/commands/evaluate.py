@@ -21,6 +21,7 @@ from experiments.settings import EvaluateSettings
 from experiments.settings.arguments import id_alone, require_horizon
 from experiments.terminal import say, wrapped
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.validation import counted
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`.
@@ -69,7 +70,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     others = {name: value for name, value in loop.kwargs.items() if name != "channel"}
     made = "".join(f", {name}={value!r}" for name, value in others.items())
     what = f"{agent.algorithm} of {folder}{statistics} in {agent.env}{made}"
-    print(wrapped(f"{what}, {settings.episodes:,} episodes"), end="\n\n")
+    print(wrapped(f"{what}, {counted(settings.episodes, 'episode')}"), end="\n\n")
     print(summary_text(arms, {}))
     if mode is not None:
         (arm,) = arms.values()
@@ -98,6 +99,6 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 def _proof_text(arm: dict[str, Any], least: int) -> str:
     """Returns after how many steps something was proved; of the box for a while only if the shield was asked for it."""
-    held = f"The guarantee held after {arm['eval_proved_steps']:,} of {arm['eval_steps']:,} steps"
+    held = f"The guarantee held after {arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}"
     promised = f"after {arm['eval_promised_steps']:,} the box was promised for one step more at least"
     return f"{held}; {promised}, whatever the network does." if least else f"{held}."

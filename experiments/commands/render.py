@@ -17,6 +17,7 @@ from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
 from experiments.settings.arguments import id_alone
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.validation import counted
 from shields import Certificate, SafetyShield
 
 # Budget of `--smoke`.
@@ -97,11 +98,12 @@ class _EpisodeRenderer:
 
     def __str__(self) -> str:
         count = int(self._info["episode_violations"])
-        line = f"{'no shield' if self._mode == 'none' else self._mode}: {self._steps} steps, {count} with a violation"
+        mode = "no shield" if self._mode == "none" else self._mode
+        line = f"{mode}: {counted(self._steps, 'step')}, {count} with a violation"
         if self._mode == "none":
             return line
         acted = "would have acted" if self._mode == "monitor" else "acted"
-        return f"{line}, shield {acted} {self._info['episode_interventions']} times"
+        return f"{line}, shield {acted} {counted(self._info['episode_interventions'], 'time')}"
 
 
 def _frames(renderers: list[_EpisodeRenderer], steps: int) -> Iterator[list[np.ndarray]]:

@@ -26,6 +26,7 @@ from ncs_gym import ChannelContract, LinearPlant, PacketLog
 from ncs_gym.network.channel import in_time
 from ncs_gym.network.requests import spare_samples
 from ncs_gym.reading import json_values, read_file
+from ncs_gym.validation import counted
 from shields import Certificate, Network, Requirement, Requirements
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
@@ -362,7 +363,7 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant
         if age is not None and age != inf:
             dt, oldest = network.sampling_period, int(age) - network.input_delay
             (row,) = (each for each in broken_contracts(log.ages(dt), dt, (oldest,)) if each["max_age"] == oldest)
-            yield f"{which}, {_steps(oldest)} of {dt:g} s, the record breaks {how_often(row)}."
+            yield f"{which}, {counted(oldest, 'step')} of {dt:g} s, the record breaks {how_often(row)}."
     index = None if today is None else _index_of(found, today)
     certificate = None if index is None else found.points[index].certificate
     if (
@@ -392,13 +393,13 @@ def _requests_text(found: Requirements, settings: RequirementsSettings) -> str:
     spare = spare_samples(env.channel, env.contract)
     text = (
         f"Samples are on request: of those newer than the newest that arrived, {spare} may be left out under the "
-        f"contract of {_steps(env.contract.max_age)}"
+        f"contract of {counted(env.contract.max_age, 'step')}"
     )
     delay = env.downlink_protocol.input_delay
     largest = [each.certified for each in found.largest_ages if each.certified not in (None, inf)]
     if len(largest) == 1 and (oldest := int(largest[0]) - delay) >= env.contract.max_age:
         longest = spare_samples(env.channel, ChannelContract(oldest, env.contract.quantization_step))
-        text += f", and {longest} under one of {_steps(oldest)}"
+        text += f", and {longest} under one of {counted(oldest, 'step')}"
     return f"{text}. Today's line above is that of asking for every sample."
 
 
@@ -422,15 +423,15 @@ def _cheapest_text(found: Requirements, settings: RequirementsSettings, bearing:
 
 def _description(point: Requirement) -> str:
     network = point.network
-    every = "step" if network.send_period == 1 else _steps(network.send_period)
+    every = "step" if network.send_period == 1 else counted(network.send_period, "step")
     parts = [f"a step of {network.sampling_period:g} s", f"a sample every {every}"]
     losses = f"at most {network.losses} lost in a row" if network.losses else "none lost"
     parts.append("any losses" if network.losses is None else losses)
     if network.delay or network.jitter:
         latest = network.delay + network.jitter
-        parts.append(f"at most {_steps(latest)} late")
+        parts.append(f"at most {counted(latest, 'step')} late")
     if network.input_delay:
-        parts.append(f"inputs {_steps(network.input_delay)} late")
+        parts.append(f"inputs {counted(network.input_delay, 'step')} late")
     if network.quantization_step:
         parts.append(f"rounded to {network.quantization_step:g}")
     parts.append(f"{_rate(network.packets_per_second)} packets/s and {_rate(point.bits_per_second)} bits/s")
@@ -444,10 +445,6 @@ def _description(point: Requirement) -> str:
 
 def _rate(number: float) -> str:
     return f"{number:,.0f}" if number >= 1000.0 else f"{number:.4g}"
-
-
-def _steps(number: int) -> str:
-    return "1 step" if number == 1 else f"{number} steps"
 
 
 def _shown(value: Any) -> str:

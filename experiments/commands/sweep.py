@@ -22,6 +22,7 @@ from experiments.runs.output_folder import claim_folder, write_results
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.validation import counted
 from shields import verify
 
 # Budget of `--smoke`, which takes the first and the last value of each side of the grid.
@@ -82,7 +83,7 @@ def sweep(settings: SweepSettings) -> None:
             "report.html": sweep_report(summary, verification, figures),
         }
         write_results(settings.out, summary, files, figures)
-        count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+        count = counted(settings.seeds, "run")
         print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
         print(f"files: {settings.out}")
 

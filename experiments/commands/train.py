@@ -14,6 +14,7 @@ from experiments.runs.resume import forget_checkpoint, resumed
 from experiments.runs.training_run import RunResult
 from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
+from ncs_gym.validation import counted
 
 # Budget of `--smoke`.
 _SMOKE = {"steps": 4_096, "episodes": 10}
@@ -32,7 +33,7 @@ def train(settings: TrainSettings) -> None:
         run = run_of_arm(settings, loop, certificate, settings.arm, 0)
         run = resumed(settings.out, run, anew=settings.force)
         if run.start is not None:
-            print(f"the training in {settings.out} goes on after {run.start.steps:,} steps", flush=True)
+            print(f"the training in {settings.out} goes on after {counted(run.start.steps, 'step')}", flush=True)
         results = results_of([run], settings.out, settings)
         forget_checkpoint(settings.out, run)
         mode = Arm.of(settings.arm, settings.mode).mode
@@ -41,7 +42,7 @@ def train(settings: TrainSettings) -> None:
         summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0}
         summary |= experiment_provenance(settings, loop, certificate, [run])
         write_results(settings.out, summary)
-        print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
+        print(f"{counted(results[0].train_steps, 'training step')}, {counted(settings.episodes, 'episode')}\n")
         print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")
         print(f"agent: {settings.out / 'models' / run.name}")
 

@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands
 from experiments.runs.arms import Arm
 from experiments.runs.loops import losses_text
+from ncs_gym.validation import counted
 
 # What the axes of a panel do not show; see `_other`.
 _Other = tuple[float | None, float, float | None, int | None]
@@ -91,7 +92,7 @@ def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Q
         low, high = low - missing / 2, high + missing / 2
     norm = Normalize(low, high if high > low else low + 1.0)  # a scale has a length where all values are zero, too
     runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
-    caption = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
+    caption = f"{quantity.caption} {counted(runs, 'run')} per field."
     if quantity.of_shields and "monitor" in arms:
         caption += " The monitor's are what the shield would have overridden."
     if len(others) == 1 and cells[0]["burst_length"]:

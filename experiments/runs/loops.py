@@ -20,7 +20,7 @@ from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
-from ncs_gym.validation import warn_caller
+from ncs_gym.validation import counted, warn_caller
 
 # Shares of packets that differ by less are the same. Eigenvalues of a chain below this are rounding.
 SHARE, ROUNDING = 1e-3, 1e-12
@@ -126,8 +126,8 @@ def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--cha
     most = changed.most_consecutive_losses
     if most is not None and length is not None and length > max(most, 1):
         raise ValueError(
-            f"{flag} burst_length={length:g}: the channel loses at most {most} packets in a row, and no mean is "
-            "longer; change max_consecutive_losses, too"
+            f"{flag} burst_length={length:g}: the channel loses at most {counted(most, 'packet')} in a row, and no "
+            "mean is longer; change max_consecutive_losses, too"
         )
     if "loss" in given and "max_consecutive_losses" not in given and (text := fewer_losses(changed)):
         warn_caller(text, UserWarning)

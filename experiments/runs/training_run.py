@@ -24,7 +24,7 @@ from experiments.runs.loops import AS_TRAINED, import_module, module_digest, und
 from experiments.runs.provenance import versions
 from experiments.settings.arguments import registration_of
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.validation import LARGEST_NUMBER, shown
+from ncs_gym.validation import LARGEST_NUMBER, counted, shown
 from shields import Certificate
 from shields.json_documents import digest
 
@@ -89,7 +89,7 @@ class RunResult:
         violating = sum(episode.violation_steps > 0 for episode in self.episodes)
         mean = sum(episode.episode_return for episode in self.episodes) / len(self.episodes)
         training = f"{self.train_violation_steps:,} violating training steps, " if self.train_steps else ""
-        return f"{training}{violating} of {len(self.episodes)} episodes violating, return {mean:z.2f}"
+        return f"{training}{violating} of {counted(len(self.episodes), 'episode')} violating, return {mean:z.2f}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ from experiments.study.summary import (
     members,
 )
 from experiments.terminal import text_table
+from ncs_gym.validation import counted
 
 # Narrow headers of the scenarios, in the order of the columns.
 _SCENARIOS = {
@@ -207,8 +208,8 @@ def budget_text(summary: dict[str, Any]) -> str:
     spent: dict[str, list[str]] = {}
     for name, env in summary["environments"].items():
         text = (
-            f"{env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps each, "
-            f"{env['episodes']} episodes per run and scenario"
+            f"{counted(env['seeds'], 'run')} per arm, {env['steps']:,} training steps each, "
+            f"{counted(env['episodes'], 'episode')} per run and scenario"
         )
         spent.setdefault(text, []).append(name)
     return "\n".join(f"{', '.join(names)}: {text}" for text, names in spent.items())

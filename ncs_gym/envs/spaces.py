@@ -14,7 +14,7 @@ from ncs_gym.network.downlink import Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_numbers, shown, warn_caller
+from ncs_gym.validation import as_numbers, counted, shown, warn_caller
 
 # What can be observed besides estimate and task.
 OBSERVED = "age", "error"
@@ -195,8 +195,8 @@ class Observer:
         bound = float(np.ravel(self._high)[first + entry])
         warn_caller(
             f"entry {entry} of {type(self._task).__name__} is beyond its observation_bound of {bound:.6g} and is "
-            f"clipped in observations: bound what {self._horizon} steps can reach, and give horizon=... if episodes "
-            "are longer",
+            f"clipped in observations: bound what {counted(self._horizon, 'step')} can reach, and give horizon=... "
+            "if episodes are longer",
             ClippedObservationWarning,
         )
 

@@ -13,6 +13,7 @@ from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age, in_round_numbers
 from ncs_gym.estimation.error_sets import ErrorSet, InvariantErrorSet
 from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.description import outputs_of
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
 from ncs_gym.validation import own_error_state
@@ -63,7 +64,8 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
         if (unseen := _unseen_state(plant)) is not None:
             raise ErrorSetError(f"no error set exists: the outputs do not show {unseen}, whose errors never decay")
         if contract.max_age == 0 or error_sets_by_age(plant, replace(contract, max_age=0)) is None:
-            raise ErrorSetError(f"no error set was found, not even for samples of age 0{_least_shown_state(plant)}")
+            reason = _loudest_sensor(plant) or _least_shown_state(plant)
+            raise ErrorSetError(f"no error set was found, not even for samples of age 0{reason}")
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )
@@ -87,6 +89,16 @@ def _unseen_state(plant: LinearPlant) -> str | None:
     """
     shown, state = min(_persistent_modes(plant), default=(1.0, ""))
     return state if shown <= UNDETECTABLE else None
+
+
+def _loudest_sensor(plant: LinearPlant) -> str:
+    """Returns which output is drowned in noise, as the rest of a sentence; an empty string if none is."""
+    reach = np.abs(plant.H) @ plant.half_widths
+    times = np.sqrt(np.diag(plant.sensor_error.shape_matrix)) / np.maximum(reach, np.finfo(float).tiny)
+    j, (names, _) = int(np.argmax(times)), outputs_of(plant)
+    if times[j] < 1.0:
+        return ""
+    return f": the sensor noise of {names[j]} is {times[j]:.3g} times as large as {names[j]} gets in the safe box"
 
 
 def _least_shown_state(plant: LinearPlant) -> str:

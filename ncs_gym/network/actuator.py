@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.validation import CopiedWhole, as_count, as_flag, as_numbers, read_only, shown, warn_caller
+from ncs_gym.validation import CopiedWhole, as_count, as_flag, as_numbers, counted, read_only, shown, warn_caller
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
@@ -92,7 +92,9 @@ class Actuator(CopiedWhole):
         if u_max is not None:
             limits = as_numbers(u_max)
             if limits is None or limits.shape not in ((), self._nothing.shape) or not (limits >= 0.0).all():
-                raise ValueError(f"u_max must be a size, or one of each of the {inputs} inputs, got {shown(u_max)}")
+                raise ValueError(
+                    f"u_max must be a size, or one of each of the {counted(inputs, 'input')}, got {shown(u_max)}"
+                )
             self._limits = self._limits.clip(max=limits)
         self.start()
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import again_if_interrupted, as_count, as_flag, as_number, read_only, shown
+from ncs_gym.validation import again_if_interrupted, as_count, as_flag, as_number, counted, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -155,7 +155,7 @@ class Channel:
     @property
     def description(self) -> str:
         """What the channel does to samples, in sentences."""
-        every = "every step" if self.send_period == 1 else f"every {in_steps(self.send_period)}"
+        every = "every step" if self.send_period == 1 else f"every {counted(self.send_period, 'step')}"
         every = "on request" if self.on_request else every
         rounded = f"quantized with step {self.quantization_step:g}" if self.quantization_step else "not quantized"
         if isinstance(self.loss, GilbertElliott):
@@ -164,7 +164,7 @@ class Channel:
             lost = f"A packet is lost with probability {self.loss:g}"
         if self.max_consecutive_losses is not None:
             lost += f", never more than {self.max_consecutive_losses} in a row"
-        late = f"{self.delay} to {self.longest_delay} steps" if self.jitter else in_steps(self.delay)
+        late = f"{self.delay} to {self.longest_delay} steps" if self.jitter else counted(self.delay, "step")
         arrives = f"What is not lost arrives {late} late" if self.longest_delay else "What is not lost arrives at once"
         return f"A sample is taken and sent {every}, {rounded}. {lost}. {arrives}."
 
@@ -214,11 +214,6 @@ def require_duration(channel: Channel, dt: float) -> None:
             f"the channel replays a record in steps of {channel.dt:g} s, and steps take {dt:g} s here: make another "
             f"one with PacketLog.channel({dt:g})"
         )
-
-
-def in_steps(number: int) -> str:
-    """Returns a number of steps in words."""
-    return "1 step" if number == 1 else f"{number} steps"
 
 
 def in_time(seconds: float) -> str:
@@ -289,7 +284,7 @@ class TraceChannel(Channel):
         more = f", on_request={self.on_request}" if self.on_request else ""
         more += "" if self.dt is None else f", dt={self.dt}"
         return (
-            f"TraceChannel(trace={reprlib.repr(self.trace)} of {len(self.trace):,} samples, "
+            f"TraceChannel(trace={reprlib.repr(self.trace)} of {counted(len(self.trace), 'sample')}, "
             f"send_period={self.send_period}, quantization_step={self.quantization_step}{more})"
         )
 
@@ -321,7 +316,9 @@ class TraceChannel(Channel):
     @property
     def description(self) -> str:
         """What the channel does to samples, in sentences."""
-        return f"{super().description} It replays a record of {len(self.trace)} packets from a random one on."
+        return (
+            f"{super().description} It replays a record of {counted(len(self.trace), 'packet')} from a random one on."
+        )
 
 
 def replayed_ages(trace: np.ndarray, send_period: int, steps: int) -> np.ndarray:

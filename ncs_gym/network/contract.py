@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from math import inf
 from typing import overload
 
-from ncs_gym.network.channel import Channel, in_steps
-from ncs_gym.validation import as_count, as_number, warn_caller
+from ncs_gym.network.channel import Channel
+from ncs_gym.validation import as_count, as_number, counted, warn_caller
 
 # There is an error set for every age.
 MAX_AGE = 1000
@@ -92,30 +92,37 @@ def warn_of_broken_contract(
         input_delay: c, the number of steps from a decision to its effect.
         counts_losses: Whether losses and jitter count, as of a real channel; one that may lose any number of packets
             in a row promises nothing. Without them it is warned only of what breaks the contract although no packet is
-            lost.
+            lost, rounding included.
     """
     if contract is None:
         return
     if counts_losses and channel.most_consecutive_losses is None:
         warn_caller(
             "the channel may lose any number of packets in a row, but the certificate's contract allows the newest "
-            f"sample to be {in_steps(contract.max_age)} old in all, so that the guarantee is likely to be lost: say "
-            "what the network promises by max_consecutive_losses",
+            f"sample to be {counted(contract.max_age, 'step')} old in all, so that the guarantee is likely to be "
+            "lost: say what the network promises by max_consecutive_losses",
             BrokenContractWarning,
         )
         return
-    promised = contract_of(channel) if counts_losses else None
-    age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
-    if age + input_delay <= contract.max_age:
-        return
     kept = contract_of(channel)
-    enough = f"{age + input_delay}), or of a larger max_age where packets are lost"
-    if kept is not None:
-        enough = f"{kept.max_age + input_delay}), which the channel keeps with its losses"
-    later = f", and what is decided takes effect {in_steps(input_delay)} later" if input_delay else ""
+    age = kept.max_age if counts_losses and kept is not None else channel.send_period - 1 + channel.delay
+    broken = []
+    if age + input_delay > contract.max_age:
+        later = f", and what is decided takes effect {counted(input_delay, 'step')} later" if input_delay else ""
+        allowed = f"but the certificate's contract allows {counted(contract.max_age, 'step')} in all"
+        broken.append(f"lets the newest sample become {counted(age, 'step')} old{later}, {allowed}")
+    if not contract.is_fine_enough_for(channel):
+        allowed = f"but the certificate's contract allows {contract.quantization_step:g}"
+        broken.append(f"rounds measurements to {channel.quantization_step:g}, {allowed}")
+    if not broken:
+        return
+    oldest = max((age if kept is None else kept.max_age) + input_delay, contract.max_age)
+    enough = ChannelContract(oldest, max(channel.quantization_step, contract.quantization_step))
+    losses = (
+        "or of a larger max_age where packets are lost" if kept is None else "which the channel keeps with its losses"
+    )
     warn_caller(
-        f"the channel lets the newest sample become {in_steps(age)} old{later}, but the certificate's contract allows "
-        f"{in_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
-        f"ChannelContract(max_age={enough}",
+        f"the channel {', and it '.join(broken)}, so that the guarantee is likely to be lost: give a certificate of "
+        f"{enough}, {losses}",
         BrokenContractWarning,
     )

@@ -16,7 +16,7 @@ from ncs_gym.network.actuator import NEVER, Actuator, Command, CommittedInputs
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of, largest_age
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
-from ncs_gym.validation import frozen, read_only, shown
+from ncs_gym.validation import counted, frozen, read_only, shown
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,8 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
         raise ValueError(f"downlink_contract must be of type ChannelContract, got {shown(contract)}")
     elif contract.max_age < downlink.longest_delay:
         raise ValueError(
-            f"the downlink delays commands by up to {downlink.longest_delay} steps, which a contract of max_age = "
-            f"{contract.max_age} never allows"
+            f"the downlink delays commands by up to {counted(downlink.longest_delay, 'step')}, which a contract of "
+            f"max_age = {contract.max_age} never allows"
         )
     return DownlinkProtocol(downlink, largest_age(contract, downlink.longest_delay), contract)
 

@@ -19,7 +19,7 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of, largest_age
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
-from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, setting, shown, warn_caller
+from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, counted, setting, shown, warn_caller
 
 # Keys of infos that are the network's own.
 INFOS = "measurement_age", "packet_arrived", "action_age", "action_applied", "packets"
@@ -131,7 +131,8 @@ class NetworkSettings:
         if age > self.pending and not self._has_warned:
             self._has_warned = True
             warn_caller(
-                f"the newest sample is {age} steps old, and the predictor is given the last {self.pending} actions: "
+                f"the newest sample is {counted(age, 'step')} old, and the predictor is given the last "
+                f"{counted(self.pending, 'action')}: "
                 f"give pending={age} or more, or say what the channel promises (max_consecutive_losses)",
                 UserWarning,
             )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ncs_gym.plants.past_inputs import inputs_under_way
+from ncs_gym.validation import counted
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -24,13 +25,13 @@ _UNBROKEN = "\N{NO-BREAK SPACE}"
 def described(plant: LinearPlant) -> str:
     """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
     counts = ((plant.n, "state"), (plant.m, "input"), (plant.p, "output"))
-    sizes = ", ".join(f"{count} {name}{'s' * (count != 1)}" for count, name in counts)
+    sizes = ", ".join(counted(count, name) for count, name in counts)
     radius = f"spectral radius {plant.spectral_radius:.6g}"
     stable = f"stable ({radius})"
     unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
     extents = {
         "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix)), plant.state_names, plant.state_units),
-        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *_outputs(plant)),
+        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *outputs_of(plant)),
         "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix)), plant.state_names, plant.state_units),
     }
     own = plant.n - inputs_under_way(plant)  # rows of past inputs alone limit nothing: inputs have limits
@@ -132,7 +133,7 @@ def _deviation(plant: LinearPlant, i: int) -> str:
     return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
 
 
-def _outputs(plant: LinearPlant) -> tuple[list[str], list[str]]:
+def outputs_of(plant: LinearPlant) -> tuple[list[str], list[str]]:
     """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
     names, units = [], []
     for j, row in enumerate(plant.H):

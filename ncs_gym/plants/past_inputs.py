@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
-from ncs_gym.validation import as_count
+from ncs_gym.validation import as_count, counted
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -105,7 +105,7 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
     if delay:
         box, ends = np.concatenate([box, coupled]), np.concatenate([ends, coupled_ends], axis=1)
         coupled, coupled_ends = np.empty((0, n + stored + m)), np.empty((2, 0))
-    ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(stored_inputs, 0, -1)]
+    ages = [f"{counted(age, 'step')} ago" for age in range(stored_inputs, 0, -1)]
     disturbance = plant.disturbance_bound
     if plant.gamma > 0.0:  # one bound for both: the ball of gamma would reach the stored inputs
         ball = Ellipsoid(plant.gamma * np.eye(n))

@@ -14,7 +14,7 @@ from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, own_error_state, shown, warn_caller
+from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, counted, own_error_state, shown, warn_caller
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
 HELD_OUT = 0.25
@@ -111,7 +111,7 @@ def linear_model(
         A, B = (given["A"], given["B"]) if given else fitted_matrices(*drawn, widths)
         factor = as_number(safety_factor, "safety_factor", low=1.0)
         bound = Ellipsoid(factor**2 * surrounding_shape(_left_out(A, B, drawn), widths))
-        basis = f"from {samples:,} samples with safety factor {factor:g}"
+        basis = f"from {counted(samples, 'sample')} with safety factor {factor:g}"
     largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
     basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
     if (off := float((np.abs(origin) / widths).max())) > max(NO_EQUILIBRIUM, spread):
@@ -212,8 +212,8 @@ def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
         return moving.step(frame, moving.write(np.zeros(n)), np.zeros(m))
     except (IndexError, TypeError, ValueError) as error:
         raise ValueError(
-            f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} (as box has) with {m} "
-            f"input{'s' * (m != 1)} (as u_max has): {error}"
+            f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} (as box has) with "
+            f"{counted(m, 'input')} (as u_max has): {error}"
         ) from error
 
 

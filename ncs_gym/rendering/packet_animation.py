@@ -5,6 +5,7 @@ from __future__ import annotations
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import FrameRecord, PacketRecord
+from ncs_gym.validation import counted
 
 # A lost packet is drawn for this many more steps, and drifts this many pixels along the line in each of them.
 _FADE_STEPS, _DRIFT = 2, 27.0
@@ -36,7 +37,7 @@ def draw_packets(canvas: Canvas, frame: FrameRecord, start: float, end: float) -
     for age, x in in_flight:
         _draw_envelope(canvas, (x, y), _color(age))
         if age and abs(x - labeled) > _LABEL_SPACING:
-            text = f"{age} step{'s' if age > 1 else ''} late"
+            text = f"{counted(age, 'step')} late"
             canvas.text(text, (x, y - 18), theme.INK, align=0.5, bold=True)
             labeled = x
 

@@ -9,6 +9,7 @@ import numpy as np
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord
+from ncs_gym.validation import counted
 
 # The largest number of inputs that are drawn.
 _MAX_INPUTS = 3
@@ -23,7 +24,7 @@ def draw_header(canvas: Canvas, frame: FrameRecord) -> None:
     canvas.text(f"step {frame.step}", (16, y), theme.INK, theme.BODY, bold=True)
     canvas.text(f"{frame.step * frame.plant.dt:.{decimals}f} s", (148, y), theme.MUTED, theme.BODY, align=1.0)
     count = frame.violations
-    text = "no violation" if count == 0 else f"{count} violation{'s' if count > 1 else ''}"
+    text = "no violation" if count == 0 else counted(count, "violation")
     color, fill = (theme.DANGER, theme.DANGER_FILL) if count else (theme.SAFE, theme.SAFE_FILL)
     left = _draw_label(canvas, theme.WIDTH - 16, text, color, fill, filled=frame.violated)
     _draw_shield(canvas, frame, left - 10)
@@ -104,7 +105,7 @@ def _draw_shield(canvas: Canvas, frame: FrameRecord, right: float) -> None:
         text = f"SHIELD ACTS {count}"
     else:
         ahead = 0 if annotation.plan is None else len(annotation.plan)  # for as long the box is kept in any case
-        label = f"{ahead} step{'' if ahead == 1 else 's'} ahead" if ahead else annotation.label
+        label = f"{counted(ahead, 'step')} ahead" if ahead else annotation.label
         text = f"shield ({label}): acted {count}"
     _draw_label(canvas, right, text, theme.SHIELD, theme.SHIELD_FILL, filled=frame.intervened)
 
@@ -192,7 +193,7 @@ def _draw_packets(canvas: Canvas, frame: FrameRecord, y: float) -> None:
     A tick below marks a step in which nobody asked for a sample, but the contract needed one.
     """
     age = frame.measurement_age
-    text = "newest used: now" if age == 0 else f"newest used: {age} step{'s' if age > 1 else ''} old"
+    text = "newest used: now" if age == 0 else f"newest used: {counted(age, 'step')} old"
     bar = _draw_row(canvas, y, "packets sent", text, theme.LATE_TEXT if age else theme.ESTIMATE)
     spacing = (bar.w - 14) / (RECENT_STEPS - 1)
     for back, forced in enumerate(frame.forced[::-1].tolist()):

@@ -20,6 +20,7 @@ import numpy as np
 from ncs_gym import Actuator, Command, Echo, Packet
 from ncs_gym.network.contract import largest_age
 from ncs_gym.network.wire import Kind, Message, Wire, WireError
+from ncs_gym.validation import counted
 from shields.nodes.step_clock import SETTLED, StepClock
 from shields.nodes.transport import Datagram, Transport
 from shields.runtime.decisions import Decision
@@ -255,8 +256,8 @@ class ControllerNode:
             raise ValueError("commands that go over a network need SafeLoop(..., downlink=Channel(...), echo_age=...)")
         if loop.channel.longest_delay > LONGEST_ANSWER:
             raise ValueError(
-                f"samples may be {loop.channel.longest_delay} steps late, and nodes hear of each other within "
-                f"{LONGEST_ANSWER}: sample less often"
+                f"samples may be {counted(loop.channel.longest_delay, 'step')} late, and nodes hear of each other "
+                f"within {LONGEST_ANSWER}: sample less often"
             )
         self.loop, self.wire, self.transport, self.clock = loop, wire, transport, clock
         self.refused: Counter[str] = Counter()

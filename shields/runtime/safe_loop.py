@@ -23,13 +23,14 @@ from ncs_gym.validation import (
     as_flag,
     as_numbers,
     as_vector,
+    counted,
     own_error_state,
     setting,
     shown,
     warn_caller,
 )
 from shields.certificate import Certificate
-from shields.certificate_text import contract_text, counted, size_of, table
+from shields.certificate_text import contract_text, size_of, table
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     LATE_INPUT,
@@ -442,8 +443,8 @@ class SafeLoop(CopiedWhole):
         """Warns once of every reason for which packets were discarded in this call."""
         oldest = self._estimator.channel.longest_delay
         texts = {
-            "too_late": f"it came later than the {oldest} steps that the channel of this loop delays any; give "
-            "SafeLoop the channel with its longest delay",
+            "too_late": f"it came later than the {counted(oldest, 'step')} that the channel of this loop delays "
+            "any; give SafeLoop the channel with its longest delay",
             "ahead": f"its stamp is ahead of the loop, which is at step {self.steps}; stamp samples with the number of "
             "their control step, counted from 0 at start (loop.steps), by one clock for both",
             "other_episode": f"its episode is not that of the loop, {self.episode}; send "

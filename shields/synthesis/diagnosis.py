@@ -276,13 +276,17 @@ def _vain(smaller: Sequence[str], wider: Sequence[str]) -> list[str]:
 
 
 def _limits_exceeded(plant: LinearPlant) -> str:
-    """Returns which limits of the safe box the disturbance of a single step exceeds, as the rest of a sentence."""
-    reached = np.sqrt(np.einsum("ji,ik,jk->j", plant.box, plant.nominal_disturbance.shape_matrix, plant.box))
-    two_ends = np.isfinite(plant.box_ends[0]) & np.isfinite(plant.box_ends[1])
+    """Returns which limits of the safe box a disturbance or a first error alone exceeds, as the rest of a sentence."""
+    two_ends = np.flatnonzero(np.isfinite(plant.box_ends).all(axis=0)).tolist()
+    alone = {
+        "the disturbance of one step": plant.nominal_disturbance,
+        "the error of the first estimate": plant.nominal_initial_error,
+    }
     return "".join(
-        f"; the disturbance of one step alone reaches {size:.3g} times the limit {row_limit(plant, j)}"
-        for j, (size, closed) in enumerate(zip(reached.tolist(), two_ends.tolist(), strict=True))
-        if size >= 1.0 and closed
+        f"; {what} alone reaches {size:.3g} times the limit {row_limit(plant, j)}"
+        for what, shape in alone.items()
+        for j, size in enumerate(np.ravel(shape.support(plant.box)).tolist())
+        if size >= 1.0 and j in two_ends
     )
 
 

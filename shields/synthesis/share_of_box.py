@@ -75,4 +75,6 @@ def _volume(C: np.ndarray) -> float | None:
 
 def _reason(C: np.ndarray) -> str:
     """Returns why there is no share."""
+    if np.linalg.matrix_rank(C) < C.shape[1]:
+        return "the box is unbounded"
     return f"a box of {C.shape[0]} rows in {C.shape[1]} dimensions has too many corners to compute its volume"

@@ -77,10 +77,10 @@ HYPERPARAMS = [
 ]  # fmt: skip
 
 CALLS = [
-    (partial(train, CRUISE, 64, 0, "SAC", REPLAY), "64 steps train nothing: learning starts after 64"),
+    (partial(train, CRUISE, 64, 0, "SAC", REPLAY), "a training of 64 steps trains nothing: learning starts after 64"),
     (partial(train, CRUISE, -5, 0), "steps must be at least 1, got -5"),
     (partial(train, CRUISE, 64, 0, "DQN"), "unknown algorithm 'DQN'"),
-    (partial(require_trainable, CRUISE, 2_000, "SAC", {}), "2000 steps train nothing"),
+    (partial(require_trainable, CRUISE, 2_000, "SAC", {}), "a training of 2,000 steps trains nothing"),
     (partial(evaluate, CRUISE, None, 0, 0), "episodes must be at least 1, got 0"),
     *((partial(ShieldSettings, value), f"certificate must be a Certificate, got {type(value).__name__}") for value in
       (PAPER, None, CERTIFICATE.document)),

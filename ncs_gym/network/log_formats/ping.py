@@ -11,7 +11,7 @@ import numpy as np
 
 from ncs_gym.network.log_formats.record import MOST_LATE, WAY_AND_BACK, Record, require_time
 from ncs_gym.reading import require_packets
-from ncs_gym.validation import shown
+from ncs_gym.validation import counted, shown
 
 # Longer lines are not ping's [characters].
 _LONGEST_LINE = 1000
@@ -238,6 +238,6 @@ def _disagreements(summary: _Summary | None, delays: np.ndarray) -> str:
     if summary is None or (len(delays), answers) == summary[:2]:
         return ""
     return (
-        f" Its summary has {summary.transmitted:,} packets and {summary.received:,} answers, its lines {len(delays):,} "
-        f"and {answers:,}: lines are missing or are counted twice."
+        f" Its summary has {counted(summary.transmitted, 'packet')} and {counted(summary.received, 'answer')}, its "
+        f"lines {len(delays):,} and {answers:,}: lines are missing or are counted twice."
     )

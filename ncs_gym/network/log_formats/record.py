@@ -51,8 +51,3 @@ def require_time(numbers: np.ndarray, sent: np.ndarray) -> None:
             f"between the packets {numbers[hurried[0]]} and {numbers[hurried[0] + 1]} its stamps leave too little time "
             "for the lost ones: the clock was set back there, cut the record"
         )
-
-
-def many(number: int, noun: str) -> str:
-    """Returns a number with its noun, in the plural where it is not one."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"

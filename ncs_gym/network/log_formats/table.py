@@ -27,10 +27,10 @@ from ncs_gym.network.log_formats.cells import (
     says_lost,
 )
 from ncs_gym.network.log_formats.lost_packets import with_missing
-from ncs_gym.network.log_formats.record import BEFORE, Record, many
+from ncs_gym.network.log_formats.record import BEFORE, Record
 from ncs_gym.network.log_formats.times import of_times
 from ncs_gym.reading import require_packets
-from ncs_gym.validation import shown
+from ncs_gym.validation import counted, shown
 
 
 class _Head(NamedTuple):
@@ -217,5 +217,5 @@ def _of_list(
     read_as = f"Read as a list of delays: {name}, in {column.unit}, packets sent every {1000.0 * every:.4g} ms"
     read_as += " (the file does not say)." if period is None else "."
     if marked:
-        read_as += f" 0, -1 or an empty line stands for a lost packet ({many(marked, 'line')})."
+        read_as += f" 0, -1 or an empty line stands for a lost packet ({counted(marked, 'line')})."
     return Record(sent, arrived, read_as)

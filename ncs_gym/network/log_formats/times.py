@@ -24,9 +24,9 @@ from ncs_gym.network.log_formats.cells import (
     units_of,
 )
 from ncs_gym.network.log_formats.lost_packets import median_gap, with_absent, with_missing
-from ncs_gym.network.log_formats.record import BEFORE, MOST_LATE, Record, many
+from ncs_gym.network.log_formats.record import BEFORE, MOST_LATE, Record
 from ncs_gym.reading import require_packets
-from ncs_gym.validation import shown
+from ncs_gym.validation import counted, shown
 
 # Packets closer to each other are in another unit than seconds, as in the days of spreadsheets [s].
 _CLOSEST = 1e-4
@@ -72,14 +72,14 @@ def of_times(rows: Iterator[tuple[int, list[str]]], columns: dict[str, Column], 
     read_as = _first_sentence(columns, lines)
     if lines.marked:
         mark = shown(_until(columns).name)
-        read_as += f" A {mark} of 0 or -1 stands for a lost packet ({many(lines.marked, 'line')})."
+        read_as += f" A {mark} of 0 or -1 stands for a lost packet ({counted(lines.marked, 'line')})."
     if missing:
-        read_as += f" A number without a line stands for a lost packet ({many(missing, 'number')})."
+        read_as += f" A number without a line stands for a lost packet ({counted(missing, 'number')})."
     if restarts:
-        read_as += f" Numbers begin anew {many(restarts, 'time')}: packets without a line are not counted there."
+        read_as += f" Numbers begin anew {counted(restarts, 'time')}: packets without a line are not counted there."
     if absent:
         read_as += (
-            f" {many(absent, 'packet')} without a line, where one is usually sent every {1000.0 * usual:.4g} ms, "
+            f" {counted(absent, 'packet')} without a line, where one is usually sent every {1000.0 * usual:.4g} ms, "
             "stand for lost ones."
         )
     if not tells_losses:

@@ -516,7 +516,7 @@ def test_predictor_that_lacks_actions_is_told_of_once():
     channel, settings = Channel(delay=1, loss=0.5), {"fill": lambda last, *_: last}
     many = VectorNetworked(gym.vector.SyncVectorEnv([Counter] * 2), channel, **settings)
     for env in (Networked(Counter(), channel, **settings), many):
-        with pytest.warns(UserWarning, match="is 2 steps old, and the predictor is given the last 1 actions") as told:
+        with pytest.warns(UserWarning, match="is 2 steps old, and the predictor is given the last 1 action") as told:
             steps(env)
         assert len(told) == 1
     steps(Networked(Counter(), channel, pending=30, **settings))

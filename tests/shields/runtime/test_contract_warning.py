@@ -1,6 +1,7 @@
 """What cannot keep the contract of a certificate is pointed out where certificate and channel meet."""
 
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -42,7 +43,7 @@ def vector_shield(channel, downlink):
 @pytest.mark.parametrize(
     ("channel", "downlink", "words"),
     [
-        (Channel(delay=9), None, r"become 9 steps old, but .* allows 4 steps in all, .* ChannelContract\(max_age=9\)"),
+        (Channel(delay=9), None, r"become 9 steps old, but .* allows 4 steps in all, .* ChannelContract\(max_age=9, "),
         (Channel(send_period=3, delay=3), None, "become 5 steps old, but"),
         (Channel(delay=2), DOWNLINK, "become 2 steps old, and what is decided takes effect 3 steps later, but"),
         (Channel(), Channel(delay=5), "become 0 steps old, and what is decided takes effect 5 steps later, but"),
@@ -52,6 +53,24 @@ def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, 
     with pytest.warns(BrokenContractWarning, match=words) as caught:
         make(channel, downlink)
     assert [each.filename for each in caught] == [__file__]
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        (Channel(quantization_step=0.01), "the channel rounds measurements to 0.01, but .* contract allows 0, so"),
+        (Channel(quantization_step=0.01, delay=5), "become 5 steps old, but .* in all, and it rounds .* to 0.01, but"),
+    ],
+)
+@pytest.mark.parametrize("make", [NCSEnv, NCSVectorEnv])
+def test_rounding_that_the_contract_does_not_allow_is_pointed_out(make, channel, words):
+    many, shielded = ((2,), VectorSafetyShield) if make is NCSVectorEnv else ((), SafetyShield)
+    promised = replace(channel, max_consecutive_losses=0)
+    env = make(*many, plant=PLANT, channel=promised)  # whose contract is that of its channel
+    with pytest.warns(BrokenContractWarning, match=words) as caught:
+        shielded(env, certificate_of(PLANT, CONTRACT))
+    (said,) = [str(each.message) for each in caught if each.category is BrokenContractWarning]
+    assert f"ChannelContract(max_age={max(channel.delay, 4)}, quantization_step=0.01), which the channel keeps" in said
 
 
 @pytest.mark.parametrize("make", [loop, shield, vector_shield])
@@ -75,7 +94,7 @@ def test_channel_that_may_keep_the_contract_is_taken_without_a_warning(make, cha
 
 def test_real_loop_behind_a_downlink_counts_what_its_uplink_promises():
     uplink = Channel(loss=0.5, delay=1, max_consecutive_losses=2)  # samples up to 3 steps old, which c is added to
-    with pytest.warns(BrokenContractWarning, match=r"become 3 steps old.* ChannelContract\(max_age=6\)"):
+    with pytest.warns(BrokenContractWarning, match=r"become 3 steps old.* ChannelContract\(max_age=6, "):
         loop(uplink, DOWNLINK)
     with warnings.catch_warnings():
         warnings.simplefilter("error", BrokenContractWarning)

@@ -10,6 +10,7 @@ from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible, synthesize
 from shields.errors import SynthesisInterrupted
 from shields.synthesis.design_problem import design_problem
+from shields.synthesis.diagnosis import Clock, with_feasible_bounds
 from shields.synthesis.max_margin_gain import max_margin_gain
 from tests.certificates import feasible_bounds_not_sought
 from tests.plants import random_plant
@@ -172,6 +173,25 @@ def test_bounds_of_a_stable_plant_are_named_without_a_contract_too():
     exceeded = r"the disturbance of one step alone reaches [\d.]+ times the limit \|coupling stretch\| <= 2 m"
     with pytest.raises(Infeasible, match=f"{exceeded}.*{largest}"):
         synthesize(plant)
+
+
+def drone(**changes):
+    bounds = {"disturbance_bound": [1e-4, 5e-3], "sensor_bound": 2e-3, "initial_bound": [5e-3, 2e-2]} | changes
+    model = ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+    return LinearPlant.from_statespace(model, dt=0.02, box=[1.0, 2.0], u_max=4.0, **bounds)
+
+
+def test_sensor_that_is_louder_than_the_box_is_wide_is_named():
+    loud = "the sensor noise of x1 is 2 times as large as x1 gets in the safe box"
+    with pytest.raises(Infeasible, match=f"no error set was found, not even for samples of age 0: {loud}"):
+        synthesize(drone(sensor_bound=2.0), contract=ChannelContract(3))
+
+
+def test_first_error_that_is_larger_than_the_box_is_named():
+    plant, clock = drone(initial_bound=[5.0, 1.0]), Clock(0.0)  # no change is sought
+    told = with_feasible_bounds(Infeasible("none", "I", 0.5), plant, ChannelContract(3), clock=clock)
+    assert "the error of the first estimate alone reaches 7.07 times the limit |x1| <= 1" in str(told)
+    assert "|x2|" not in str(told)
 
 
 def test_plant_that_no_gain_stabilizes_is_not_blamed_on_its_bounds():

@@ -56,6 +56,11 @@ def test_too_many_corners_are_a_reason_not_a_number(certificate):
     assert "%" not in text
 
 
+def test_unbounded_box_is_the_reason():
+    plant = replace(truck_trailer(), box=np.array([[0.5, 0.0]]))
+    assert share_of_box(plant, np.diag([1.0, 5.0])) == {"share_of_box_unknown": "the box is unbounded"}
+
+
 def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
     """A limit that cuts off nothing of the box, which is no product by it."""
     plant = LinearPlant(
