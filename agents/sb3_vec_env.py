@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -100,6 +102,7 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         """
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
+            self._reset_options()
             raise ValueError("a vector environment takes the same options for all environments")
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
@@ -224,12 +227,22 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """Returns whether a wrapper of that class is around; True for `Monitor`, whose infos this class provides."""
+        """Returns whether a wrapper of that class is around; True for `Monitor`, whose infos this class provides.
+
+        Around the environments of gymnasium's sync and async vector environments, too; those in processes of their own
+        tell the names of their wrappers' classes.
+        """
         wrapped, layer = wrapper_class is Monitor, self.vector_env
         while isinstance(layer, gym.vector.VectorWrapper):
             wrapped |= isinstance(layer, wrapper_class)
             layer = layer.env
-        return [wrapped for _ in self._get_indices(indices)]
+        chosen = list(self._get_indices(indices))
+        if wrapped or not isinstance(layer, _WITH_RESET_MASK[1:]):
+            return [wrapped for _ in chosen]
+        if isinstance(layer, gym.vector.SyncVectorEnv):
+            return [is_wrapped(layer.envs[e], wrapper_class) for e in chosen]
+        names, told = _names_of(wrapper_class), layer.call("__str__")  # "<Monitor<TimeLimit<..."
+        return [not names.isdisjoint(re.split(r"[^<\w]", str(told[e]))[0].split("<")) for e in chosen]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Returns a frame per environment, None where the vector environment renders none."""
@@ -256,6 +269,11 @@ def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
         value = info[key]
         merged[key] = np.where(done.reshape(-1, *[1] * (value.ndim - 1)), final[key], value)
     return merged
+
+
+def _names_of(kind: type) -> set[str]:
+    """Returns the names of a class and of its subclasses."""
+    return {kind.__name__}.union(*map(_names_of, kind.__subclasses__()))
 
 
 def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:

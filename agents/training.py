@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from math import isnan
@@ -185,7 +186,7 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
             f"the agent to go on from is {start.algorithm} of {start.env}, this is {algorithm} of {loop.env}"
         )
     try:
-        parameters: Any = start.model.get_parameters()
+        parameters: Any = deepcopy(start.model.get_parameters())  # optimizers go on using the tensors they load
         model.set_parameters(parameters, exact_match=True, device="cpu")
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"the agent to go on from has other networks: {reason_of(error)}") from error

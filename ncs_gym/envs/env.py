@@ -454,7 +454,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     def _observation(self) -> np.ndarray:
         task_state = self._task_state
         for u in self._committed.pending:
-            task_state = self._task.predict(self._plant, task_state, u)
+            task_state = self._task.predict_one(self._plant, task_state, u)
         return self._observer.observation(self._known, self._task.observe(task_state))
 
     def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool, read: Any = None) -> dict[str, Any]:

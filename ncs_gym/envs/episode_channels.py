@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,6 +15,10 @@ from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel, require_duration
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
 from ncs_gym.validation import AroundEnvironment, AroundEnvironments, shown
+
+# Draws a channel; and which one: the option of `reset`, and of several channels the key.
+_Draw = Callable[[np.random.Generator], Any]
+_Which = tuple[str, Any]
 
 
 class EveryEpisode(NamedTuple):
@@ -164,11 +168,12 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     Args:
         env: An `NCSEnv`, or another environment in `Networked`, possibly wrapped.
         channel: A function (rng) -> Channel, or a list of channels (or dictionaries of their fields) of which each is
-            equally likely; None for the environment's own.
+            equally likely; None for the environment's own. Several channels are drawn one by one: of the same, or of a
+            dictionary of these by the channels' keys, where those that it leaves out stay the environment's own.
         downlink: The same for the commands.
 
     Raises:
-        ValueError: If neither is given, or it is none of these.
+        ValueError: If neither is given, it is none of these, or the environment has no channel of a key.
     """
 
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
@@ -186,13 +191,18 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
         Raises:
             ValueError: See `RandomChannel`.
         """
-        self._drawn = _drawn(channel, downlink)
+        self._keys = _keys(self.env.get_wrapper_attr("channel"))
+        self._drawn = _drawn(self._keys, channel, downlink)
         self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
         self._cached_spec = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; a channel among the options takes the place of a drawn one."""
-        return self.env.reset(seed=seed, options=self._drawn | (options or {}))
+
+        def source(which: _Which, first: Any) -> Any:
+            return self._drawn[which] if first is None else first
+
+        return self.env.reset(seed=seed, options=_options(self._keys, self._drawn, options, source))
 
 
 class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorArgs):
@@ -210,7 +220,7 @@ class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorAr
     def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
-        self._drawn: dict[str, Callable[[np.random.Generator], Any]] = {}
+        self._drawn: dict[_Which, _Draw] = {}
         self.draw_from(channel, downlink)
 
     def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
@@ -219,9 +229,11 @@ class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorAr
         Raises:
             ValueError: See `RandomChannel`; or if another of channel and downlink was drawn until now.
         """
-        drawn = _drawn(channel, downlink)
+        self._keys = _keys(self.env.channel)  # pyright: ignore[reportAttributeAccessIssue]
+        drawn = _drawn(self._keys, channel, downlink)
         if self._drawn and drawn.keys() != self._drawn.keys():
-            raise ValueError(f"draw_from takes the place of what was given: give {' and '.join(self._drawn)}")
+            given = dict.fromkeys(name if key is None else f"{name} of {key!r}" for name, key in self._drawn)
+            raise ValueError(f"draw_from takes the place of what was given: give {' and '.join(given)}")
         self._drawn = drawn
         self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
 
@@ -229,30 +241,76 @@ class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorAr
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; channels among the options take the place of drawn ones, in these episodes."""
-        own = options or {}
-        drawn = {name: EveryEpisode(partial(self._draw, name), own.get(name)) for name in self._drawn}
+
+        def source(which: _Which, first: Any) -> Any:
+            return EveryEpisode(partial(self._draw, which), first)
+
+        options = _options(self._keys, self._drawn, options, source)
         # gymnasium's annotation leaves out the lists that its own vector environments take.
-        return self.env.reset(seed=seed, options=own | drawn)  # pyright: ignore[reportArgumentType]
+        return self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
 
-    def _draw(self, name: str, rng: np.random.Generator) -> Any:
+    def _draw(self, which: _Which, rng: np.random.Generator) -> Any:
         """Returns what is drawn now, whenever the environments began to ask for it."""
-        return self._drawn[name](rng)
+        return self._drawn[which](rng)
 
 
-def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:
-    given = {name: each for name, each in {"channel": channel, "downlink": downlink}.items() if each is not None}
+def _keys(channel: Any) -> list[Any]:
+    """Returns the keys of an environment's channels; that of a single one is None."""
+    return list(channel) if isinstance(channel, Mapping) else [None]
+
+
+def _drawn(keys: list[Any], channel: Any, downlink: Any) -> dict[_Which, _Draw]:
+    """Returns what channels are drawn from, by the option of `reset` and the key of a channel."""
+    given: dict[_Which, Any] = {}
+    if channel is not None:
+        each = channel if isinstance(channel, Mapping) and keys != [None] else dict.fromkeys(keys, channel)
+        if unknown := [key for key in each if key not in keys]:
+            raise ValueError(f"channel has the key {shown(unknown[0])}, the channels' are {keys}")
+        given = {("channel", key): source for key, source in each.items()}
+    if downlink is not None:
+        given["downlink", None] = downlink
     if not given:
         raise ValueError("give channel or downlink: a function (rng) -> Channel, or a list of channels")
-    return {name: _draw(each, name) for name, each in given.items()}
+    return {(name, key): _draw(source, name, several=key is not None) for (name, key), source in given.items()}
 
 
-def _draw(source: Any, name: str) -> Callable[[np.random.Generator], Any]:
+def _draw(source: Any, name: str, *, several: bool) -> _Draw:
     if callable(source):
         return source
-    choices = tuple(from_json(each, (Channel,), name) for each in source) if isinstance(source, (list, tuple)) else ()
+    try:
+        choices = [from_json(each, (Channel,), name) for each in source] if isinstance(source, (list, tuple)) else []
+    except ValueError:
+        if not several:
+            raise
+        choices = []
     if not choices or not all(isinstance(each, Channel) for each in choices):
-        raise ValueError(f"{name} must be a function (rng) -> Channel or a list of channels, got {shown(source)}")
-    return partial(_chosen, choices)
+        by_key = ", or a dictionary of these by the channels' keys" if several else ""
+        wanted = f"a function (rng) -> Channel or a list of channels{by_key}"
+        raise ValueError(f"{name} must be {wanted}, got {shown(source)}")
+    return partial(_chosen, tuple(choices))
+
+
+def _options(
+    keys: list[Any], drawn: dict[_Which, _Draw], given: dict[str, Any] | None, source: Callable[[_Which, Any], Any]
+) -> dict[str, Any]:
+    """Returns the options of a reset, with what is drawn.
+
+    Args:
+        keys: Of the environment's channels.
+        drawn: What channels are drawn from.
+        given: The options that were given.
+        source: Returns what an environment draws a channel from, and has instead if that is given.
+    """
+    options = dict(given or {})
+    for name in dict.fromkeys(name for name, _ in drawn):
+        own = options.get(name)
+        if name == "downlink" or keys == [None]:
+            options[name] = source((name, None), own)
+        else:
+            each = own if isinstance(own, Mapping) else dict.fromkeys(keys, own)
+            several = {key: source((name, key), each.get(key)) for key in keys if (name, key) in drawn}
+            options[name] = {**each, **several}
+    return options
 
 
 def _chosen(choices: tuple[Channel, ...], rng: np.random.Generator) -> Channel:

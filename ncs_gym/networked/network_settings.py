@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import Autoreset
 
-from ncs_gym.envs.episode_channels import EpisodeChannels, EveryEpisode
+from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.network.channel import Channel
@@ -114,16 +114,12 @@ class NetworkSettings:
             if meant := get_close_matches(str(name), ("channel", "downlink"), cutoff=0.75):
                 said = f"the reset option {shown(name)} is the environment's; the network's is {meant[0]!r}"
                 warn_caller(said, UserWarning)
-        option = options.pop("channel", None)
-        given = option.first if isinstance(option, EveryEpisode) else option
-        each = [given] * len(self.parts)
-        if isinstance(given, Mapping):
-            keys = [part.key for part in self.parts]
+        given, keys = options.pop("channel", None), [part.key for part in self.parts]
+        each = [given] * len(keys)
+        if isinstance(given, Mapping) and keys != [None]:
             if unknown := [key for key in given if key not in keys]:
                 raise ValueError(f"the option channel has the key {shown(unknown[0])}, the channels' are {keys}")
             each = [given.get(key) for key in keys]
-        if isinstance(option, EveryEpisode):
-            each = [EveryEpisode(option.draw, first) for first in each]
         return [links.read(one, "channel") for one, links in zip(each, uplinks, strict=True)]
 
     def warn_of_lacking_actions(self, age: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import deepcopy
 from math import nan
 from typing import Any, ClassVar
 
@@ -88,13 +89,17 @@ class Task(ReadOnlyArrays, ABC):
             moved[episode] = self.advance(rng, plant, each, own)
         return moved
 
+    def predict_one(self, plant: LinearPlant, task_state: Any, u: np.ndarray) -> Any:
+        """Returns what `predict` does, which cannot write into the task's state."""
+        return self.predict(plant, _own(task_state), u)
+
     def predict_many(self, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns what `predict` does for inputs (m, N) of N environments."""
+        """Returns what `predict_one` does for inputs (m, N) of N environments."""
         if self.vectorized:
-            return self.predict(plant, task_state, u)
+            return self.predict_one(plant, task_state, u)
         predicted = np.empty_like(task_state)
         for episode, (each, own) in enumerate(zip(task_state, u.T, strict=True)):
-            predicted[episode] = self.predict(plant, each, own)
+            predicted[episode] = self.predict_one(plant, each, own)
         return predicted
 
     def observe_many(self, task_state: np.ndarray) -> np.ndarray:
@@ -139,3 +144,8 @@ class Task(ReadOnlyArrays, ABC):
     def check(self, plant: LinearPlant) -> str:
         """Returns why this task does not suit the plant, or an empty string."""
         return ""
+
+
+def _own(task_state: Any) -> Any:
+    """Returns a task's state for code of others: an array that it cannot write into, a copy of anything else."""
+    return guarded(task_state) if isinstance(task_state, np.ndarray) else deepcopy(task_state)

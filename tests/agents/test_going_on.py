@@ -1,5 +1,6 @@
 """Trainings that go on from an agent, keep what they learned when they are interrupted, and learn what was applied."""
 
+import copy
 import json
 from dataclasses import replace
 from functools import partial
@@ -7,6 +8,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -52,6 +54,19 @@ def test_training_goes_on_from_an_agent(loop):
         train(loop, 512, 0, "A2C", start=first)
     with pytest.raises(ValueError, match="has other networks"):
         train(loop, 512, 0, hyperparams=SMALL | {"policy_kwargs": {"net_arch": [8]}}, start=first)
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+def test_agent_that_a_training_goes_on_from_stays_as_it_is(loop, algorithm):
+    small = SMALL if algorithm == "PPO" else {"n_envs": 4, "learning_starts": 64, "policy_kwargs": {"net_arch": [8]}}
+    first = train(loop, 256, 0, algorithm, small).agent
+    before = copy.deepcopy(first.model.get_parameters())
+    second, third = (train(loop, 256, 1, algorithm, small, start=first).agent for _ in range(2))
+    after = first.model.get_parameters()
+    assert after.keys() == before.keys()
+    for name, values in before.items():
+        torch.testing.assert_close(after[name], values, rtol=0.0, atol=0.0)
+    assert second.checksum == third.checksum
 
 
 @pytest.mark.cases(1)

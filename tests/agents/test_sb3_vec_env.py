@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 import ncs_gym  # noqa: F401
 from agents import SB3VecEnv
-from shields import VectorSafetyShield
+from shields import SafetyShield, VectorSafetyShield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -238,6 +238,27 @@ def test_attributes():
     env.close()
     with pytest.raises(ValueError, match="must be a gymnasium VectorEnv"):
         SB3VecEnv(gym.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_wrappers_around_environments_of_their_own_are_seen(mode):
+    vector = gym.make_vec(CRUISE, num_envs=2, vectorization_mode=mode, wrappers=[SafetyShield])
+    env = SB3VecEnv(vector)
+    for wrapper, is_around in (
+        (SafetyShield, True), (gym.wrappers.TimeLimit, True), (gym.Wrapper, True), (Monitor, True),
+        (gym.wrappers.ClipAction, False),
+    ):  # fmt: skip
+        assert env.env_is_wrapped(wrapper) == [is_around] * 2
+        assert env.env_is_wrapped(wrapper, 1) == [is_around]
+    env.close()
+
+
+def test_options_that_differ_are_refused_once():
+    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=2))
+    env.set_options([{"state": [0.0, 0.0]}, {}])
+    with pytest.raises(ValueError, match="the same options"):
+        env.reset()
+    assert env.reset().shape == (2, 3)
 
 
 def test_evaluate_policy_counts_episodes_by_its_infos():

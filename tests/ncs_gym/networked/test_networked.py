@@ -15,7 +15,16 @@ from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import DelayObservation, TimeLimit, TransformReward
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from ncs_gym import Channel, GilbertElliott, Networked, RandomChannel, RequestActions, TraceChannel, VectorNetworked
+from ncs_gym import (
+    Channel,
+    GilbertElliott,
+    Networked,
+    RandomChannel,
+    RequestActions,
+    TraceChannel,
+    VectorNetworked,
+    VectorRandomChannel,
+)
 from tests.ncs_gym.networked.environments import Counter
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
@@ -369,6 +378,50 @@ def test_channels_of_episodes_are_drawn_or_given_and_other_options_reach_the_env
         env.reset(options={"chanel": Channel()})
     inner.reset()
     assert inner.episode_channel.delay == 1
+
+
+class Sensors(gym.Env):
+    """Two sensors, that say nothing."""
+
+    observation_space = gym.spaces.Dict({name: gym.spaces.Box(-1.0, 1.0, (1,)) for name in "ab"})
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+DELAYED = [Channel(delay=1), Channel(delay=3)]
+NETWORK = {"a": Channel(), "b": Channel(delay=5)}
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_channels_of_several_sensors_are_drawn_by_their_keys(many):
+    if many:
+        inner, drawn = VectorNetworked(SyncVectorEnv([Sensors] * 8), NETWORK), VectorRandomChannel
+    else:
+        inner, drawn = Networked(Sensors(), NETWORK), RandomChannel
+
+    def delays(env, **options):
+        """The different pairs of delays in many episodes."""
+        infos = [env.reset(seed=seed, options=options)[1]["channel_delay"] for seed in range(40)]
+        return {pair for info in infos for pair in zip(*(np.ravel(info[key]).tolist() for key in "ab"), strict=True)}
+
+    assert delays(drawn(inner, {"a": DELAYED})) == {(1, 5), (3, 5)}
+    assert delays(drawn(inner, {"a": DELAYED, "b": lambda rng: Channel(delay=2)})) == {(1, 2), (3, 2)}
+    assert delays(drawn(inner, DELAYED)) == {(1, 1), (1, 3), (3, 1), (3, 3)}
+    assert delays(drawn(inner, DELAYED), channel={"b": Channel(delay=7)}) == {(1, 7), (3, 7)}
+    assert delays(drawn(inner, {"a": DELAYED}), channel=Channel(delay=4)) == {(4, 4)}
+    by_key = "a dictionary of these by the channels' keys, got"
+    for wrong, words in (
+        ({"c": DELAYED}, r"channel has the key 'c', the channels' are \['a', 'b'\]"),
+        ([NETWORK], by_key), ({"a": Channel()}, by_key), ({}, "give channel or downlink"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            drawn(inner, wrong)
 
 
 @pytest.mark.parametrize("make", [Counter, lambda: gym.wrappers.DtypeObservation(gym.make("CartPole-v1"), np.float64)])

@@ -1,8 +1,10 @@
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
+from ncs_gym import Channel, LinearPlant, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
 from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
 
 
@@ -162,6 +164,45 @@ def test_whole_numbers_are_rewards_and_the_array_stays_the_tasks_own():
     rewards = envs.step(np.ones((3, 1), np.float32))[1]
     assert (rewards.dtype, rewards.tolist()) == (np.float64, [1.0, 1.0, 1.0])
     assert rewards is not paid
+
+
+class Counting(Task):
+    """Counts steps in a list or an array, and what `predict` writes there."""
+
+    def __init__(self, first):
+        object.__setattr__(self, "first", first)
+
+    def begin(self, rng, plant, size=None):
+        return self.first.copy()
+
+    def advance(self, rng, plant, task_state, u):
+        task_state[0] += 1
+        return task_state
+
+    def predict(self, plant, task_state, u):
+        task_state[0] += 1
+        return task_state
+
+    def observe(self, task_state):
+        return np.array([float(task_state[0])])
+
+    def observation_bound(self, plant, horizon):
+        return np.array([1000.0])
+
+    def reward(self, plant, task_state, state, u):
+        return float(task_state[0])
+
+
+def test_what_is_predicted_does_not_move_the_state_of_a_task():
+    for make, axes in ((gym.make, ()), (partial(gym.make_vec, num_envs=1), (1,))):
+        settings = {"plant": truck_trailer(mass=4000.0), "downlink": Channel(delay=2)}
+        env = make("ncs_gym/LinearNCS-v0", task=Counting([0]), **settings)
+        env.reset(seed=0)
+        steps = [env.step(np.zeros((*axes, 1), np.float32)) for _ in range(3)]
+        assert [float(np.squeeze(step[1])) for step in steps] == [1.0, 2.0, 3.0]
+        assert [float(np.squeeze(step[0][..., -1])) for step in steps] == [3.0, 4.0, 5.0]
+        with pytest.raises(ValueError, match="read-only"):
+            make("ncs_gym/LinearNCS-v0", task=Counting(np.zeros(1)), **settings).reset(seed=0)
 
 
 class Table(PayingMany):
