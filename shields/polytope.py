@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linprog
 
 from ncs_gym.plants.between_samples import MOST_POINTS
 from ncs_gym.plants.limits import as_row_ends, listed_ends
@@ -128,6 +127,8 @@ class Polytope(ReadOnlyArrays):
         Raises:
             ValueError: If the polytope is unbounded in a direction.
         """
+        from scipy.optimize import linprog  # takes long to import
+
         units = 1.0 / np.abs(self.rows).max(axis=0)  # the solver drops small coefficients
         rows, ones, found = self.F * units, np.ones(len(self.F)), []
         given = np.atleast_2d(np.asarray(directions, dtype=np.float64))

@@ -57,7 +57,8 @@ class Silence:
         anywhere: For how many steps more the box is kept from any belief that the contract allows, whatever the agent
             and the disturbance do (every mode of a shield but "monitor").
         at_half: For how many steps more it is kept with the fallback input, from an estimate in half of the safe set,
-            which is made smaller around its resting point.
+            which is made smaller around its resting point. The state itself may be outside the set then, so that with
+            large errors this may be less than `anywhere`.
         at_rest: The same from an estimate at the resting point. All three are at most `MOST_STEPS`.
         ways_back: How the guarantee returns after outages.
     """
@@ -77,8 +78,9 @@ class Silence:
 
         kept = (
             f"if no sample comes, late ones included, the box is kept until the newest is {until(self.anywhere)}, from "
-            "any belief that the contract allows and whatever the agent does; with the fallback input from half of the "
-            f"safe set until it is {until(self.at_half)}, from rest until {until(self.at_rest)}"
+            "any belief that the contract allows and whatever the agent does; with the fallback input, from an "
+            f"estimate in half of the safe set, until it is {until(self.at_half)}, from one at rest until "
+            f"{until(self.at_rest)}"
         )
         ways = [way.rarely for way in self.ways_back]
         outages = _listed([str(way.outage) for way in self.ways_back])

@@ -178,7 +178,7 @@ class LiveView:
                 print()
 
     def _show(self, row: dict[str, Any]) -> None:
-        self._seen["overridden"] += row["intervened"]
+        self._seen["overridden" if _is_answered(row) else "unanswered"] += int(row["intervened"])
         now = time.monotonic()
         if now < self._next:
             return
@@ -186,7 +186,8 @@ class LiveView:
         proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason'].removesuffix(KEPT_FOR_NOW)}"
         if row["safe_steps"]:
             proved = f"{proved}, the box kept for {counted(row['safe_steps'], 'step')}"
-        counts = f"overridden {self._seen['overridden']}, missing {row['missing']}, late {row['skipped']}"
+        counts = f"overridden {self._seen['overridden']}, unanswered {self._seen['unanswered']}"
+        counts += f", missing {row['missing']}, late {row['skipped']}"
         known = f"margin {row['margin']:.2f}, age {row['age']}; {counts}, refused {row['refused']}"
         line = f"step {row['step']}: {proved}; {known}"
         if self._live is None:
@@ -203,6 +204,11 @@ class LiveView:
             bar = "".join("#" if i == place else "|" if i in (0, 15, 30) else "-" for i in range(31))
             table.add_row(name, f"{row[f'x_hat_{name}']:.4f}", f"{bar} {share:+.0%}")
         self._live.update(table)
+
+
+def _is_answered(row: dict[str, Any]) -> bool:
+    """Returns whether the policy proposed something in time, in a row of the controller's log."""
+    return any(value not in ("", None) for name, value in row.items() if name.startswith("proposed_"))
 
 
 def _counts(written: str) -> list[list[str]]:
@@ -224,7 +230,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
         counts["steps"] += 1
         counts["proved"] += row["guaranteed"] == "1"
         counts["promised"] += row["safe_steps"] != "0"
-        counts["overridden"] += row["intervened"] == "1"
+        counts["overridden" if _is_answered(row) else "unanswered"] += row["intervened"] == "1"
         counts["reason: " + row["reason"]] += bool(row["reason"])
         ages[int(row["age"])] += 1
         times.append(int(row["microseconds"]))
@@ -245,6 +251,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
             "proved": counts["proved"],
             **({"box promised for a step or more": counts["promised"]} if counts["promised"] else {}),
             "overridden": counts["overridden"],
+            "not answered in time by the policy": counts["unanswered"],
             "decided too late": int(last["skipped"]),
             "datagrams refused": int(last["refused"]),
             **{

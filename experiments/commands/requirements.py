@@ -54,7 +54,7 @@ _SHARES = {
     "polytope": "polytope's share of the box [%]",
     "certificate": "100: a certificate, whose share of the box is not known",
 }
-# Progress is counted in these parts of an age that is searched: workers report a thousand at a time.
+# Progress is counted in these parts of a search: workers report a thousand at a time.
 _PARTS = 1000
 _MOST_PANELS = 9
 
@@ -241,7 +241,7 @@ class _SearchRun:
 
     @property
     def total_steps(self) -> int:
-        return _PARTS * len(self.search.ages)
+        return _PARTS * self.search.count
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> dict[float, Answer]:
         return self.search(lambda count: on_progress(_PARTS * count))
@@ -346,7 +346,9 @@ def _boundary_text(largest: LargestAge) -> str:
         return f"{where}: a certificate needs no samples at all."
     time = in_time(largest.certified * network.sampling_period)
     text = f"{where}: the newest sample may be {largest.certified:g} steps ({time}) old"
-    beyond = "" if largest.none_found is None else f"; for {_shown_age(largest.none_found)} no certificate was found"
+    beyond = "; no older one was asked"
+    if largest.none_found is not None:
+        beyond = f"; for {_shown_age(largest.none_found)} no certificate was found"
     return f"{text}{beyond}."
 
 
@@ -354,7 +356,11 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant
     """Yields how a record was read, and how often it would have broken the contract of today and the widest ones."""
     yield log.read_as
     yield log.disagreement
-    asked = [("The widest contract with a certificate", each.network, each.certified) for each in found.largest_ages]
+    widest = "The widest contract with a certificate"
+    asked = [
+        (widest if each.none_found is not None else f"{widest} of those asked", each.network, each.certified)
+        for each in found.largest_ages
+    ]
     if today is not None and today.contract is not None:
         asked.insert(0, ("Today's contract", today, today.contract.max_age))
     if any(each.certified == inf for each in found.largest_ages):

@@ -21,6 +21,8 @@ from shields.synthesis.network_requirements import LargestAge, Network, Requirem
 
 # Ages that one search goes through, each from the certificate of the last; other processes have the others.
 _AGES_PER_SEARCH = 6
+# Where all ages that are asked certify, older ones are sought up to so many times the oldest of these.
+_BEYOND = 4
 # Bits of a number that is not quantized.
 _FLOAT_BITS = 64
 # A tolerated factor is first sought this close below the margin that a gain is known to have, then ever farther below.
@@ -55,13 +57,18 @@ class Search:
     ages: tuple[float, ...]
     tolerance: bool = False
 
+    @property
+    def count(self) -> int:
+        """How many parts of it are reported."""
+        return len(self.ages)
+
     def __call__(self, report: Callable[[int], object] = lambda count: None) -> dict[float, Answer]:
         """Returns the answer for every age; ages beyond one for which none is found are not searched.
 
         A certificate of such an age would be one of the smaller age, too, for which none was found.
 
         Args:
-            report: Called with the number of ages that are answered since its last call.
+            report: Called with the number of its parts that are done since its last call.
         """
         answers: dict[float, Answer] = {}
         last: Certificate | None = None
@@ -98,26 +105,43 @@ class BoundarySearch(Search):
 
     start: Certificate
 
+    @property
+    def count(self) -> int:
+        """Bisections, and where no age is known to have none what is asked before."""
+        low, high = self._ends
+        return ceil(log2(high - low)) if high < inf else 3 + ceil(log2(self._oldest - low))
+
+    @property
+    def _ends(self) -> tuple[int, float]:
+        return int(self.ages[0]), self.ages[-1] if len(self.ages) > 1 else inf
+
+    @property
+    def _oldest(self) -> int:
+        return min(_BEYOND * (int(self.ages[0]) + 1), MAX_AGE)
+
     def __call__(self, report: Callable[[int], object] = lambda count: None) -> dict[float, Answer]:
         """Returns the answers for the ages that bisection asks, after doubling where no age is known to have none.
 
-        Before doubling it asks for a certificate that needs no samples, as stable plants may have.
+        Before doubling, `_BEYOND`-fold at most, it asks for a certificate that needs no samples, as stable plants may
+        have.
         """
         answers: dict[float, Answer] = {}
-        low, high, best = int(self.ages[0]), self.ages[-1] if len(self.ages) > 1 else inf, self.start
+        (low, high), best, left = self._ends, self.start, self.count
         if high == inf and (certificate := nearby_certificate(self.plant, None, best)) is not None:
-            report(len(self.ages))
+            report(left)
             return {inf: Answer(certificate)}
-        while high - low > 1 and low < MAX_AGE:
-            report(0)  # the caller may end the search here
-            age = min(2 * low + 1, MAX_AGE) if high == inf else (low + int(high)) // 2
+        report(0)  # the caller may end the search here, and after every age
+        while high - low > 1 and low < self._oldest:
+            age = min(2 * low + 1, self._oldest) if high == inf else (low + int(high)) // 2
             certificate = nearby_certificate(self.plant, _contract(age, self.quantization_step), best)
             answers[age] = Answer(certificate)
             if certificate is None:
                 high = age
             else:
                 low, best = age, certificate
-        report(len(self.ages))
+            report(1)
+            left -= 1
+        report(left)
         return answers
 
 

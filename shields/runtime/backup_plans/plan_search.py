@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import clarabel
 import numpy as np
-from scipy.sparse import csc_matrix
 
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
@@ -319,6 +318,8 @@ class PlanProgram:
         """Fixes where the entries of the matrix are, those of the cone being what changes."""
         size = self._length * self._m
         identity = np.eye(size)
+        from scipy.sparse import csc_matrix  # takes long to import
+
         linear = np.concatenate([self._rows, identity, -identity])
         row, column = np.nonzero(linear)
         first = len(linear) + 1  # the row before holds the radius
@@ -380,6 +381,8 @@ class PlanProgram:
 
     def _set_up(self) -> Any:
         """Returns a solver with the pattern of the problem."""
+        from scipy.sparse import csc_matrix
+
         size, settings = self._length * self._m, _clarabel.DefaultSettings()
         settings.verbose, settings.presolve_enable, settings.max_iter = False, False, MOST_ITERATIONS
         settings.input_sparse_dropzeros = False

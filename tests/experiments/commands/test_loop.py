@@ -85,6 +85,19 @@ def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     assert (packets["received"] >= packets["sent"]).all()
 
 
+def test_steps_without_an_answer_of_the_policy_are_not_called_overridden(tmp_path):
+    columns = (
+        "episode,step,guaranteed,safe_steps,reason,proposed_u1,proposed_u2,intervened,age,skipped,refused,refused_why"
+    )
+    rows = [f"1,{step},1,0,,{proposed},{intervened},2,0,0," for step, (proposed, intervened) in enumerate(
+        [("0.0,0.0", 0), ("1.0,0.0", 1), (",", 1), (",", 1), ("0.5,0.5", 1), ("nan,0.5", 1)]
+    )]  # fmt: skip
+    lines = [columns + ",microseconds", *(f"{row},100" for row in rows)]
+    (tmp_path / "controller-000.csv").write_text("\n".join(lines) + "\n")
+    summary = summary_of(tmp_path)
+    assert (summary["overridden"], summary["not answered in time by the policy"]) == (3, 2)
+
+
 @pytest.mark.slow
 def test_controller_that_is_killed_is_restarted_beside_the_running_plant(tmp_path):
     key, certificate = tmp_path / "key", tmp_path / "c.json"

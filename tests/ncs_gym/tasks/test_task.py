@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -112,7 +113,12 @@ def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
         inputs = np.stack([np.cos(angles), np.sin(angles)])
         states = to_state @ inputs
         used = np.maximum(np.abs(plant.box_rows @ states).max(axis=0), np.abs(inputs.T / plant.u_max).max(axis=1))
-        assert farthest_equilibrium(plant, output) == pytest.approx((output @ states / used).max(), rel=1e-3)
+        farthest = farthest_equilibrium(plant, output)
+        assert farthest == pytest.approx((output @ states / used).max(), rel=1e-3)
+        task = SetpointTracking(output=output, reach=(1.0 - 1e-6) * farthest, width=1.0)
+        assert task.check(plant) == ""
+        assert "no controller can hold" in replace(task, reach=1.001 * farthest).check(plant)
+        assert replace(task, reach=0.1 * farthest).check(plant) == ""
 
 
 class Paying(Task):

@@ -145,7 +145,7 @@ def test_packets_that_come_too_late_for_a_loop_are_named_once(certificate):
     loop = SafeLoop(certificate, PLANT, Channel(delay=1))
     loop.start([0.0, 0.0])
     [loop.step(0.0) for _ in range(4)]
-    with pytest.warns(UnusedPacketsWarning, match="later than the 1 steps"):
+    with pytest.warns(UnusedPacketsWarning, match="later than the 1 step that"):
         loop.step(0.0, [Packet(1, np.zeros(2))])
     loop.step(0.0, [Packet(2, np.zeros(2))])
     assert loop.discarded.too_late == 2

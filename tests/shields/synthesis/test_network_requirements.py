@@ -224,8 +224,28 @@ def test_search_for_the_largest_age_asks_before_every_age_whether_it_should_end(
     )
     reported = []
     answers = search(reported.append)
-    assert reported == [0] * len(answers) + [2]
-    assert len(answers) >= 2
+    assert reported == [0, *[1] * len(answers), search.count - len(answers)]
+    assert len(answers) == search.count == 2
+
+
+@pytest.mark.parametrize(
+    ("up_to", "asked"), [(1000, [27, 55, 56]), (56, [27, 55, 56]), (30, [27, 55, 41, 34, 30, 32, 31])]
+)
+def test_beyond_ages_that_all_certify_older_ones_are_sought_up_to_four_times(monkeypatch, up_to, asked):
+    plant = servo()
+    start = nearby_certificate(plant, ChannelContract(0))
+
+    def nearby(plant, contract, best):
+        return start if contract is not None and contract.max_age <= up_to else None
+
+    monkeypatch.setattr("shields.synthesis.requirement_search.nearby_certificate", nearby)
+    search = BoundarySearch(name="", title="", plant=plant, quantization_step=0.0, ages=(13,), start=start)
+    reported = []
+    answers = search(reported.append)
+    assert list(answers) == asked
+    assert max(age for age, answer in answers.items() if answer.certificate is not None) == min(up_to, 56)
+    assert sum(reported) == search.count
+    assert min(reported) >= 0
 
 
 def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
