@@ -55,7 +55,7 @@ def mean_return(env_id, training, channel, observe, seed, smoke):
     settings = settings | ({"learning_starts": 100} if smoke and algorithm is SAC else {})
 
     def envs(count, seed):
-        network = {"channel": channel, "observe": observe, "pending": PENDING}
+        network = {"channel": channel, "observe": observe} | ({"pending": PENDING} if observe else {})
         return make_vec_env(env_id, count, seed=seed, wrapper_class=Networked, wrapper_kwargs=network)
 
     normalized = VecNormalize(envs(count, seed), norm_reward=algorithm is PPO and env_id == "Acrobot-v1")

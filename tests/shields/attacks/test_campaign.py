@@ -95,7 +95,9 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
         assert counts["overridden"] > 0 or through == "SafetyShield"  # which has few steps
         assert counts["guaranteed"] == counts["steps"]
     elif through == "VectorSafetyShield":
-        assert min(counts["planned"], counts["stored"], counts["outside S"]) > 0
+        assert min(counts["planned"], counts["stored"]) > 0
+        if is_whole or mode != SILENCE:  # plans for silence rarely leave it so soon
+            assert counts["outside S"] > 0
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
