@@ -58,10 +58,10 @@ def test_training_goes_on_from_an_agent(loop):
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_agent_that_a_training_goes_on_from_stays_as_it_is(loop, algorithm):
-    small = SMALL if algorithm == "PPO" else {"n_envs": 4, "learning_starts": 64, "policy_kwargs": {"net_arch": [8]}}
-    first = train(loop, 256, 0, algorithm, small).agent
+    small = SMALL if algorithm == "PPO" else REPLAY | {"policy_kwargs": {"net_arch": [8]}}
+    first = train(loop, 128, 0, algorithm, small).agent
     before = copy.deepcopy(first.model.get_parameters())
-    second, third = (train(loop, 256, 1, algorithm, small, start=first).agent for _ in range(2))
+    second, third = (train(loop, 128, 1, algorithm, small, start=first).agent for _ in range(2))
     after = first.model.get_parameters()
     assert after.keys() == before.keys()
     for name, values in before.items():
