@@ -186,8 +186,8 @@ class LiveView:
         proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason'].removesuffix(KEPT_FOR_NOW)}"
         if row["safe_steps"]:
             proved = f"{proved}, the box kept for {counted(row['safe_steps'], 'step')}"
-        counts = f"overridden {self._seen['overridden']}, unanswered {self._seen['unanswered']}"
-        counts += f", missing {row['missing']}, late {row['skipped']}"
+        counts = f"overridden {self._seen['overridden']}, missing {row['missing']}, late {row['skipped']}"
+        counts += f", unanswered {unanswered}" if (unanswered := self._seen["unanswered"]) else ""
         known = f"margin {row['margin']:.2f}, age {row['age']}; {counts}, refused {row['refused']}"
         line = f"step {row['step']}: {proved}; {known}"
         if self._live is None:

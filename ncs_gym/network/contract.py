@@ -117,12 +117,15 @@ def warn_of_broken_contract(
     if not broken:
         return
     oldest = max((age if kept is None else kept.max_age) + input_delay, contract.max_age)
-    enough = ChannelContract(oldest, max(channel.quantization_step, contract.quantization_step))
-    losses = (
-        "or of a larger max_age where packets are lost" if kept is None else "which the channel keeps with its losses"
-    )
+    if oldest > MAX_AGE:
+        advice = f"no certificate is for samples older than {MAX_AGE} steps"
+    else:
+        enough = ChannelContract(oldest, max(channel.quantization_step, contract.quantization_step))
+        losses = "or of a larger max_age where packets are lost"
+        advice = (
+            f"give a certificate of {enough}, {losses if kept is None else 'which the channel keeps with its losses'}"
+        )
     warn_caller(
-        f"the channel {', and it '.join(broken)}, so that the guarantee is likely to be lost: give a certificate of "
-        f"{enough}, {losses}",
+        f"the channel {', and it '.join(broken)}, so that the guarantee is likely to be lost: {advice}",
         BrokenContractWarning,
     )

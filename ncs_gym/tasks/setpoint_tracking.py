@@ -111,7 +111,7 @@ class SetpointTracking(Task):
         if self.reach > farthest * (1.0 + _ROUNDING):
             return (
                 f"targets reach {self.reach:g}, but the farthest equilibrium inside the safe box and the input limits "
-                f"has c x = {farthest:.6g}: no controller can hold what lies beyond"
+                f"has c x = {farthest:z.6g}: no controller can hold what lies beyond"
             )
         return ""
 

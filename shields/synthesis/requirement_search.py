@@ -109,7 +109,7 @@ class BoundarySearch(Search):
     def count(self) -> int:
         """Bisections, and where no age is known to have none what is asked before."""
         low, high = self._ends
-        return ceil(log2(high - low)) if high < inf else 3 + ceil(log2(self._oldest - low))
+        return ceil(log2(max(self._oldest - low, 1))) + (3 if high == inf else 0)
 
     @property
     def _ends(self) -> tuple[int, float]:
@@ -117,7 +117,9 @@ class BoundarySearch(Search):
 
     @property
     def _oldest(self) -> int:
-        return min(_BEYOND * (int(self.ages[0]) + 1), MAX_AGE)
+        """The oldest age that may be asked: the one that is known to have none, or what doubling ends at."""
+        low, high = self._ends
+        return min(_BEYOND * (low + 1), MAX_AGE) if high == inf else int(high)
 
     def __call__(self, report: Callable[[int], object] = lambda count: None) -> dict[float, Answer]:
         """Returns the answers for the ages that bisection asks, after doubling where no age is known to have none.

@@ -92,6 +92,11 @@ def test_channel_that_may_keep_the_contract_is_taken_without_a_warning(make, cha
         make(channel, downlink)
 
 
+def test_channel_that_no_contract_covers_is_pointed_out_too():
+    with pytest.warns(BrokenContractWarning, match="so that .* no certificate is for samples older than 1000 steps"):
+        shield(Channel(delay=998), Channel(delay=4))
+
+
 def test_real_loop_behind_a_downlink_counts_what_its_uplink_promises():
     uplink = Channel(loss=0.5, delay=1, max_consecutive_losses=2)  # samples up to 3 steps old, which c is added to
     with pytest.warns(BrokenContractWarning, match=r"become 3 steps old.* ChannelContract\(max_age=6, "):

@@ -229,9 +229,15 @@ def test_search_for_the_largest_age_asks_before_every_age_whether_it_should_end(
 
 
 @pytest.mark.parametrize(
-    ("up_to", "asked"), [(1000, [27, 55, 56]), (56, [27, 55, 56]), (30, [27, 55, 41, 34, 30, 32, 31])]
+    ("ages", "up_to", "asked"),
+    [
+        ((13,), 1000, [27, 55, 56]),
+        ((13,), 30, [27, 55, 41, 34, 30, 32, 31]),
+        ((0, 40), 37, [20, 30, 35, 37, 38]),  # between ages of which the older one has none
+        ((1000,), 1000, []),
+    ],
 )
-def test_beyond_ages_that_all_certify_older_ones_are_sought_up_to_four_times(monkeypatch, up_to, asked):
+def test_largest_age_is_bisected_and_sought_up_to_four_times_the_oldest_asked(monkeypatch, ages, up_to, asked):
     plant = servo()
     start = nearby_certificate(plant, ChannelContract(0))
 
@@ -239,11 +245,12 @@ def test_beyond_ages_that_all_certify_older_ones_are_sought_up_to_four_times(mon
         return start if contract is not None and contract.max_age <= up_to else None
 
     monkeypatch.setattr("shields.synthesis.requirement_search.nearby_certificate", nearby)
-    search = BoundarySearch(name="", title="", plant=plant, quantization_step=0.0, ages=(13,), start=start)
+    search = BoundarySearch(name="", title="", plant=plant, quantization_step=0.0, ages=ages, start=start)
     reported = []
     answers = search(reported.append)
     assert list(answers) == asked
-    assert max(age for age, answer in answers.items() if answer.certificate is not None) == min(up_to, 56)
+    certified = [age for age, answer in answers.items() if answer.certificate is not None]
+    assert max(certified, default=ages[0]) == min(up_to, 56 if ages == (13,) else up_to)
     assert sum(reported) == search.count
     assert min(reported) >= 0
 
