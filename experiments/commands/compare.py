@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -53,8 +53,20 @@ _SMOKE_ARMS = ("unshielded", "shielded")
 _SMOKE_BASELINES = ("zero input", PRETRAINED, f"{PRETRAINED}+shielded")
 
 
-def compare(settings: CompareSettings) -> None:
-    """Runs `ncs compare`: prints the table and writes the files."""
+class Comparison(NamedTuple):
+    """What a comparison found.
+
+    Attributes:
+        episodes: A row per evaluation episode (`episodes_table`).
+        summary: What summary.json holds.
+    """
+
+    episodes: pd.DataFrame
+    summary: dict[str, Any]
+
+
+def compare(settings: CompareSettings) -> Comparison:
+    """Runs `ncs compare`: prints the table, writes the files, and returns what they are made of."""
     settings = _with_full_names(shortened(settings))
     noise = "gaussian" if settings.noise == "gaussian" else None
     loop = loop_config(settings.env, settings.channel, noise=noise, between_samples=settings.between_samples)
@@ -86,6 +98,7 @@ def compare(settings: CompareSettings) -> None:
         print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
         short = [_smoke_text(settings)] if settings.smoke else []
         print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
+    return Comparison(episodes, summary)
 
 
 def shortened(settings: CompareSettings) -> CompareSettings:

@@ -37,7 +37,7 @@ from experiments.study.tables import (
     training_table,
 )
 from experiments.terminal import GREATEST_WIDTH, wrapped
-from ncs_gym.reading import json_values, read_file, read_text
+from ncs_gym.reading import read_text
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`: enough to pass through every part, in the first environment, with baselines of one margin each.
@@ -54,18 +54,16 @@ def study(settings: StudySettings) -> None:
         require_marks(read_text(path))
     with claim_folder("study", settings):
         parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
-        comparisons, channels = {}, {}
+        episodes, summaries, channels = {}, {}, {}
         for name, part in parts.items():
-            compare(part)
-            comparisons[name] = json_values(read_file(part.out / "summary.json"))
+            episodes[name], summaries[name] = compare(part)
             if settings.channel_episodes:
                 sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
                 channels[name] = channel_switches(sweep, trained_agents(part))
             print(flush=True)
         kept = {key: value for key, value in lasting_settings(settings).items() if key != "smoke"}
         provenance = {"settings": kept, "versions": versions()}
-        episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
-        summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
+        summary = study_summary(summaries, episodes) | {"channels": channels} | provenance
         _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
         print(f"files: {settings.out}")
 
