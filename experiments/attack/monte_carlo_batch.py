@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -81,8 +80,8 @@ class MonteCarloBatch:
 
     @property
     def name(self) -> str:
-        """Name of the batch in file names, progress lines and messages."""
-        return re.sub(r"[^\w.+-]+", "-", f"{self.case}-{self.index}")
+        """Name of the batch in messages and, with hyphens, of its file."""
+        return f"{self.case}-{self.index}"
 
     @property
     def key(self) -> str:

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from experiments.backends.worker import Outcome, signals_blocked, work
 from experiments.errors import RunError, RunStopped
-from experiments.runs.run_store import Run, RunStore
+from experiments.runs.run_store import Run, RunStore, file_name
 from experiments.settings import BackendSettings
 from experiments.terminal import progress_bar, say
 
@@ -56,7 +56,7 @@ def results_of(runs: Sequence[Run], folder: Path, settings: BackendSettings) -> 
         ClusterError: If a cluster cannot execute the runs.
         OSError: If the folder cannot be written.
     """
-    if len({run.name for run in runs}) < len(runs):
+    if len(set(map(file_name, runs))) < len(runs):
         raise ValueError("two runs have the same name")
     store = RunStore(folder)
     results = {run.name: _without_files(result) for run in runs if (result := store.load(run)) is not None}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -14,23 +13,20 @@ import numpy as np
 
 import shields
 from experiments.analysis.stalls import broken_contracts, how_often, silences_text
-from experiments.backends.execution import execute, executor_of
-from experiments.errors import ResultsError
+from experiments.backends.execution import results_of
 from experiments.plots.heatmaps import requirements_map
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
-from experiments.terminal import say, text_table, wrapped
+from experiments.terminal import text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant, PacketLog
 from ncs_gym.network.channel import in_time
 from ncs_gym.network.requests import spare_samples
-from ncs_gym.reading import json_values, read_file
 from ncs_gym.validation import counted
 from shields import Certificate, Network, Requirement, Requirements
-from shields.atomic_write import write_atomically
 from shields.json_documents import digest
-from shields.synthesis.network_requirements import LargestAge, kind_of_share
+from shields.synthesis.network_requirements import LargestAge, kind_of_share, largest_age
 from shields.synthesis.requirement_search import Answer, Search
 
 _DEFAULT_ENV = "ncs_gym/CartPole-v0"
@@ -65,12 +61,13 @@ def requirements(settings: RequirementsSettings) -> None:
     asked = _values(settings, plant, today)
     log = None if settings.log is None else PacketLog.load(settings.log, None, plant.dt, settings.ignore)
     with claim_folder("requirements", settings):
-        store = _Store(settings.out)
         found = shields.requirements(
             plant,
             **asked,
             tolerance=settings.tolerance,
-            execute=lambda searches: _answers(searches, settings, store),
+            execute=lambda searches: [
+                each.answers for each in results_of(list(map(_SearchRun, searches)), settings.out, settings)
+            ],
         )
         wanted = {"share": True, "tolerance": settings.tolerance}
         names = [name for name, is_wanted in wanted.items() if is_wanted]
@@ -79,9 +76,11 @@ def requirements(settings: RequirementsSettings) -> None:
         for name, table in zip(names, tables, strict=True):
             figure = table.figure(today)
             figures[name] = (figure.caption, figure.png)
+        place = settings.out / "certificates"
+        place.mkdir(exist_ok=True)
         for point in found.points:
             if point.certificate is not None:
-                point.certificate.save(store.place_of(point.certificate.checksum))
+                point.certificate.save(place / f"{point.certificate.checksum[:16]}.json")
         cheapest = found.cheapest(settings.keep / 100.0)
         summary = found.document | {
             "command": "requirements",
@@ -142,83 +141,52 @@ def _values(settings: RequirementsSettings, plant: LinearPlant, today: Network |
 
 
 @dataclass(frozen=True)
-class _Store:
-    """The answers of finished searches in an output folder, and certificates by their checksums."""
+class _StoredAnswer:
+    """What a search found for one age, as JSON values.
 
-    folder: Path
+    Attributes:
+        age: Largest age of the newest sample [steps]; None for no contract.
+        searched: Whether a certificate was sought.
+        tolerance: The factor on all radii that it tolerates; None if that was not sought.
+        certificate: Its document; None for none.
+    """
 
-    def place_of(self, checksum: str) -> Path:
-        place = self.folder / "certificates"
-        place.mkdir(exist_ok=True)
-        return place / f"{checksum[:16]}.json"
+    age: float | None
+    searched: bool
+    tolerance: float | None
+    certificate: dict[str, Any] | None
 
-    def save(self, search: Search, answers: dict[float, Answer]) -> None:
-        entries = []
-        for age, answer in answers.items():
-            checksum = answer.certificate and answer.certificate.checksum
-            if answer.certificate is not None:
-                answer.certificate.save(self.place_of(answer.certificate.checksum))
-            numbers = {"age": None if age == inf else age, "searched": answer.searched, "tolerance": answer.tolerance}
-            entries.append(numbers | {"certificate": checksum})
-        write_atomically(self._file(search), json.dumps({"key": _key(search), "answers": entries}, indent=1) + "\n")
+    @classmethod
+    def of(cls, age: float, answer: Answer) -> _StoredAnswer:
+        document = None if answer.certificate is None else answer.certificate.document
+        return cls(None if age == inf else age, answer.searched, answer.tolerance, document)
 
-    def load(self, search: Search) -> dict[float, Answer] | None:
-        """Returns the answers of a search; None if there are none.
-
-        Raises:
-            ResultsError: If the file is damaged, or a certificate does not verify.
-        """
-        file = self._file(search)
-        if not file.exists():
-            return None
-        try:
-            document = json_values(read_file(file))
-            if document["key"] != _key(search):
-                return None
-            answers = {}
-            for entry in document["answers"]:
-                age = inf if entry["age"] is None else int(entry["age"])
-                checksum = entry["certificate"]
-                certificate = None if checksum is None else Certificate.load(self.place_of(checksum))
-                answers[age] = Answer(certificate, bool(entry["searched"]), entry["tolerance"])
-            _SearchRun(search).require(answers)
-            return answers
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise ResultsError(f"{file} is damaged; delete it to repeat its search") from error
-
-    def _file(self, search: Search) -> Path:
-        place = self.folder / "searches"
-        place.mkdir(exist_ok=True)
-        return place / f"{search.name}.json"
+    @property
+    def answer(self) -> Answer:
+        certificate = None if self.certificate is None else Certificate.read(self.certificate)
+        return Answer(certificate, self.searched, self.tolerance)
 
 
-def _key(search: Search) -> str:
-    """Returns what the answers of a search depend on."""
-    ages = [None if age == inf else age for age in search.ages]
-    known = [search.plant.fingerprint, search.quantization_step, ages, search.tolerance, versions()]
-    return digest(known)
+@dataclass(frozen=True)
+class _SearchResult:
+    """What a search found for each age."""
 
+    found: tuple[_StoredAnswer, ...]
 
-def _answers(searches: Sequence[Search], settings: RequirementsSettings, store: _Store) -> list[dict[float, Answer]]:
-    """Returns the answers of all searches, in their order; each is stored when it is finished."""
-    answers = {search.name: known for search in searches if (known := store.load(search)) is not None}
-    missing = {search.name: search for search in searches if search.name not in answers}
-    if answers:
-        say(f"{len(answers)} of {len(searches)} searches were finished before")
+    @property
+    def answers(self) -> dict[float, Answer]:
+        """The answers by age, infinite for no contract."""
+        return {inf if each.age is None else int(each.age): each.answer for each in self.found}
 
-    def keep(run: _SearchRun, result: dict[float, Answer]) -> None:
-        store.save(run.search, result)
-        answers[run.name] = result
-        largest = max((age for age, answer in result.items() if answer.certificate is not None), default=None)
-        outcome = "no certificate found" if largest is None else f"certified up to {largest:g}"
-        say(f"{run.search.title}: {outcome}")
+    @property
+    def outcome(self) -> str:
+        """The largest age that is certified."""
+        certified = [inf if each.age is None else each.age for each in self.found if each.certificate is not None]
+        return f"certified up to {max(certified):g}" if certified else "no certificate found"
 
-    for search in missing.values():
-        say(f"seeking certificates: {search.title}")
-    if missing:
-        executor = executor_of(settings, len(missing), store.folder / "tensorboard")
-        execute([_SearchRun(search) for search in missing.values()], executor, keep)
-    return [answers[search.name] for search in searches]
+    @property
+    def files(self) -> dict[str, bytes]:
+        return {}
 
 
 @dataclass(frozen=True)
@@ -228,29 +196,35 @@ class _SearchRun:
     search: Search
     parts: tuple[str, ...] = ("search",)
     unit: str = ""
-    result_type: type = dict
+    result_type: type = _SearchResult
     leaves: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
-        return self.search.name
+        return self.search.title
 
     @property
     def key(self) -> str:
-        return _key(self.search)
+        search = self.search
+        ages = [None if age == inf else age for age in search.ages]
+        return digest([search.plant.fingerprint, search.quantization_step, ages, search.tolerance, versions()])
 
     @property
     def total_steps(self) -> int:
         return _PARTS * self.search.count
 
-    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> dict[float, Answer]:
-        return self.search(lambda count: on_progress(_PARTS * count))
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> _SearchResult:
+        answers = self.search(lambda count: on_progress(_PARTS * count))
+        return _SearchResult(tuple(_StoredAnswer.of(age, answer) for age, answer in answers.items()))
 
-    def require(self, result: Any) -> None:
-        """Raises ValueError unless every certificate verifies."""
-        for answer in result.values():
-            if answer.certificate is not None and not shields.verify(answer.certificate, self.search.plant).valid:
-                raise ValueError("certificate")
+    def require(self, result: _SearchResult) -> None:
+        """Raises ValueError unless every certificate is one of its age and verifies."""
+        for age, answer in result.answers.items():
+            found = answer.certificate
+            if found is None:
+                continue
+            if largest_age(found.contract) != age or not shields.verify(found, self.search.plant).valid:
+                raise ValueError(f"no certificate of this plant for age {age:g}")
 
 
 @dataclass(frozen=True)

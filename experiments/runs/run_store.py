@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -55,7 +56,7 @@ class Run(Protocol):
 
     @property
     def name(self) -> str:
-        """Name in file names, progress lines and messages."""
+        """Name in progress lines and messages, and of its file (`file_name`)."""
         ...
 
     @property
@@ -87,6 +88,11 @@ class Run(Protocol):
 
 
 _FORMAT = "ncs-gym run 3"
+
+
+def file_name(run: Run) -> str:
+    """Returns the name of a run's file: its name, with hyphens for what is special in file names."""
+    return re.sub(r"[^\w.+-]+", "-", run.name) + ".json"
 
 
 class RunStore:
@@ -158,4 +164,4 @@ class RunStore:
         return files
 
     def _path(self, run: Run) -> Path:
-        return self._folder / "runs" / f"{run.name}.json"
+        return self._folder / "runs" / file_name(run)

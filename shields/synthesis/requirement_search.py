@@ -42,15 +42,13 @@ class Search:
     """Certificates for some ages of one plant, each sought near that of the age before; the unit of parallel work.
 
     Attributes:
-        name: Name of its file.
-        title: What it searches, for messages.
+        title: What it searches, in words; no other search of the same networks has the same.
         plant: The plant, as it is sampled and disturbed.
         quantization_step: Of the contract.
         ages: Largest ages [steps], ascending; infinite for no contract.
         tolerance: Whether the factor that all radii may grow by is sought, too.
     """
 
-    name: str
     title: str
     plant: LinearPlant
     quantization_step: float
@@ -269,16 +267,11 @@ class _Ages:
     asked: set[float] = field(default_factory=set)
     answers: dict[float, Answer] = field(default_factory=dict)
 
-    @property
-    def _name(self) -> str:
-        return "-".join(f"{value:g}" for value in _group_of(self.network))
-
     def searches(self, tolerance: bool) -> list[Search]:
         """Returns searches for all ages, a few each."""
         ages, count = sorted(self.asked), _AGES_PER_SEARCH
         return [
             Search(
-                name=f"{self._name}-{part[0]:g}-{part[-1]:g}",
                 title=f"{self.network.setting}, ages {part[0]:g} to {part[-1]:g}",
                 plant=self.plant,
                 quantization_step=self.network.quantization_step,
@@ -296,7 +289,6 @@ class _Ages:
         certificate = self.answers[low].certificate
         assert certificate is not None
         return BoundarySearch(
-            name=f"{self._name}-beyond-{low:g}",
             title=f"{self.network.setting}, ages beyond {low:g}",
             plant=self.plant,
             quantization_step=self.network.quantization_step,

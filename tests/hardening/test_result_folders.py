@@ -16,7 +16,7 @@ from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
 from experiments.report.text_tables import summary_text
 from experiments.runs.output_folder import claim_folder
-from experiments.runs.run_store import RunStore
+from experiments.runs.run_store import RunStore, file_name
 from experiments.settings import AttackSettings, CompareSettings
 from shields.json_documents import document_of
 from tests.command import assert_one_sentence, ncs
@@ -48,7 +48,7 @@ def stored(run, result, tmp_path_factory):
 
 
 def file_of(folder, run):
-    return folder / "runs" / f"{run.name}.json"
+    return folder / "runs" / file_name(run)
 
 
 def signed(content):

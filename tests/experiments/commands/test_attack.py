@@ -16,7 +16,7 @@ from experiments.attack.worst_case import GaussianVectorEnv, HostileRequests, Wo
 from experiments.commands import attack as command
 from experiments.commands.attack import attack, shortened
 from experiments.errors import ResultsError, RunError, SafetyBroken
-from experiments.runs.run_store import RunStore
+from experiments.runs.run_store import RunStore, file_name
 from experiments.settings.certificates import AttackSettings
 from ncs_gym import truck_trailer
 from ncs_gym.network import requests
@@ -391,7 +391,7 @@ def test_batch_that_fails_is_named_and_what_is_finished_is_kept(tmp_path, small,
         return SafetyCounts(steps=batch.total_steps, episodes=batch.settings.envs)
 
     monkeypatch.setattr(MonteCarloBatch, "execute", fails_once)
-    with pytest.raises(RunError, match=r"^run TruckTrailerCruise-v0-overtaking-1: no memory") as error:
+    with pytest.raises(RunError, match=r"^run TruckTrailerCruise-v0, overtaking-1: no memory") as error:
         attack(settings(tmp_path))
     assert isinstance(error.value.__cause__, ValueError)
     assert stored(tmp_path) >= {f"TruckTrailerCruise-v0-overtaking-{index}.json" for index in (0, 2)}
@@ -455,7 +455,7 @@ def test_damaged_counts_are_refused_and_those_of_other_settings_not_taken(tmp_pa
     assert store.load(batch) == counts
     for other in (replace(batch, settings=replace(CAMPAIGN, seed=1)), replace(batch, certificate=another)):
         assert store.load(other) is None
-    path = tmp_path / "runs" / f"{batch.name}.json"
+    path = tmp_path / "runs" / file_name(batch)
     whole = path.read_bytes()
     for position in range(len(whole) - 1):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])

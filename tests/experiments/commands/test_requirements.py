@@ -9,8 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant
+from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, certificate_for, verify
+from shields.json_documents import document_of
 from tests.command import ROOT, ncs
 
 
@@ -46,8 +47,30 @@ def test_requirements_leave_table_figure_certificates_and_are_resumed(plant_file
             assert verify(certificate, plant).valid
     assert (tmp_path / "r/figures/share.png").read_bytes().startswith(b"\x89PNG")
     again = ncs(*arguments)
-    assert "searches were finished before" in again.stderr
+    assert "runs were finished before" in again.stderr
     assert again.stdout == first.stdout
+
+
+@pytest.mark.parametrize("forged", ["age", "plant", "altered"])
+def test_certificates_of_stored_searches_are_verified_again(forged, plant_file, tmp_path, without_workers):
+    arguments = ("requirements", "--plant", plant_file, "--send-periods", 1, "--losses", 3, "--out", tmp_path / "r")
+    assert ncs(*arguments).returncode == 0
+    (file,) = (tmp_path / "r/runs").glob("*-ages-3-to-3.json")
+    document = json.loads(file.read_text())["run"]
+    (answer,) = document["result"]["found"]
+    if forged == "age":
+        answer["age"] = 2
+    elif forged == "plant":
+        answer["certificate"] = certificate_for(
+            gym.make("ncs_gym/CSTR-v0").unwrapped.plant, ChannelContract(3)
+        ).document
+    else:
+        answer["certificate"]["certificate"]["K"][0][0] += 1e-3
+    file.write_text(json.dumps(document_of("run", "ncs-gym run 3", document)))
+    again = ncs(*arguments)
+    assert again.returncode == 2
+    assert "is no result of its run" in again.stderr
+    assert {"age": "for age 2", "plant": "for age 3", "altered": "checksum does not match"}[forged] in again.stderr
 
 
 def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file, tmp_path, without_workers):

@@ -121,8 +121,10 @@ def test_changed_source_is_another_key(run, monkeypatch):
 
 
 def test_runs_of_one_name_are_refused(run, tmp_path):
-    with pytest.raises(ValueError, match="same name"):
-        results_of([run, run], tmp_path, BackendSettings(jobs=1))
+    alike = replace(run, grid_point="loss 0.3"), replace(run, grid_point="loss/0.3")
+    for runs in ((run, run), alike):
+        with pytest.raises(ValueError, match="same name"):
+            results_of(runs, tmp_path, BackendSettings(jobs=1))
 
 
 def test_nothing_stored_is_nothing_loaded(run, tmp_path):

@@ -215,7 +215,6 @@ def test_infeasible_names_a_pair_where_no_change_alone_is_enough(monkeypatch):
 def test_search_for_the_largest_age_asks_before_every_age_whether_it_should_end():
     plant = servo()
     search = BoundarySearch(
-        name="beyond",
         title="",
         plant=plant,
         quantization_step=0.0,
@@ -245,7 +244,7 @@ def test_largest_age_is_bisected_and_sought_up_to_four_times_the_oldest_asked(mo
         return start if contract is not None and contract.max_age <= up_to else None
 
     monkeypatch.setattr("shields.synthesis.requirement_search.nearby_certificate", nearby)
-    search = BoundarySearch(name="", title="", plant=plant, quantization_step=0.0, ages=ages, start=start)
+    search = BoundarySearch(title="", plant=plant, quantization_step=0.0, ages=ages, start=start)
     reported = []
     answers = search(reported.append)
     assert list(answers) == asked
