@@ -325,7 +325,7 @@ def _policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int]
     """What makes the policy of a seed, by name."""
     env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
     assert loop.shield is not None
-    certified, hyperparams = loop.shield.certificate.K, tuned_hyperparams(loop.env)
+    certified, hyperparams = loop.shield.certificate.fallback, tuned_hyperparams(loop.env)
     steps = tuned_steps(loop.env) or STEPS
     found: dict[str, Callable[[int], Policy]] = {"tuned agent": lambda seed: trained(loop, hyperparams, steps, seed)}
     if with_defaults:
@@ -496,7 +496,7 @@ def _regulated_arm(
 ) -> float:
     """Returns the mean return of a regulator with the given weights."""
     env = ncs_env(loop.single())
-    policy = controller(arm.partition("+")[0], env, certificate.K, 0, RegulatorWeights(**weights))
+    policy = controller(arm.partition("+")[0], env, certificate.fallback, 0, RegulatorWeights(**weights))
     return mean_return(Arm.of(arm).loops(loop, certificate, CompareSettings())[1], policy, SEARCH_SEED, episodes)
 
 

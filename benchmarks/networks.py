@@ -180,7 +180,7 @@ def _delayed(env_id: str, lead: int, episodes: int) -> tuple[str, ...]:
     env = ncs_env(gym.make(env_id, **settings))
     certificate = certificate_for(env.plant, env.certificate_contract)
     shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=episodes, **settings), certificate, on_unproved="ignore")
-    policy = controller("lqr", env, certificate.K, 0)
+    policy = controller("lqr", env, certificate.fallback, 0)
     observation, info = shield.reset(seed=0)
     returns, overridden, steps, violations = np.zeros(episodes), 0.0, 0, 0.0
     running = np.ones(episodes, np.bool_)
@@ -338,8 +338,8 @@ def measured(env_id: str, network: str, name: str, least: int, count: int, hours
     agent, kept = pushes(rng, dt, shape), np.zeros(count, np.int64)
     controls = None
     if name in REGULATORS:
-        gain = certificate_for(plant.plant, plant.certificate_contract).K
-        controls = controller(name, plant, gain, 0, tuned_weights(env_id, name.partition(":")[0]))
+        fallback = certificate_for(plant.plant, plant.certificate_contract).fallback
+        controls = controller(name, plant, fallback, 0, tuned_weights(env_id, name.partition(":")[0]))
     ended, ever, promised, steps = 0, 0, 0, round(hours * 3600.0 / (dt * count))
     for _ in range(steps):
         action = next(agent) if controls is None else controls(observation, info)
@@ -523,7 +523,7 @@ def requests(
     assert isinstance(single, NCSEnv)
     assert single.contract is not None
     weights = tuned_weights(env.replace("OnRequest", ""), "lqr+shielded")
-    control = controller("lqr", single, certificate.K, 0, weights)
+    control = controller("lqr", single, certificate.fallback, 0, weights)
     best = best_period(single.channel, single.contract)
     rules = {"period 1": every(1), f"period {best}, the best": every(best), "forced alone": at_random(0.0)}
     rules |= {f"random {share:g}": at_random(share) for share in (0.1, 0.2, 0.4)}

@@ -130,10 +130,10 @@ def _deciding(shield: SafetyFilter, inside: Certificate, count: int) -> Callable
     return lambda: shield.decide_columns(estimates, batch, proposals)
 
 
-def _behind(name: str, certificate: Certificate, K: np.ndarray, steps: int, **settings: Any) -> tuple[float, float]:
+def _behind(name: str, certificate: Certificate, steps: int, **settings: Any) -> tuple[float, float]:
     """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
     envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, **settings), certificate)
-    policy = controller("lqr", _env(name), K, 0)
+    policy = controller("lqr", _env(name), certificate.fallback, 0)
     observations, info = envs.reset(seed=0)
     sums = np.zeros(2)
     for _ in range(steps // 20):
@@ -169,7 +169,7 @@ def polytope(ids: Sequence[str] = IDS, steps: int = 8000) -> None:
             rows = getattr(certificate.polytope, "rows", ())
             share = certificate.provenance["polytope_share_of_box" if len(rows) else "share_of_box"]
             ratios = [f"{ratio:.2f}" for ratio in times[:, k] / times[:, 0]]
-            overridden, reward = _behind(name, certificate, plain.K, steps)
+            overridden, reward = _behind(name, certificate, steps)
             found = (f"{share:.1%}", f"{seconds:.1f}", *ratios, f"{overridden:.1%}", f"{reward:.3f}")
             show(name, kind, len(rows) or "", *found)
 
@@ -327,7 +327,7 @@ def between_samples(
         for k, (plant, (certificate, seconds)) in enumerate(zip(plants, found, strict=True)):
             recorded, rows = certificate.provenance, getattr(certificate.polytope, "rows", ())
             shares = recorded["share_of_box"], recorded.get("polytope_share_of_box", np.nan)
-            overridden, reward = _behind(name, certificate, certificate.K, steps, plant=plant)
+            overridden, reward = _behind(name, certificate, steps, plant=plant)
             cells = [*(f"{share:.1%}" for share in shares), len(rows), f"{seconds:.1f}"]
             cells += [f"{recorded['tolerated_scale']:.2f}", f"{overridden:.1%}", f"{reward:.4f}"]
             cells += [f"{_left(name, plant, steps):.3f}", *(f"{ratio:.2f}" for ratio in times[:, k] / times[:, 0])]

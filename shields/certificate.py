@@ -136,6 +136,11 @@ class Fallback(NamedTuple):
     resting_state: np.ndarray
     resting_input: np.ndarray
 
+    @classmethod
+    def of_gain(cls, gain: np.ndarray) -> Fallback:
+        """Returns u = K x_hat of a gain K, shape (m, n)."""
+        return cls(gain, *(np.zeros(size) for size in gain.shape[::-1]))
+
     @property
     def constant(self) -> np.ndarray:
         """u_c - K x_c, shape (m,), which K x_hat is added to."""

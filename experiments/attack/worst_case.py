@@ -100,12 +100,13 @@ def starts_in_set(rng: np.random.Generator, certificate: Certificate, count: int
 def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Certificate, count: int) -> np.ndarray:
     """Returns starts, shape (count, n): half on the boundary of the safe set, half drawn uniformly from the box.
 
-    In directions that no row of the box limits, `half_widths` limit them.
+    States whose ends are open are drawn within `half_widths`.
     """
-    states = starts_in_set(rng, certificate, count)
+    states, ends = starts_in_set(rng, certificate, count), plant.own_limits
+    low, high = np.where(np.isfinite(ends), ends, [-plant.half_widths, plant.half_widths])
     chosen, missing = np.arange(count) % 2 == 1, np.arange(count) % 2 == 1
     while missing.any():
-        states[missing] = rng.uniform(-1.0, 1.0, (int(missing.sum()), plant.n)) * plant.half_widths
+        states[missing] = rng.uniform(low, high, (int(missing.sum()), plant.n))
         missing = chosen & (plant.constraint_values(states.T).max(axis=0) > 0.0)
     return states
 

@@ -21,7 +21,8 @@ from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
 from ncs_gym.plants.lqr import lqr_gain
-from shields.runtime.rows_within_step import rows_within_step
+from shields.certificate import Fallback
+from shields.runtime.rows_within_step import closed, rows_within_step
 
 # Its types are not declared.
 _clarabel: Any = clarabel
@@ -93,7 +94,7 @@ def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProble
     plant, task = env.plant, env.task
     if isinstance(task, SetpointTracking):
         return _tracking_problem(plant, task, weights)
-    states, effort = np.sqrt(weights.state) * plant.box_rows, np.sqrt(weights.effort + _LEAST_WEIGHT)
+    states, effort = np.sqrt(weights.state) * plant.box, np.sqrt(weights.effort + _LEAST_WEIGHT)
     A, B, E = plant.A, plant.B, states
     if isinstance(task, SpeedTracking):
         A = np.pad(A, (0, 1))
@@ -101,7 +102,7 @@ def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProble
         B = np.vstack([B, -plant.dt * np.eye(plant.m)[task.input_index]])
         E = np.pad(E, (0, 1))
         E[-1, -1] = 1.0 / 5.0  # the reward counts errors in units of 5 m/s
-    D = np.vstack([np.zeros((len(E), plant.m)), effort * np.diag(1.0 / plant.u_max)])
+    D = np.vstack([np.zeros((len(E), plant.m)), effort * np.diag(1.0 / plant.input_half)])
     E = np.vstack([E, np.zeros((plant.m, len(A)))])
     return RegulatorProblem(A, B, E, D)
 
@@ -125,12 +126,12 @@ def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: Regul
     def rows(of_state: np.ndarray, of_target: np.ndarray) -> np.ndarray:
         return np.hstack([of_state, -of_target[:, None], np.zeros((len(of_state), size - n - 1))])
 
-    held = rows(np.zeros((m, n)), -u_s) / plant.u_max[:, None]  # u_s r
-    last = np.eye(size)[n + targets :] / plant.u_max[:, None] if task.change_price else held
+    held = rows(np.zeros((m, n)), -u_s) / plant.input_half[:, None]  # u_s r
+    last = np.eye(size)[n + targets :] / plant.input_half[:, None] if task.change_price else held
     error = rows(task.output[None], np.ones(1)) / task.width
-    box = np.sqrt(weights.state) * rows(plant.box_rows, plant.box_rows @ x_s)
+    box = np.sqrt(weights.state) * rows(plant.box, plant.box @ x_s)
     wanted = np.vstack([np.sqrt(weights.effort) * last, np.sqrt(_LEAST_WEIGHT) * held])
-    given = np.vstack([np.sqrt(each) * np.diag(1.0 / plant.u_max) for each in (weights.effort, _LEAST_WEIGHT)])
+    given = np.vstack([np.sqrt(each) * np.diag(1.0 / plant.input_half) for each in (weights.effort, _LEAST_WEIGHT)])
     free = np.zeros((1 + len(box), m))
     return RegulatorProblem(A, B, np.vstack([error, box, -wanted]), np.vstack([free, given]))
 
@@ -163,11 +164,13 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
     moved[:n, :n] = plant.A
     pushed = np.vstack([plant.B, np.eye(plant.m)[: own.shape[1] - n]])
     loop, drive = moved + pushed @ own, pushed @ of_target
-    (k, grid), beyond = (len(plant.box_rows), rows_within_step(plant)), ((0, 0), (0, own.shape[1] - n))
+    (k, grid), beyond = (len(plant.box), rows_within_step(plant)), ((0, 0), (0, own.shape[1] - n))
     between = np.pad(grid.state, beyond) + grid.input @ own
-    limits = np.vstack([np.pad(plant.box_rows, beyond), between, own / plant.u_max[:, None]])
-    direct = np.concatenate([np.zeros((k, 1)), grid.input @ of_target, of_target / plant.u_max[:, None]])
-    allowed = np.concatenate([np.full(k + len(grid.state), 1.0 - margin), np.ones(plant.m)])
+    limits = np.vstack([np.pad(plant.box, beyond), between, own / plant.input_half[:, None]])
+    direct = np.concatenate([np.zeros((k, 1)), grid.input @ of_target, of_target / plant.input_half[:, None]])
+    low, high = plant.input_ends / plant.input_half
+    low = np.concatenate([plant.box_low + margin, grid.low + margin, low])
+    high = np.concatenate([plant.box_high - margin, grid.high - margin, high])
     rows, slopes = [limits[k:]], [direct[k:]]
     power, response = loop, drive
     for _ in range(GOVERNED_STEPS):
@@ -175,15 +178,17 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
         slopes.append(limits @ response + direct)
         power, response = loop @ power, loop @ response + drive
     free, slope = np.vstack(rows), np.vstack(slopes)[:, 0]
-    bound = np.concatenate([allowed[k:], np.tile(allowed, GOVERNED_STEPS)])
+    low, high = (np.concatenate([ends[k:], np.tile(ends, GOVERNED_STEPS)]) for ends in (low, high))
     felt = np.abs(slope) > _LEAST_WEIGHT * np.abs(slope).max()
-    free, slope, bound = free[felt], slope[felt], bound[felt]
+    free, slope, low, high = free[felt], slope[felt], low[felt], high[felt]
+    below = np.where(slope > 0.0, low, -high) / np.abs(slope)
+    above = np.where(slope > 0.0, high, -low) / np.abs(slope)
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         entries = problem.entries(observations, estimates)
         middle = -np.delete(entries, np.arange(entries.shape[1])[known], axis=1) @ free.T / slope
-        low, high = ((middle + side * bound / np.abs(slope)) for side in (-1.0, 1.0))
-        low, high = low.max(axis=1, keepdims=True), high.min(axis=1, keepdims=True)
+        low = (middle + below).max(axis=1, keepdims=True)
+        high = (middle + above).min(axis=1, keepdims=True)
         center = 0.5 * (low + high)
         entries[:, known] = np.clip(entries[:, known], np.minimum(low, center), np.maximum(high, center))
         return entries @ gain.T
@@ -202,7 +207,10 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
     to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
     beyond, grid = ((0, 0), (0, len(A) - plant.n)), rows_within_step(plant)
-    rows, between = np.pad(plant.box_rows, beyond), np.pad(grid.state, beyond)
+    rows, between = np.pad(plant.box, beyond), np.pad(grid.state, beyond)
+    low, high = closed(np.concatenate([grid.low, plant.box_low]), np.concatenate([grid.high, plant.box_high]))
+    low, high = np.tile(low + margin, steps), np.tile(high - margin, steps)
+    least, most = (np.tile(ends, steps) for ends in plant.input_ends)
     free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
     for k in range(steps):  # z_k = free z_0 + forced u
         now = np.eye(steps * m)[k * m : (k + 1) * m]
@@ -226,14 +234,14 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
         ],
         format="csc",
     )
-    settings, bounds = _clarabel.DefaultSettings(), np.tile(plant.u_max, 2 * steps)
+    settings = _clarabel.DefaultSettings()
     settings.verbose = settings.presolve_enable = False
     without_limits = -np.linalg.lstsq(effect, drift)[0]
 
     def solved(entries: np.ndarray) -> np.ndarray:
         slope, place = effect.T @ (drift @ entries), moved @ entries
         q = np.concatenate([2.0 * slope, np.full(steps, _PRICE_OF_LEAVING)])
-        b = np.concatenate([1.0 - margin - place, 1.0 - margin + place, bounds, np.zeros(steps)])
+        b = np.concatenate([high - place, place - low, most, -least, np.zeros(steps)])
         cones = [_clarabel.NonnegativeConeT(len(b))]
         found = _clarabel.DefaultSolver(P, q, inequalities, b, cones, settings).solve()
         if found.status not in (_clarabel.SolverStatus.Solved, _clarabel.SolverStatus.AlmostSolved):
@@ -243,8 +251,9 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         entries = problem.entries(observations, estimates)
         plans = entries @ without_limits.T  # the minimum without limits is the minimum where it keeps them
-        kept = (np.abs(plans) <= bounds[: steps * m]).all(axis=1)
-        kept &= (np.abs(entries @ moved.T + plans @ felt.T) <= 1.0 - margin).all(axis=1)
+        kept = ((least <= plans) & (plans <= most)).all(axis=1)
+        places = entries @ moved.T + plans @ felt.T
+        kept &= ((low <= places) & (places <= high)).all(axis=1)
         for k in np.flatnonzero(~kept):
             plans[k, :m] = solved(entries[k])
         return plans[:, :m]
@@ -257,27 +266,27 @@ def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.
 
     Where there is none, the least-squares solution. The output is c, shape (n,).
     """
-    n, scale = plant.n, np.concatenate([plant.half_widths, plant.u_max])
+    n, scale = plant.n, np.concatenate([plant.half_widths, plant.input_half])
     rest = np.hstack([np.eye(n) - plant.A, -plant.B]) / plant.half_widths[:, None]
     equations = np.vstack([rest, np.concatenate([output, np.zeros(plant.m)])])
     both = scale * np.linalg.lstsq(equations * scale, np.eye(n + 1)[-1])[0]
     return both[:n], both[n:]
 
 
-def _zero(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
+def _zero(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     return lambda observations, estimates: np.zeros((len(estimates), env.plant.m))
 
 
-def _random(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
-    rng, limits = np.random.default_rng(seed), env.plant.u_max
-    return lambda observations, estimates: rng.uniform(-limits, limits, (len(estimates), len(limits)))
+def _random(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
+    rng, (low, high) = np.random.default_rng(seed), env.plant.input_ends
+    return lambda observations, estimates: rng.uniform(low, high, (len(estimates), len(low)))
 
 
-def _certified_gain(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
-    return lambda observations, estimates: estimates @ K.T
+def _fallback(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
+    return lambda observations, estimates: estimates @ fallback.gain.T + fallback.constant
 
 
-def _greedy(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
+def _greedy(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     """Returns inputs that come closest to the task's goal in one step, and ignore the safe box.
 
     For `SpeedTracking` they remove the error of the speed, for `SetpointTracking` that of the output, with as little
@@ -290,35 +299,39 @@ def _greedy(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
     elif isinstance(task, SetpointTracking):
         effect, moved = task.output @ plant.B, task.output @ plant.A
     else:
-        gain = np.linalg.lstsq(plant.box_rows @ plant.B, -plant.box_rows @ plant.A)[0]
+        gain = np.linalg.lstsq(plant.box @ plant.B, -plant.box @ plant.A)[0]
         return lambda observations, estimates: estimates @ gain.T
-    largest = float(np.abs(effect) @ plant.u_max)
+    # The inputs that raise the output the most, and that lower it the most.
+    low, high = plant.input_ends
+    farthest = np.where(effect > 0.0, [high, low], np.where(effect < 0.0, [low, high], 0.0))
+    changes = np.abs(farthest @ effect)
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         missing = observations[:, first].astype(np.float64) - estimates @ moved
-        fractions = np.minimum(1.0, np.abs(missing) / largest) if largest > 0.0 else np.zeros(len(missing))
-        return fractions[:, None] * np.sign(missing[:, None] * effect) * plant.u_max
+        side = (missing < 0.0).astype(np.intp)
+        fractions = np.abs(missing) / np.where(changes > 0.0, changes, np.inf)[side]
+        return np.minimum(1.0, fractions)[:, None] * farthest[side]
 
     return inputs
 
 
-def _proportional(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
+def _proportional(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     """Returns inputs in proportion to the error of the task.
 
     For `SpeedTracking` u = (target - speed) / dt, which within the limits removes the error in a step; for
     `SetpointTracking` the certified gain about the equilibrium at the target, u = u_s + K (x_hat - x_s); for other
-    tasks, whose target is rest, u = K x_hat.
+    tasks, whose target is rest, the fallback.
     """
     if isinstance(env.task, SpeedTracking):
         direction = np.eye(env.plant.m)[env.task.input_index] / env.plant.dt
         return lambda observations, estimates: observations[:, -1:] * direction
     if not isinstance(env.task, SetpointTracking):
-        return lambda observations, estimates: estimates @ K.T
+        return _fallback(env, fallback, seed)
     first, (x_s, u_s) = env.plant.n, equilibrium(env.plant, env.task.output)
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         target = observations[:, first : first + 1].astype(np.float64)
-        return target * u_s + (estimates - target * x_s) @ K.T
+        return target * u_s + (estimates - target * x_s) @ fallback.gain.T
 
     return inputs
 
@@ -328,27 +341,33 @@ REGULATORS: dict[str, Callable[[NCSEnv, RegulatorWeights], Inputs]] = {"lqr": re
 for _name, _make in {"governor": governor, "mpc": model_predictive}.items():
     REGULATORS |= {_name: _make} | {f"{_name}:{each}": partial(_make, margin=each / 100.0) for each in MARGINS}
 
-CONTROLLERS: dict[str, Callable[[NCSEnv, np.ndarray, int], Inputs]] = {
+CONTROLLERS: dict[str, Callable[[NCSEnv, Fallback, int], Inputs]] = {
     "zero input": _zero,
-    "K x_hat": _certified_gain,
+    "K x_hat": _fallback,
     "random": _random,
     "greedy": _greedy,
     "proportional": _proportional,
 }
-"""The policies by name, made from an environment, the certified gain and a seed."""
+"""The policies by name, made from an environment, the certificate's fallback and a seed."""
 
 
-def controller(name: str, env: NCSEnv, K: np.ndarray, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS) -> Policy:
+def controller(
+    name: str, env: NCSEnv, fallback: Fallback, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS
+) -> Policy:
     """Returns a policy for vector environments of a kind.
 
     Args:
         name: A name in `CONTROLLERS` or `REGULATORS`.
         env: A single environment with the plant and the task.
-        K: Certified gain, shape (m, n), of u = K x_hat.
+        fallback: A certificate's: u = u_c + K (x_hat - x_c), K x_hat around the operating point.
         seed: Seed of the random policy.
         weights: Weights of the regulators.
     """
-    make = REGULATORS.get(name)
-    inputs = CONTROLLERS[name](env, K, seed) if make is None else make(env, weights)
-    limits = env.plant.u_max
-    return lambda observations, infos: np.clip(inputs(observations, infos["estimate"]) / limits, -1.0, 1.0)
+    make, plant = REGULATORS.get(name), env.plant
+    inputs = CONTROLLERS[name](env, fallback, seed) if make is None else make(env, weights)
+
+    def actions(observations: np.ndarray, infos: Any) -> np.ndarray:
+        u = inputs(observations, infos["estimate"])
+        return np.clip((u - plant.input_middle) / plant.input_half, -1.0, 1.0)
+
+    return actions

@@ -262,7 +262,7 @@ class EstimateFilter(AroundEnvironment, VectorWrapper):
         self.penalty = penalty
         super().__init__(env)
         inner = _environment_behind(env)
-        self._limits, self._inputs_of, self._rule = inner.plant.u_max, inner.inputs_of, rule
+        self._plant, self._inputs_of, self._rule = inner.plant, inner.inputs_of, rule
         self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
         self._begins_next = inner.autoreset_mode is AutoresetMode.NEXT_STEP
         self._done = self._begun = np.zeros(self.num_envs, np.bool_)
@@ -273,7 +273,7 @@ class EstimateFilter(AroundEnvironment, VectorWrapper):
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         self._done, self._begun = self._done & ~mask, self._begun | mask
         self._estimates = info["estimate"].copy()
-        nothing = np.zeros((self.num_envs, len(self._limits)))
+        nothing = np.zeros((self.num_envs, self._plant.m))
         return observation, info | _info(nothing, nothing, self._done & False)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -286,7 +286,7 @@ class EstimateFilter(AroundEnvironment, VectorWrapper):
         applied = self._rule(self._estimates, proposed, self._begun)
         intervened = (applied != proposed).any(axis=1) & ~self._done
         actions = np.array(actions, np.float64)
-        actions[intervened] = applied[intervened] / self._limits
+        actions[intervened] = (applied[intervened] - self._plant.input_middle) / self._plant.input_half
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         self._estimates = info["estimate"].copy()
         applied = np.where(intervened[:, None], applied, proposed)

@@ -77,7 +77,8 @@ class Asking:
         """How far inside S the proposed inputs keep the next state, shape (N,): `Decision.margin`."""
         known, given = self._inner.known, self._shield.filter
         sets = given.test.reachable(np.array(known.estimate, order="C"), given.errors_of_many(known.error_shape))
-        return sets.margins(self._inner.plant.u_max[:, None] * self.proposed.T)[1]
+        plant = self._inner.plant
+        return sets.margins(plant.input_half[:, None] * self.proposed.T + plant.input_middle[:, None])[1]
 
 
 # Says in which of N loops a sample is asked for, shape (N,).

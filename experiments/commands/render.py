@@ -9,8 +9,8 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.commands import require_extra, short_version
-from experiments.network_loop.log_figure import loop_log_figure
 from experiments.plots.animation import FORMATS, save_animation
+from experiments.plots.loop_figure import loop_log_figure
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name

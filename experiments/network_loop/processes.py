@@ -379,7 +379,8 @@ def controller_named(
     def propose(estimate: np.ndarray) -> np.ndarray:
         nonlocal goal
         observation = np.clip(np.concatenate([estimate, task.observe(goal)]), low, high).astype(np.float32)
-        u = plant.u_max * np.asarray(policy(observation, {"estimate": estimate}), dtype=np.float64)
+        action = np.asarray(policy(observation, {"estimate": estimate}), dtype=np.float64)
+        u = plant.input_half * action + plant.input_middle
         goal = task.advance(rng, plant, goal, u)
         return u
 

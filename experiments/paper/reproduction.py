@@ -162,7 +162,7 @@ def _draw_states(axis: Axes, simulation: Simulation) -> None:
         label = None if i else "true state"
         axis.plot(path[:, 0], path[:, 1], color=_COLOR, lw=0.6, alpha=0.5, label=label)
     axis.plot(*projected_ellipsoid(design.L, (0, 1)).T, color="black", lw=1.4, label="safe set")
-    box = projected_box(design.plant.box_rows, (0, 1))
+    box = projected_box(design.plant.box, design.plant.box_ends, (0, 1))
     assert box is not None
     axis.plot(*box.T, color="black", lw=1.0, ls="--", label="safe box")
     axis.set_xlabel("coupling stretch [m]")

@@ -209,7 +209,7 @@ def _shown_arms(names: Sequence[str]) -> list[str]:
 def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
     """Returns the same evaluation episode of the first runs of the shown arms.
 
-    From above: the largest |c_j x| of state and estimate, a panel per input, and a row of ticks per kind of event.
+    From above: how close state and estimate come to a limit, a panel per input, and a row of ticks per kind of event.
     """
     paths = {name: arms[name][0].trajectory for name in _shown_arms(list(arms))}
     caption = (
@@ -236,18 +236,18 @@ def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
 
 
 def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, Artist]:
-    """Draws the largest |c_j x| of states and estimates, and marks the violations."""
+    """Draws how close states and estimates come to a limit, 1 for one that is reached, and marks the violations."""
     handles: dict[str, Artist] = {}
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
         color, time = ArmStyle.of(name).color, plant.dt * np.arange(len(path.states))
-        true, estimated = (np.abs(x @ plant.box_rows.T).max(axis=1) for x in (path.states, path.estimates))
+        true, estimated = (1.0 + plant.constraint_values(x.T).max(axis=0) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
         (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_INK, lw=1.1, ls=":", zorder=3)
         if (true > 1.0).any():
             (cross,) = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
             handles["violation of the true state"] = cross
     handles["limit"] = axis.axhline(1.0, **_LIMIT)
-    label(axis, "", "largest |c$_j$ x|", "First evaluation episode of the first run")
+    label(axis, "", "closest limit", "First evaluation episode of the first run")
     axis.set_ylim(0.0, max(1.12, axis.get_ylim()[1]))
     return handles
 
@@ -264,10 +264,10 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
             axis.vlines(middle, path.inputs[changed, i], proposed, color=color, lw=0.7, alpha=0.6)
             axis.plot(middle, proposed, ".", color=_INK, ms=4.0)
             handles["proposed, but overridden"] = Line2D([], [], ls="none", marker=".", color=_INK)
-    limit, unit = float(plant.u_max[i]), plant.input_units[i]
-    for end in (-limit, limit):
+    (middle, half), unit = plant.input_scales[i], plant.input_units[i]
+    for end in plant.input_ends[:, i]:
         axis.axhline(end, **_LIMIT)
-    axis.set_ylim(-1.15 * limit, 1.15 * limit)
+    axis.set_ylim(middle - 1.15 * half, middle + 1.15 * half)
     label(axis, "", with_unit(plant.input_names[i] + "\n" * bool(unit), unit))
     return handles
 
@@ -293,11 +293,12 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
     """Returns two states of the first evaluation episode of each run, a panel per arm, with safe box and safe set."""
     states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
     plane = plane_of(certificate, states)
-    box = projected_box(plant.box_rows, plane)
+    box = projected_box(plant.box, plant.box_ends, plane)
     outlines = {"safe set": (_outline(certificate, plane), "-"), "safe box": (box, "--")}
     prefix = "" if plant.n == 2 else "projection of the "
-    extent = np.max([np.abs(outline).max(axis=0) for outline, _ in outlines.values() if outline is not None], axis=0)
-    furthest = np.abs(states[:, plane]).max(axis=0)
+    drawn = np.concatenate([outline for outline, _ in outlines.values() if outline is not None])
+    middle, extent = 0.5 * (drawn.max(axis=0) + drawn.min(axis=0)), 0.5 * np.ptp(drawn, axis=0)
+    furthest = np.abs(states[:, plane] - middle).max(axis=0)
     half = np.clip(1.05 * furthest, 1.08 * extent, _VIEW * extent)
     caption = "Phase plane: true states of the first evaluation episode of each run, for every arm."
     if plant.n > 2:
@@ -315,7 +316,8 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((min(11.0, 1.4 + 3.2 * columns), 0.9 + 2.9 * rows), caption)
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        panels[0, 0].set(xlim=(-half[0], half[0]), ylim=(-half[1], half[1]))
+        low, high = middle - half, middle + half
+        panels[0, 0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         handles: dict[str, Artist] = {}
         for at, (panel, (name, results)) in enumerate(zip(panels.flat, arms.items(), strict=False)):
             for title, (outline, line) in outlines.items():
@@ -377,20 +379,23 @@ def projected_ellipsoid(shape: np.ndarray, plane: tuple[int, int], points: int =
     return (np.linalg.cholesky(shape[np.ix_(plane, plane)]) @ np.stack([np.cos(angle), np.sin(angle)])).T
 
 
-def projected_box(rows: np.ndarray, plane: tuple[int, int]) -> np.ndarray | None:
-    """Returns the outline of the projection of {x : |c_j x| <= 1}, closed, shape (corners + 1, 2); None if unbounded.
+def projected_box(rows: np.ndarray, ends: np.ndarray, plane: tuple[int, int]) -> np.ndarray | None:
+    """Returns the outline of the projection of {x : low_j <= c_j x <= high_j}, closed, shape (corners + 1, 2).
+
+    None if it is unbounded, or a row has one end alone.
 
     Args:
         rows: Rows c_j, shape (k, n).
+        ends: low < 0 and high > 0, shape (2, k).
         plane: The two coordinates.
     """
     pick, free = np.eye(rows.shape[1])[list(plane)], null_space(rows)
     # Along unlimited directions the box is a prism over these coordinates, in which it is bounded.
     basis = orth(rows.T)
-    if (free.size and np.abs(pick @ free).max() > _FLAT) or basis.shape[1] == 1:
+    if (free.size and np.abs(pick @ free).max() > _FLAT) or basis.shape[1] == 1 or not np.isfinite(ends).all():
         return None
-    walls = rows @ basis
-    sides = np.vstack([np.column_stack([sign * walls, -np.ones(len(walls))]) for sign in (1.0, -1.0)])
+    walls, (low, high) = rows @ basis, ends
+    sides = np.vstack([np.column_stack([walls, -high]), np.column_stack([-walls, low])])
     corners = HalfspaceIntersection(sides, np.zeros(basis.shape[1])).intersections @ basis.T @ pick.T
     hull = corners[ConvexHull(corners).vertices]
     return np.vstack([hull, hull[:1]])

@@ -109,7 +109,10 @@ class Arm:
             given = self.violation_weight
             training = replace(training, violation_penalty=settings.violation_penalty if given is None else given)
         if self.is_residual:
-            u_max = ncs_env(loop.single()).plant.u_max
+            try:
+                u_max = ncs_env(loop.single()).plant.u_max
+            except ValueError as error:
+                raise ValueError(f"arm {self.name}: {error}") from None
             training = replace(training, residual_gain=certificate.K / u_max[:, None])
         return training, filtered()
 

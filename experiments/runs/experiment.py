@@ -10,7 +10,7 @@ from typing import Any
 from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
-from experiments.baselines import tuned_training
+from experiments.baselines import FILTERS, tuned_training
 from experiments.runs.arms import Arm
 from experiments.runs.loops import other_scenarios, under
 from experiments.runs.policies import PRETRAINED
@@ -81,8 +81,14 @@ def run_of_arm(
         folder = pretrained_folder(loop.env)
         agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
     training_loop, loop = arm.loops(loop, certificate, settings)
-    if arm.is_trained and index == 0:
-        require_trainable(settings, training_loop)
+    if index == 0:  # what cannot be made is refused before anything is trained
+        if arm.is_trained:
+            require_trainable(settings, training_loop)
+        if arm.mode in FILTERS:
+            try:
+                loop.vector(1).close()
+            except ValueError as error:
+                raise ValueError(f"arm {arm.name}: {error}") from None
     scenarios = other_scenarios(getattr(settings, "scenarios", ()))
     for scenario in scenarios:  # what cannot be simulated is refused before anything is trained
         try:

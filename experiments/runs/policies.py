@@ -11,6 +11,7 @@ import numpy as np
 from agents.agent_file import AgentError, pretrained_folder
 from experiments.baselines import REGULATORS, controller, tuned_weights
 from ncs_gym import NCSEnv
+from shields.certificate import Fallback
 
 if TYPE_CHECKING:
     from agents.agent import Agent
@@ -44,8 +45,8 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize
     """
     if name in UNTRAINED_POLICIES:
         require_no_statistics(vec_normalize, name)
-        no_gain = np.zeros((env.plant.m, env.plant.n))
-        act = controller(_SHORT.get(name, name), env, no_gain, seed, tuned_weights(env_id, name))
+        nothing = Fallback.of_gain(np.zeros((env.plant.m, env.plant.n)))
+        act = controller(_SHORT.get(name, name), env, nothing, seed, tuned_weights(env_id, name))
         return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
     agent, _ = agent_named(name, env_id, vec_normalize)
     return lambda observation, info: agent.act(observation[None])[0]

@@ -331,5 +331,5 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
     """Returns what acts in the evaluation of a run: an agent, or for None the run's controller, which begins anew."""
     if agent is not None:
         return lambda observations, infos: agent.act(observations)
-    weights = tuned_weights(run.loop.env, run.arm)
-    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed, weights)
+    env, fallback, weights = ncs_env(run.loop.single()), run.certificate.fallback, tuned_weights(run.loop.env, run.arm)
+    return controller(run.policy_kind, env, fallback, run.evaluation_seed, weights)

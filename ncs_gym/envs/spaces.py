@@ -63,7 +63,8 @@ def observation_space(
     errors = np.sqrt(np.diagonal(error_set.shapes, axis1=1, axis2=2).max(axis=0))
     estimate = reach.max(axis=0) + errors
     if plant.spectral_radius >= 1.0:
-        known = np.maximum(plant.half_widths, initial_set.support(np.eye(plant.n)))
+        in_box = np.where(np.isfinite(plant.reach[: plant.n]), plant.reach[: plant.n], plant.half_widths)
+        known = np.maximum(in_box, initial_set.support(np.eye(plant.n)))
         for _ in range(input_delay + 1):
             pushed = np.abs(plant.B) @ plant.largest_input + plant.disturbance.support(np.eye(plant.n))
             known = np.maximum(known, np.abs(plant.A) @ known + pushed)

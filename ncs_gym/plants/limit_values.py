@@ -78,6 +78,17 @@ class LimitValues(ReadOnlyArrays):
         return read_only(np.maximum(-self.input_low, self.input_high))
 
     @cached_property
+    def own_limits(self) -> np.ndarray:
+        """The closest limits of each state alone, low and high ends of shape (2, n); infinite where an end is open."""
+        low, high = np.full((2, self.n), [[-np.inf], [np.inf]])
+        for row, ends in zip(self.box, self.box_ends.T, strict=True):
+            if np.count_nonzero(row) == 1:
+                j = int(np.flatnonzero(row)[0])
+                least, most = sorted(ends / row[j])
+                low[j], high[j] = max(low[j], least), min(high[j], most)
+        return read_only(np.array([low, high]))
+
+    @cached_property
     def reach(self) -> np.ndarray:
         """The largest |x_j| in the safe box and |u_i| within the limits, shape (n + m,); infinite for a free state.
 
@@ -87,10 +98,7 @@ class LimitValues(ReadOnlyArrays):
         limited, reach = self.box[two_ends].any(axis=0), np.full(self.n, np.inf)
         with suppress(ZeroDivisionError):  # rows that limit a sum alone
             reach[limited] = between_samples.widest(self.box[:, limited], self.box_ends)
-        for row, ends in zip(self.box, self.box_ends.T, strict=True):
-            if np.count_nonzero(row) == 1:
-                j = int(np.flatnonzero(row)[0])
-                reach[j] = min(reach[j], np.abs(ends / row[j]).max())
+        reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
         past = inputs_under_way(cast("LinearPlant", self))
         reach[self.n - past :] = np.tile(self.largest_input, past // self.m)
         return read_only(np.concatenate([reach, self.largest_input]))

@@ -52,11 +52,8 @@ class Range(NamedTuple):
 
 def range_of(plant: LinearPlant, index: int) -> Range:
     """Returns the range of a state: between the closest limits of it alone."""
-    alone = [j for j, row in enumerate(plant.box) if row[index] != 0.0 and np.count_nonzero(row) == 1]
-    ends = [sorted([plant.box_low[j] / plant.box[j, index], plant.box_high[j] / plant.box[j, index]]) for j in alone]
-    low, high = max((end[0] for end in ends), default=-np.inf), min((end[1] for end in ends), default=np.inf)
-    reach = float(plant.half_widths[index])
-    return Range(float(low) if np.isfinite(low) else -reach, float(high) if np.isfinite(high) else reach)
+    (low, high), reach = plant.own_limits[:, index].tolist(), float(plant.half_widths[index])
+    return Range(low if np.isfinite(low) else -reach, high if np.isfinite(high) else reach)
 
 
 class PhasePlane:

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from experiments.attack.worst_case import WorstCaseVectorEnv
+from experiments.attack.worst_case import WorstCaseVectorEnv, starts_in_box
 from ncs_gym import Channel, Ellipsoid, LinearPlant
 from shields import VectorSafetyShield
 from tests.certificates import certificate_of
+from tests.shields.polytope.limits import PLANTS, certificate
 
 COUNT = 32
 SLANTED = np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
@@ -65,3 +66,11 @@ def test_first_errors_attain_the_bound_of_a_covariance_and_of_what_is_declared_b
     radius = np.sqrt(alone.initial_radius_squared)
     np.testing.assert_allclose(np.linalg.norm(first_errors(alone), axis=1), radius, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(first_errors(both), axis=1), radius + 0.02, rtol=1e-6)
+
+
+def test_starts_in_the_box_are_drawn_from_all_of_it():
+    plant = PLANTS["angle"]
+    starts = starts_in_box(np.random.default_rng(0), plant, certificate("angle"), 4000)[1::2]
+    (low, high), reached = plant.own_limits, [starts.min(axis=0), starts.max(axis=0)]
+    np.testing.assert_allclose(reached, [low, high], atol=0.01)
+    np.testing.assert_allclose(starts.mean(axis=0), 0.5 * (low + high), atol=0.03)

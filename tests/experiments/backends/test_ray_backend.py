@@ -227,13 +227,6 @@ def one_sentence(run):
     return run.stderr.strip().splitlines()[-1]
 
 
-def test_failing_run_is_named(tmp_path):
-    small = ["--algo", "SAC", "--steps", "50", "--losses", "0.5", "--delays", "1", "--arms", "unshielded"]
-    run = ncs("sweep", *small, "--engine", "ray", "--out", tmp_path / "out")
-    said = "ncs: run loss0.5-delay1-burst0.0-unshielded-0: a training of 50 steps trains nothing"
-    assert one_sentence(run).startswith(said)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

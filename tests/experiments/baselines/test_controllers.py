@@ -9,7 +9,9 @@ import pytest
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
 from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
+from ncs_gym import Channel, LinearPlant, NCSEnv, SetpointTracking
 from ncs_gym.envs.env import ncs_env
+from shields.certificate import Fallback
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
 
@@ -20,7 +22,7 @@ def env_of(env_id):
 
 def settled(env, name, K, target, steps=600):
     """State and input after following a target without disturbance, from rest, and the largest |c_j x| on the way."""
-    policy, x = controller(name, env, K, 0), np.zeros(env.plant.n)
+    policy, x = controller(name, env, Fallback.of_gain(K), 0), np.zeros(env.plant.n)
     for _ in range(steps):
         observation = np.append(x, target)[None].astype(np.float32)
         u = env.plant.u_max * policy(observation, {"estimate": x[None]})[0]
@@ -45,12 +47,12 @@ def test_regulator_with_set_point_reaches_the_target(env_id):
 
 def test_speed_controllers_remove_the_error():
     env = env_of("ncs_gym/TruckTrailerCruise-v0")
-    proportional = controller("proportional", env, np.zeros((1, 2)), 0)
+    proportional = controller("proportional", env, Fallback.of_gain(np.zeros((1, 2))), 0)
     error, estimates = np.array([[0.0, 0.0, 1.5], [0.0, 0.0, -20.0]], np.float32), np.zeros((2, 2))
     u = env.plant.u_max * proportional(error, {"estimate": estimates})
     np.testing.assert_allclose(u[0] * env.plant.dt, 1.5)
     np.testing.assert_allclose(u[1], -env.plant.u_max)
-    regulator, x, left = controller("lqr", env, np.zeros((1, 2)), 0), np.zeros(2), 8.0
+    regulator, x, left = controller("lqr", env, Fallback.of_gain(np.zeros((1, 2))), 0), np.zeros(2), 8.0
     for _ in range(40):
         u = env.plant.u_max * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]
         x, left = env.plant.A @ x + env.plant.B @ u, left - env.plant.dt * u[0]
@@ -61,14 +63,14 @@ def test_regulation_needs_no_target_and_the_others_their_gain():
     env, K = env_of("ncs_gym/TruckTrailer-v0"), np.array([[0.3, -0.2]])
     estimates = np.array([[0.5, -0.1], [9.0, -9.0]])
     for name in ("proportional", "K x_hat"):
-        actions = controller(name, env, K, 0)(estimates, {"estimate": estimates})
+        actions = controller(name, env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates})
         np.testing.assert_allclose(actions, np.clip(estimates @ K.T / env.plant.u_max, -1.0, 1.0))
-    assert not controller("zero input", env, K, 0)(estimates, {"estimate": estimates}).any()
+    assert not controller("zero input", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates}).any()
 
 
 def test_random_inputs_depend_on_the_seed_alone():
     env, estimates = env_of("ncs_gym/BatchReactor-v0"), np.zeros((500, 4))
-    one, again, other = (controller("random", env, np.zeros((2, 4)), seed) for seed in (1, 1, 2))
+    one, again, other = (controller("random", env, Fallback.of_gain(np.zeros((2, 4))), seed) for seed in (1, 1, 2))
     first = one(estimates, {"estimate": estimates})
     np.testing.assert_array_equal(first, again(estimates, {"estimate": estimates}))
     assert (first != other(estimates, {"estimate": estimates})).any()
@@ -81,7 +83,7 @@ def test_random_inputs_depend_on_the_seed_alone():
 def test_actions_of_every_controller_fit_every_environment(name, env_id):
     env = env_of(env_id)
     rng, (m, n) = np.random.default_rng(0), (env.plant.m, env.plant.n)
-    policy = controller(name, env, rng.standard_normal((m, n)), 0)
+    policy = controller(name, env, Fallback.of_gain(rng.standard_normal((m, n))), 0)
     observations = rng.standard_normal((7, *env.observation_space.shape)).astype(np.float32)
     actions = policy(observations, {"estimate": observations[:, :n].astype(np.float64)})
     assert actions.shape == (7, m)
@@ -93,7 +95,7 @@ def nominal(env, name, weights, steps=150, times=1):
 
     Looked at that many times per step.
     """
-    policy, plant = controller(name, env, np.zeros((1, 2)), 0, weights), env.plant
+    policy, plant = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), env.plant
     part = plant if times == 1 else replace(plant, between_samples=None).resampled(plant.dt / times)
     x, applied, reached = np.zeros(plant.n), [np.zeros(plant.m)], 0.0
     targets = np.full(1 + env.task.preview, env.task.reach)
@@ -138,7 +140,7 @@ def test_mpc_far_from_all_limits_is_the_regulator(env_id):
     observations = 2e-2 * rng.standard_normal((3, *env.observation_space.shape))
     estimates = {"estimate": observations[:, : env.plant.n]}
     predicted, optimal = (
-        controller(name, env, np.zeros((1, 2)), 0)(observations, estimates) for name in ("mpc", "lqr")
+        controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0)(observations, estimates) for name in ("mpc", "lqr")
     )
     assert np.abs(optimal).max() > 1e-5
     np.testing.assert_allclose(predicted, optimal, atol=1e-2 * np.abs(optimal).max())
@@ -146,7 +148,7 @@ def test_mpc_far_from_all_limits_is_the_regulator(env_id):
 
 def test_regulator_moves_before_a_target_that_it_knows_does():
     env = env_of("ncs_gym/LaneKeeping-v0")
-    policy = controller("lqr", env, np.zeros((1, 2)), 0)
+    policy = controller("lqr", env, Fallback.of_gain(np.zeros((1, 2))), 0)
     later = np.concatenate([np.zeros(2), np.zeros(4), np.full(env.task.preview - 3, 0.4)])
     estimate = {"estimate": np.zeros((1, 2))}
     assert policy(later[None], estimate)[0, 0] > 0.01
@@ -165,3 +167,60 @@ def test_every_arm_of_the_study_has_weights_of_its_own():
         weights = {arm: tuned_weights(env_id, arm) for arm in REGULATED_ARMS}
         assert len(set(weights.values())) > 2
     assert tuned_weights("ncs_gym/CartPole-v0", "lqr") == RegulatorWeights()
+
+
+def two_ended(task=None):
+    """A tank above another one, whose levels and valve have limits that are not symmetric about their rest."""
+    plant = LinearPlant(
+        A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, disturbance_bound=0.01, sensor_bound=0.01,
+        initial_bound=0.05, operating_state=[3.0, 3.5], operating_input=[2.6],
+        state_limits=([0.5, 0.5], [4.0, 6.0]), input_limits=(0.0, 8.0),
+    )  # fmt: skip
+    return NCSEnv(plant=plant, channel=Channel(), task=task)
+
+
+def inputs_of(plant, actions):
+    return plant.input_half * actions + plant.input_middle
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_actions_stand_for_inputs_between_both_ends(name):
+    plant, estimates = (env := two_ended()).plant, np.random.default_rng(0).uniform(-9.0, 9.0, (400, 2))
+    fallback = Fallback(np.array([[-0.8, -0.3]]), np.array([0.5, 0.25]), np.array([0.125]))
+    u = inputs_of(plant, controller(name, env, fallback, 0)(estimates, {"estimate": estimates}))
+    assert ((plant.input_low - 1e-12 <= u) & (u <= plant.input_high + 1e-12)).all()
+    if name == "zero input":
+        np.testing.assert_allclose(u, 0.0, atol=1e-12)
+    else:
+        np.testing.assert_allclose([u.min(), u.max()], plant.input_ends[:, 0], atol=0.1)
+    if name in ("K x_hat", "proportional"):
+        wanted = 0.125 + (estimates - [0.5, 0.25]) @ fallback.gain.T
+        np.testing.assert_allclose(u, np.clip(wanted, plant.input_low, plant.input_high), atol=1e-12)
+
+
+def test_greedy_inputs_reach_the_target_in_a_step_or_go_to_the_end_on_its_side():
+    env = two_ended(SetpointTracking(output=np.array([1.0, 0.0]), reach=0.5, width=0.5))
+    policy = controller("greedy", env, Fallback.of_gain(np.zeros((1, 2))), 0)
+    targets = np.linspace(-1.0, 1.0, 41, dtype=np.float32)
+    observations = np.stack([np.zeros(41), np.zeros(41), targets], axis=1)
+    u = inputs_of(env.plant, policy(observations, {"estimate": np.zeros((41, 2))}))[:, 0]
+    np.testing.assert_allclose(u, np.clip(targets / 0.114, *env.plant.input_ends[:, 0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["governor", "governor:20", "mpc", "mpc:20"])
+@pytest.mark.parametrize("target", [-4.0, 4.0])
+def test_governor_and_mpc_come_close_to_both_ends_and_no_further(name, target):
+    env, weights = (
+        two_ended(SetpointTracking(output=np.array([0.0, 1.0]), reach=0.5, width=0.5)),
+        RegulatorWeights(1e-4, 0.0),
+    )
+    plant, reached = env.plant, {}
+    for each in ("lqr", name):
+        policy, states = controller(each, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), [np.zeros(2)]
+        for _ in range(150):
+            actions = policy(np.array([[*states[-1], target]]), {"estimate": states[-1][None]})
+            states.append(plant.A @ states[-1] + plant.B @ inputs_of(plant, actions)[0])
+        reached[each] = plant.constraint_values(np.transpose(states)).max()
+    margin = 0.2 if name.endswith("20") else 0.0
+    assert reached["lqr"] > 0.05
+    assert -margin - 0.05 <= reached[name] <= -margin + 1e-6

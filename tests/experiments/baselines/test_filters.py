@@ -35,7 +35,7 @@ def cases(certificate, loaded):
 def played(certificate, **filters):
     """The proportional controller on the cruise, always with the same seed."""
     loop = LoopConfig(env=CRUISE, **filters)
-    policy = controller("proportional", ncs_env(loop.single()), certificate.K, 0)
+    policy = controller("proportional", ncs_env(loop.single()), certificate.fallback, 0)
     return evaluate(loop, policy, 20, 7, certificate.M).episodes
 
 
@@ -64,7 +64,7 @@ def violating(loop, certificate, name, episodes=40, **settings):
         loop = replace(loop, filter=EstimateFilterSettings(name, certificate))
     elif name:
         loop = replace(loop, shield=ShieldSettings(certificate, name, 0.0, None, "ignore"))
-    policy = controller("lqr", ncs_env(loop.single()), certificate.K, 0)
+    policy = controller("lqr", ncs_env(loop.single()), certificate.fallback, 0)
     return sum(
         each.violation_steps > 0 for each in evaluate(loop.with_kwargs(**settings), policy, episodes, 7).episodes
     )

@@ -27,14 +27,30 @@ register_plant("Plants/Truck-v0", truck_trailer(mass=2000.0), channel=Channel(lo
 """
 
 
+TANK = """
+from ncs_gym import Channel, LinearPlant, contract_of, register_plant
+
+# Limits with two ends, far from symmetric about the operating point.
+plant = LinearPlant(
+    A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, disturbance_bound=0.01, sensor_bound=0.01,
+    initial_bound=0.05, operating_state=[3.0, 3.5], operating_input=[2.6],
+    state_limits=([0.5, 0.5], [4.0, 6.0]), input_limits=(0.0, 8.0),
+)
+channel = Channel(loss=0.3, max_consecutive_losses=2)
+register_plant("Plants/Tank-v0", plant, channel=channel, contract=contract_of(channel), max_episode_steps=20)
+"""
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a module that registers a plant; neither the module nor the id outlives the test."""
+    """A folder with modules that register a plant each; neither they nor the ids outlive the test."""
     (tmp_path / "own_plants.py").write_text(MODULE)
+    (tmp_path / "own_tank.py").write_text(TANK)
     monkeypatch.setattr(sys, "path", list(sys.path))
     yield tmp_path
-    sys.modules.pop("own_plants", None)
-    gym.registry.pop("Plants/Truck-v0", None)
+    for module, env_id in {"own_plants": "Plants/Truck-v0", "own_tank": "Plants/Tank-v0"}.items():
+        sys.modules.pop(module, None)
+        gym.registry.pop(env_id, None)
 
 
 ENV = ("--env", "own_plants:Plants/Truck-v0")
@@ -62,6 +78,22 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_work
     assert document["total"]["exits"] == document["total"]["unproved"] == 0
     assert document["total"]["interventions"] > 0
     assert_one_sentence(ncs("attack", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")
+
+
+def test_arms_with_and_without_training_are_compared_where_limits_have_two_ends(folder, without_workers):
+    tank, short = ("--env", "own_tank:Plants/Tank-v0"), ("--seeds", 1, "--episodes", 2, "--steps", 32)
+    small = ("--hyperparams", "n_steps=16", "n_envs=2", "batch_size=32", "n_epochs=1")
+    baselines = ("zero input", "K x_hat", "random", "greedy", "proportional+shielded", "lqr+trusting:20", "mpc")
+    run = ncs("compare", *tank, *short, *small, "--baselines", *baselines, "--out", "c", cwd=folder)
+    assert run.returncode == 0, run.stderr
+    arms = json.loads((folder / "c" / "summary.json").read_text())
+    assert set(arms["references"]) == set(baselines)
+    assert arms["arms"]["shielded"]["eval_violation_steps"] == 0
+    assert (folder / "c" / "figures" / "phase.png").is_file()
+    for arm in ("lqr+psf", "shielded+residual"):  # before anything is trained
+        refused = ncs("compare", *tank, *short, "--baselines", "mpc", "--arms", "unshielded", arm, cwd=folder)
+        assert_one_sentence(refused, f"arm {arm}: the limits of this plant are not symmetric")
+    assert not (folder / "runs" / "compare" / "runs").exists()
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
 from agents.results import TrainingPoint
+from experiments.network_loop.log import StepLog
 from experiments.plots import comparison_figures as figures
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
@@ -23,6 +24,7 @@ from experiments.plots.comparison_figures import (
     training_figure,
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
+from experiments.plots.loop_figure import loop_log_figure
 from experiments.settings.learning import REGULATED_ARMS
 from ncs_gym import Ellipsoid, LinearPlant
 from shields.polytope import Polytope
@@ -221,11 +223,12 @@ class _Moved:
 @pytest.mark.parametrize("seed", range(3))
 def test_projections_reach_as_far_as_the_sets_in_every_direction(seed):
     rng = np.random.default_rng(seed)
-    factor, rows = rng.standard_normal((4, 4)), rng.standard_normal((5, 4))
-    ellipse, box = projected_ellipsoid(factor @ factor.T, (0, 2), 20_001), projected_box(rows, (0, 2))
+    factor, rows, ends = rng.standard_normal((4, 4)), rng.standard_normal((5, 4)), rng.uniform(0.2, 2.0, (2, 5))
+    ellipse = projected_ellipsoid(factor @ factor.T, (0, 2), 20_001)
+    box = projected_box(rows, ends * [[-1.0], [1.0]], (0, 2))
     for angle in np.linspace(0.0, np.pi, 7):
         direction = np.array([np.cos(angle), 0.0, np.sin(angle), 0.0])
-        reach = linprog(-direction, np.vstack([rows, -rows]), np.ones(10), bounds=(None, None))
+        reach = linprog(-direction, np.vstack([-rows, rows]), ends.ravel(), bounds=(None, None))
         assert (box @ direction[[0, 2]]).max() == pytest.approx(-reach.fun)
         wanted = Ellipsoid(factor @ factor.T).support(direction)
         assert (ellipse @ direction[[0, 2]]).max() == pytest.approx(wanted, rel=1e-5)
@@ -233,9 +236,11 @@ def test_projections_reach_as_far_as_the_sets_in_every_direction(seed):
 
 def test_box_without_limits_in_the_plane_has_no_outline_and_elsewhere_does_not_matter():
     rows = np.array([[0.5, 0.0, 0.0], [0.0, 0.25, 0.0]])
-    assert projected_box(rows, (0, 2)) is None
-    outline = projected_box(rows, (0, 1))
-    np.testing.assert_allclose(np.abs(outline).max(axis=0), [2.0, 4.0])
+    ends = np.array([[-1.0, -0.5], [1.0, 1.5]])
+    assert projected_box(rows, ends, (0, 2)) is None
+    assert projected_box(rows, np.array([[-1.0, -np.inf], [1.0, 1.5]]), (0, 1)) is None
+    outline = projected_box(rows, ends, (0, 1))
+    np.testing.assert_allclose([outline.min(axis=0), outline.max(axis=0)], [[-2.0, -2.0], [2.0, 6.0]])
     assert len(outline) == 5
 
 
@@ -360,3 +365,20 @@ def test_a_single_state_has_no_phase_plane():
     with without_pictures():
         figures = comparison_figures(single, SimpleNamespace(L=np.eye(1), polytope=None), summary_of(shown), shown)
     assert set(figures) == {"training", "scatter", "episode"}
+
+
+def test_log_of_a_loop_has_the_ends_of_every_limit(tmp_path):
+    plant = LinearPlant(
+        A=[[0.9, 0.0], [0.1, 0.9]], B=[[0.1], [0.0]], dt=1.0, state_limits=([-0.5, -np.inf], [4.0, 2.0]),
+        input_limits=(-1.0, 3.0), disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
+    )  # fmt: skip
+    names = [*plant.state_names, *plant.input_names]
+    log = StepLog(tmp_path, "controller", ["episode", "step", "x_hat_x1", "x_hat_x2", f"u_{names[2]}", "guaranteed"])
+    for step in range(5):
+        log.write([0, step, 0.5, 0.25, 0.1, int(step != 3)])
+    log.close()
+    figure = loop_log_figure(tmp_path, plant, 5)
+    drawn = [[set(line.get_ydata()) for line in axis.lines if line.get_label() != "controller"] for axis in figure.axes]
+    assert drawn == [[{-0.5}, {4.0}], [{2.0}], [{-1.0}, {3.0}]]
+    for axis in figure.axes:
+        np.testing.assert_array_equal(axis.collections[0].get_segments(), [[[3.0, 0.0], [3.0, 1.0]]])

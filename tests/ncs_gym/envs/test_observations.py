@@ -1,13 +1,23 @@
 """What observations hold and are clipped to, and that clipping is never silent where it hides something."""
 
 import warnings
+from itertools import product
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ncs_gym import Channel, ClippedObservationWarning, LinearPlant, NCSEnv, NCSVectorEnv, Task, cart_pole
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    ClippedObservationWarning,
+    LinearPlant,
+    NCSEnv,
+    NCSVectorEnv,
+    Task,
+    cart_pole,
+)
 from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.ncs_gym.envs.same_draws import compare
@@ -173,3 +183,22 @@ def test_spec_with_a_certificate_and_observations_is_json(tmp_path):
         SafetyShield(env, altered)
     with pytest.raises(ValueError, match="certificate must be a Certificate, its document or path"):
         SafetyShield(env, 3)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"state_limits": ([-0.5, -1.0], [9.0, 2.0]), "input_limits": (-2.0, 1.0)},
+        {"box": [[0.5, 0.5], [0.5, -0.5]], "u_max": 2.0},
+    ],
+    ids=["two ends", "sums"],
+)
+def test_estimates_in_the_safe_box_are_observed_as_they_are(limits):
+    """The plant is unstable, so that observations are clipped somewhere: not at the corners of its box."""
+    quiet = {"disturbance_bound": 0.01, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[1.02, 0.1], [0.0, 1.01]], B=[[0.5], [0.2]], dt=1.0, **limits, **quiet)
+    env = NCSEnv(plant=plant, channel=Channel(), contract=ChannelContract(0))
+    for ends in product(*plant.box_ends.T):
+        corner = np.linalg.solve(plant.box, ends)
+        observation, _ = env.reset(seed=0, options={"state": corner})
+        np.testing.assert_allclose(observation, corner, rtol=1e-6, atol=1e-6)

@@ -208,3 +208,10 @@ def test_one_sided_limits_leave_the_other_side_free():
     np.testing.assert_allclose(plant.box, [[1.0, 0.0], [0.0, 0.5]])
     np.testing.assert_array_equal(plant.box_ends, [[-1.0, -np.inf], [np.inf, 1.0]])
     np.testing.assert_allclose(plant.input_ends, [[-1.4], [0.6]])
+
+
+def test_own_limits_are_the_closest_of_each_state_alone():
+    rows = [[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.0, 0.0, 4.0]]
+    limits = [(row, low, high) for row, low, high in zip(rows, (-1, -4, -1, -np.inf), (5, 6, 1, 2), strict=True)]
+    plant = LinearPlant(A=0.5 * np.eye(3), B=np.ones((3, 1)), u_max=1.0, dt=0.1, output_limits=limits, **QUIET)
+    np.testing.assert_allclose(plant.own_limits, [[-1.0, -np.inf, -np.inf], [2.0, np.inf, 0.5]])

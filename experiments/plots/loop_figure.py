@@ -6,6 +6,7 @@ from collections import deque
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pandas as pd
 
 from experiments.network_loop.log import rows_of
@@ -29,22 +30,23 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
             raise ValueError(f"the logs in {folder} are of another plant, without {', '.join(missing)}: give its --env")
     logs = {name: log[log["episode"] == log["episode"].iloc[-1]] for name, log in logs.items()}
     names, units = [*plant.state_names, *plant.input_names], [*plant.state_units, *plant.input_units]
-    widths = [*plant.half_widths, *plant.largest_input]
+    ends = np.hstack([plant.own_limits, plant.input_ends]).T.tolist()
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure(
             (11.0, 1.0 + 1.4 * len(names)), f"{folder.name}: the dashed lines are the box and the input limits."
         )
         axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for i, (axis, name, unit, width) in enumerate(zip(axes, names, units, widths, strict=True)):
+        for i, (axis, name, unit, limits) in enumerate(zip(axes, names, units, ends, strict=True)):
             for log, rows in logs.items():
                 column = columns[log] + name if i < plant.n else f"u_{name}"
                 style = {"plant": "-", "controller": ":"}[log]
                 axis.plot(rows["step"].astype(int), rows[column].astype(float), style, lw=1.2, label=log)
-            for side in (-width, width):
-                axis.axhline(side, color="#222222", lw=1.0, ls=(0, (6.0, 3.0)))
+            for end in filter(np.isfinite, limits):
+                axis.axhline(end, color="#222222", lw=1.0, ls=(0, (6.0, 3.0)))
             if "controller" in logs:
                 unproved = logs["controller"][logs["controller"]["guaranteed"] == "0"]["step"].astype(int)
-                axis.vlines(unproved, -width, width, color="#cc3311", alpha=0.2, label="not proved")
+                height = {"transform": axis.get_xaxis_transform(), "label": "not proved"}
+                axis.vlines(unproved, 0.0, 1.0, color="#cc3311", alpha=0.2, **height)
             label(axis, "", with_unit(name, unit).replace(" [", "\n["))
         axes[-1].set_xlabel("step")
         axes[0].set_title("what the controller estimates and decides at a step is about that at which it takes effect")
