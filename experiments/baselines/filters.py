@@ -15,7 +15,7 @@ from ncs_gym.validation import AroundEnvironment
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
-from shields.runtime.rows_within_step import rows_within_step
+from shields.runtime.rows_within_step import closed, rows_within_step
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.set_test import certificate_test
 from shields.verification import require_valid
@@ -80,16 +80,17 @@ class PredictiveFilter:
 
     It solves, with x_0 = x_hat taken for the true state and neither disturbance nor error set,
 
-        min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  |u_i| <= u_max,
-                                      |c_j x_i| <= 1 - t_ij (0 < i < N),  |x_N|_M <= 1 - t_N,
+        min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  u_i within the limits,
+                                      low_j + t_ij <= c_j x_i <= high_j - t_ij (0 < i < N),  |x_N|_M <= 1 - t_N,
 
-    or |g x_N| <= 1 - t_N(g) for the rows g of the certificate's polytope, if it has one. Where the box counts between
-    samples, its limits hold at these times, too, tightened as at the worse of the two samples.
+    or low + t_N(g) <= g x_N <= high - t_N(g) for the rows g of the certificate's polytope, if it has one. Where the box
+    counts between samples, its limits hold at these times, too, tightened as at the worse of the two samples, and so do
+    limits of states and inputs together.
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
     already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
-    do, and u = K x_hat when it is used up.
+    do, and the fallback when it is used up.
 
     After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
     is that of Mayne et al. 2006 (docs/bibliography.md).
@@ -98,11 +99,13 @@ class PredictiveFilter:
         certificate: Gives S and K; verified exactly here.
         plant: The plant it was made for.
         horizon: N [steps], at least 2.
-        margin: Fraction of box and safe set that is kept free.
+        margin: Fraction of half the range of the box, and of the way from the resting point to a face of the safe set,
+            that is kept free.
         tube: Whether the tightenings are those of the tube, beside the margin.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
+        ValueError: If a tube is asked for where states and inputs have limits together.
     """
 
     def __init__(
@@ -115,30 +118,44 @@ class PredictiveFilter:
         tube: bool = False,
     ) -> None:
         require_valid(certificate, plant)
-        self._plant, self._K, self._horizon = plant, certificate.K, horizon
+        self._plant, self._fallback, self._horizon = plant, certificate.fallback, horizon
         self._plans = np.empty((0, horizon - 1, plant.m))
         polytope = certificate.polytope
         self._root = np.linalg.cholesky(certificate.M).T if polytope is None else polytope.rows
         self._ends_in_ellipsoid = polytope is None
         self._prediction = Prediction(certificate_test(certificate, plant), horizon)
         self._program = PlanProgram(self._prediction)
-        at_samples = np.full((horizon + 1, len(plant.box_rows)), 1.0 - margin)
-        self._end_limits = np.full(1 if polytope is None else len(polytope.rows), 1.0 - margin)
+        self._middle, half = _middle_and_half(plant.box_low, plant.box_high)
+        at_samples = np.tile(half - margin, (horizon + 1, 1))
+        self._end_middle, end_half, to_face = np.zeros(1), np.ones(1), np.ones(1)
+        if polytope is not None:
+            self._end_middle, end_half = _middle_and_half(polytope.low, polytope.high)
+            reached = polytope.rows @ polytope.center
+            to_face = np.minimum(polytope.high - reached, reached - polytope.low)
+        self._end_limits = end_half - margin * to_face
         if tube:
+            if len(plant.mixed_rows):
+                raise ValueError("a tube knows no limits of states and inputs together")
             reach, end = _tube(certificate, plant, self._end_sizes, horizon)
             at_samples, self._end_limits = at_samples - reach, self._end_limits - end
         self._limits = at_samples[1:-1]
         # As the program takes it, whose rows of the box are shorter by what a disturbance does between samples; the
         # last row is for ends in P.
-        self._all_limits = np.ones((horizon, max(self._limits.shape[1], len(self._end_limits))))
-        longer = np.linalg.norm(self._prediction.rows[: len(plant.box_rows)], axis=1)
-        longer = longer / np.linalg.norm(plant.box_rows, axis=1)
-        self._all_limits[:-1, : self._limits.shape[1]] = self._limits * longer
-        self._all_limits[-1, : len(self._end_limits)] = self._end_limits
+        k, ends = len(plant.box), len(self._end_limits)
+        self._all_limits = np.ones((horizon, max(k, ends)))
+        longer = np.linalg.norm(self._prediction.rows[:k], axis=1) / np.linalg.norm(plant.box, axis=1)
+        shrunk = self._prediction.half[:k]
+        self._all_limits[:-1, :k] = shrunk - 1.0 + (self._limits + (1.0 - half)) * longer
+        self._all_limits[-1, :ends] = self._end_limits
+        if polytope is not None:  # its first rows are those of the box
+            self._all_limits[-1, :k] += shrunk - half
         self._weighting = self._root if polytope is None else self._root[:0]
         self._grid = rows_within_step(plant)
-        times = len(self._grid.state) // len(plant.box_rows)
-        self._between = np.tile(np.minimum(at_samples[:-1], at_samples[1:]), times)
+        self._grid_middle, grid_half = _middle_and_half(self._grid.low, self._grid.high)
+        times = (len(grid_half) - len(plant.mixed_rows)) // k
+        left = np.tile(np.minimum(at_samples[:-1], at_samples[1:]) + (1.0 - half), times)
+        mixed = np.full((horizon, len(plant.mixed_rows)), 1.0 - margin)
+        self._between = grid_half - 1.0 + np.hstack([left, mixed])
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
@@ -160,10 +177,10 @@ class PredictiveFilter:
         """Returns where a proposed input and then u = K x are a plan, (N,), and these inputs, (N, horizon - 1, m)."""
         plant, states, inputs, plans = self._plant, estimates, proposed, []
         fine = np.ones(len(states), np.bool_)
-        for between, limits in zip(self._between, [*self._limits, np.full(len(plant.box_rows), np.inf)], strict=True):
-            fine &= (np.abs(self._grid.values(states, inputs)) <= between).all(axis=1)
+        for between, limits in zip(self._between, [*self._limits, np.full(len(plant.box), np.inf)], strict=True):
+            fine &= (np.abs(self._grid.values(states, inputs) - self._grid_middle) <= between).all(axis=1)
             states = states @ plant.A.T + inputs @ plant.B.T
-            fine &= (np.abs(states @ plant.box_rows.T) <= limits).all(axis=1)
+            fine &= (np.abs(states @ plant.box.T - self._middle) <= limits).all(axis=1)
             inputs = self._gained(states)
             plans.append(inputs)
         return fine & (self._levels(states) <= self._end_limits).all(axis=-1), np.stack(plans[:-1], axis=1)
@@ -171,23 +188,24 @@ class PredictiveFilter:
     def _solved(self, estimate: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns the inputs of the best plan, shape (horizon, m); None if the solver finds none."""
         plant = self._plant
-        missed = np.abs(plant.box_rows @ plant.A @ estimate) - np.abs(plant.box_rows @ plant.B) @ plant.u_max
+        moved = plant.box @ plant.A @ estimate + plant.box @ plant.B @ plant.input_middle - self._middle
+        missed = np.abs(moved) - np.abs(plant.box @ plant.B) @ plant.input_half
         if not (missed <= self._limits[0]).all() or (self._end_limits <= 0.0).any():
             return None  # no input brings the next state into the box, or nothing is left of the end
         radius = float(self._end_limits[0])  # counts for ends in S
         plan = self._program.solve(estimate, self._all_limits, self._weighting, radius, self._between, proposed)
         if plan is None:
             return None
-        plan = np.clip(plan, -plant.u_max, plant.u_max)
+        plan = np.clip(plan, plant.input_low, plant.input_high)
         centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
-        inside = (np.abs(centers[:-1] @ plant.box_rows.T) <= self._limits + TOLERANCE).all()
+        inside = (np.abs(centers[:-1] @ plant.box.T - self._middle) <= self._limits + TOLERANCE).all()
         begun = np.vstack([estimate, centers[:-1]])
-        inside &= (np.abs(self._grid.values(begun, plan)) <= self._between + TOLERANCE).all()
+        inside &= (np.abs(self._grid.values(begun, plan) - self._grid_middle) <= self._between + TOLERANCE).all()
         return plan if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
 
     def _levels(self, states: np.ndarray) -> np.ndarray:
-        """Returns |x|_M, shape (..., 1), or |g x| for all rows of P, shape (..., r), of states (..., n)."""
-        values = states @ self._root.T
+        """Returns |x|_M, (..., 1), or how far the rows g x of P are from their middles, (..., r), of states (..., n)."""
+        values = states @ self._root.T - self._end_middle
         return np.linalg.norm(values, axis=-1, keepdims=True) if self._ends_in_ellipsoid else np.abs(values)
 
     def _end_sizes(self, shape: np.ndarray) -> np.ndarray:
@@ -196,8 +214,15 @@ class PredictiveFilter:
         return np.sqrt(np.maximum(np.linalg.eigvalsh(moved)[-1:] if self._ends_in_ellipsoid else np.diag(moved), 0.0))
 
     def _gained(self, states: np.ndarray) -> np.ndarray:
-        """Returns u = K x within the limits, shape (m,) or (N, m)."""
-        return np.clip(states @ self._K.T, -self._plant.u_max, self._plant.u_max)
+        """Returns the fallback within the limits, shape (m,) or (N, m)."""
+        inputs = states @ self._fallback.gain.T + self._fallback.constant
+        return np.clip(inputs, self._plant.input_low, self._plant.input_high)
+
+
+def _middle_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns middles and halves of ranges, of which one end may be open."""
+    low, high = closed(low, high)
+    return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _tube(
@@ -207,7 +232,7 @@ def _tube(
 
     `end_sizes` returns how far the states of an ellipsoid of a given shape reach at the end.
     """
-    K, rows = certificate.K, plant.box_rows
+    K, rows = certificate.K, plant.box
     first = list(certificate.error_shapes)
     pushes = [plant.B @ K @ shape @ (plant.B @ K).T for shape in first]
 

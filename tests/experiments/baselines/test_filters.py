@@ -14,6 +14,8 @@ from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter, synthesize
 from tests.certificates import certificate_of
+from tests.shields.polytope.limits import PLANTS
+from tests.shields.polytope.limits import certificate as limited
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 NEVER = np.zeros(1, np.bool_)
@@ -157,21 +159,25 @@ def test_trusting_filter_still_keeps_the_disturbance_out_if_the_estimate_is_true
 
 
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("safe_set", ["ellipsoid", "polytope"])
-def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(safe_set, certificate, loaded):
+@pytest.mark.parametrize("kind", ["ellipsoid", "polytope", "two ends"])
+def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(kind, certificate, loaded):
     """Two steps, by trying inputs on a grid."""
-    if safe_set == "polytope":
+    plant = loaded
+    if kind == "polytope":
         certificate = synthesize(loaded, contract=certificate.contract)
         assert certificate.polytope is not None
-    predictive, grid = PredictiveFilter(certificate, loaded, horizon=2), np.linspace(-1.0, 1.0, 401) * loaded.u_max
+    elif kind == "two ends":
+        plant, certificate = PLANTS["angle"], limited("angle")
+    predictive, grid = PredictiveFilter(certificate, plant, horizon=2), np.linspace(*plant.input_ends[:, 0], 401)
     rng, found = np.random.default_rng(3), 0
     first, second = (each.ravel()[:, None] for each in np.meshgrid(grid, grid, indexing="ij"))
+    (low, high), widths = plant.own_limits, plant.half_widths
     for _ in range(60):
-        estimate = 1.3 * rng.uniform(-1.0, 1.0, 2) * loaded.half_widths
-        proposed = rng.uniform(-1.0, 1.0, 1) * loaded.u_max
-        one = loaded.A @ estimate + first @ loaded.B.T
-        two = one @ loaded.A.T + second @ loaded.B.T
-        fine = (np.abs(one @ loaded.box_rows.T) <= 1.0).all(axis=1)
+        estimate = rng.uniform(low - 0.3 * widths, high + 0.3 * widths)
+        proposed = rng.uniform(*plant.input_ends)
+        one = plant.A @ estimate + first @ plant.B.T
+        two = one @ plant.A.T + second @ plant.B.T
+        fine = (plant.constraint_values(one.T) <= 0.0).all(axis=0)
         fine &= certificate.safe_set.gauge(two) <= 1.0
         if fine.any():
             best = np.abs(first[fine] - proposed).min()
@@ -179,6 +185,34 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(safe_set,
             assert abs(abs(chosen - proposed).item() - best) <= 0.03
             found += best > 0.1
     assert found >= 5
+
+
+@pytest.mark.parametrize("name", ["angle", "rates", "coupled"])
+@pytest.mark.parametrize("margin", [0.0, 0.2])
+def test_predictive_filter_keeps_limits_with_two_ends_and_of_states_and_inputs_together(name, margin):
+    plant, certificate = PLANTS[name], limited(name)
+    predictive, rng, raw = (
+        PredictiveFilter(certificate, plant, margin=margin),
+        np.random.default_rng(1),
+        np.zeros(plant.n),
+    )
+    state, reached, alone = np.zeros(plant.n), [], []
+    for k in range(240):
+        if k % 20 == 0:
+            proposed = np.where(rng.random(plant.m) < 0.5, *plant.input_ends)
+        u = predictive(state[None], proposed[None], np.array([k == 0]))[0]
+        assert ((plant.input_low <= u) & (u <= plant.input_high)).all()
+        after = plant.A @ state + plant.B @ u
+        reached.append(plant.worst_constraint_values(state, u, after).max())
+        state, raw = after, plant.A @ raw + plant.B @ proposed
+        alone.append(plant.constraint_values(raw).max())
+    assert max(alone) > 0.05
+    assert -margin - 0.1 < max(reached) <= -margin + 1e-5
+
+
+def test_tubes_are_not_for_limits_of_states_and_inputs_together():
+    with pytest.raises(ValueError, match="a tube knows no limits of states and inputs together"):
+        PredictiveFilter(limited("coupled"), PLANTS["coupled"], tube=True)
 
 
 def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificate, loaded):
