@@ -204,7 +204,7 @@ class PredictiveFilter:
         return plan if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
 
     def _levels(self, states: np.ndarray) -> np.ndarray:
-        """Returns |x|_M, (..., 1), or how far the rows g x of P are from their middles, (..., r), of states (..., n)."""
+        """Returns |x|_M, shape (..., 1), or how far the rows g x of P are from their middles, shape (..., r)."""
         values = states @ self._root.T - self._end_middle
         return np.linalg.norm(values, axis=-1, keepdims=True) if self._ends_in_ellipsoid else np.abs(values)
 

@@ -19,10 +19,9 @@ from experiments.attack.safety_counts import (
 )
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.runs.experiment import lasting_settings
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.provenance import versions
-from experiments.settings import AttackSettings
+from experiments.settings import AttackSettings, lasting_settings
 from experiments.settings.certificates import FEWEST_ENVS
 from experiments.terminal import wrapped
 from ncs_gym.network import downlink_protocol

@@ -24,19 +24,13 @@ from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
-from experiments.report.text_tables import decimals_of, scenario_text, summary_text
-from experiments.runs.arms import Arm, by_arm, full_names
-from experiments.runs.experiment import (
-    certificate_line,
-    certificate_of,
-    experiment_provenance,
-    require_trainable,
-    run_of_arm,
-)
-from experiments.runs.loops import loop_config
+from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
+from experiments.runs.arms import Arm, by_arm, full_names, run_of_arm
+from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
-from experiments.runs.training_run import TrainingRun
+from experiments.runs.provenance import experiment_provenance
+from experiments.runs.training_run import TrainingRun, require_trainable
 from experiments.settings import CompareSettings
 from experiments.settings.arguments import id_alone
 from experiments.terminal import wrapped

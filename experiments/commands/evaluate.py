@@ -11,8 +11,7 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
-from experiments.runs.experiment import certificate_of
-from experiments.runs.loops import registered_env, with_channel
+from experiments.runs.loops import certificate_of, registered_env, with_channel
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import agent_named, certificate_file
 from experiments.runs.provenance import versions

@@ -15,10 +15,11 @@ from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.html import sweep_report
 from experiments.report.text_tables import sweep_table
-from experiments.runs.arms import full_names
-from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
-from experiments.runs.loops import loop_config
+from experiments.runs.arms import full_names, run_of_arm
+from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.provenance import experiment_provenance
+from experiments.runs.training_run import require_trainable
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env

@@ -6,12 +6,12 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import Arm, require_used
-from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
-from experiments.runs.loops import loop_config
+from experiments.runs.arms import Arm, require_used, run_of_arm
+from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.provenance import experiment_provenance
 from experiments.runs.resume import forget_checkpoint, resumed
-from experiments.runs.training_run import RunResult
+from experiments.runs.training_run import RunResult, require_trainable
 from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
 from ncs_gym.validation import counted

@@ -8,6 +8,8 @@ from typing import Any
 
 from experiments.runs.loops import losses_text
 from experiments.terminal import text_table, wrapped
+from shields import Certificate, Report
+from shields.certificate_text import size_of
 
 _MOST_DECIMALS = 4
 # Two lines of the header of what a point of a sweep fixes, by its key.
@@ -146,3 +148,10 @@ def _outcome(arm: dict[str, Any]) -> list[str]:
         "-" if arm["mode"] is None else f"{100 * arm['intervention_rate']:.1f} %",
         f"{arm['eval_return_mean']:z.1f}",
     ]
+
+
+def certificate_line(certificate: Certificate, verification: Report) -> str:
+    """Returns one line about a certificate and its exact verification."""
+    size = size_of(certificate)
+    conditions = f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic"
+    return f"{conditions} ({size})" if size else conditions

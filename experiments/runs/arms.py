@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 
+from agents.agent_file import AGENT_FILES, pretrained_folder
+from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS, EstimateFilterSettings
+from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS, EstimateFilterSettings, tuned_training
+from experiments.runs.loops import other_scenarios, under
 from experiments.runs.policies import PRETRAINED
-from experiments.runs.training_run import RunResult
+from experiments.runs.training_run import RunResult, TrainingRun, require_trainable
 from experiments.settings import LearningSettings
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
@@ -193,3 +196,65 @@ def _is_weight(text: str) -> bool:
         return 0.0 <= float(text) < float("inf")
     except ValueError:
         return False
+
+
+def run_of_arm(
+    settings: LearningSettings,
+    loop: LoopConfig,
+    certificate: Certificate,
+    arm_name: str,
+    index: int,
+    grid_point: str = "",
+) -> TrainingRun:
+    """Returns one training run of an arm, or the run of an arm in which nothing is trained.
+
+    Raises:
+        ValueError: If the arm or a scenario is unknown.
+        AgentError: If the arm is the pretrained agent's, and the package has none for the environment.
+    """
+    arm, hyperparams = Arm.of(arm_name, settings.mode), settings.all_hyperparams
+    if arm.is_trained and getattr(settings, "tuned_arms", False):
+        own = dict(tuned_training(loop.env, arm.name))
+        hyperparams = with_changes(hyperparams, own.pop("hyperparams", {}))
+        if "lagrangian" in own:
+            own["lagrangian"] = replace(settings.lagrangian, **own["lagrangian"])
+        settings = replace(settings, **own)
+    agent_files = {}
+    if arm.policy == PRETRAINED:  # its checksums are verified where it acts
+        folder = pretrained_folder(loop.env)
+        agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
+    training_loop, loop = arm.loops(loop, certificate, settings)
+    if index == 0:  # what cannot be made is refused before anything is trained
+        if arm.is_trained:
+            require_trainable(settings, training_loop)
+        if arm.mode in FILTERS:
+            try:
+                loop.vector(1).close()
+            except ValueError as error:
+                raise ValueError(f"arm {arm.name}: {error}") from None
+    scenarios = other_scenarios(getattr(settings, "scenarios", ()))
+    for scenario in scenarios:  # what cannot be simulated is refused before anything is trained
+        try:
+            under(scenario, loop).single().close()
+        except ValueError as error:
+            raise ValueError(f"--scenarios {scenario}: {error}") from None
+    origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
+    origin += "" if certificate.polytope is None else " with a polytope"
+    return TrainingRun(
+        arm=arm.name,
+        policy_kind=arm.policy,
+        training_loop=training_loop,
+        loop=loop,
+        module=settings.env.rpartition(":")[0],
+        seed=settings.seed,
+        index=index,
+        steps=settings.training_steps,
+        episodes=settings.episodes,
+        certificate=certificate,
+        certificate_basis=origin if settings.certificate is None else "",
+        scenarios=scenarios,
+        algorithm=settings.algo,
+        settings=hyperparams,
+        grid_point=grid_point,
+        agent_files=agent_files,
+    )

@@ -21,6 +21,8 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
 from ncs_gym.validation import counted, warn_caller
+from shields import Certificate, certificate_for
+from shields.verification import require_valid
 
 # Shares of packets that differ by less are the same. Eigenvalues of a chain below this are rounding.
 SHARE, ROUNDING = 1e-3, 1e-12
@@ -277,3 +279,24 @@ _CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
     "attacked": _attacked,
     "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
 }
+
+
+def certificate_of(loop: LoopConfig, file: Path | None = None, safe_set: str | None = None) -> Certificate:
+    """Returns a certificate for the plant of a control loop, under the contract of its channels.
+
+    Args:
+        loop: The control loop.
+        file: File of the certificate, which is verified; None synthesizes one.
+        safe_set: Of one that is synthesized: "polytope", "ellipsoid" or None; see `shields.synthesize`.
+
+    Raises:
+        ValueError: If the environment cannot have its keyword arguments.
+        CertificateError: If a given certificate is damaged or does not verify for the plant.
+        Infeasible: If no certificate is found.
+    """
+    env = ncs_env(loop.single())
+    if file is None:
+        return certificate_for(env.plant, env.certificate_contract, safe_set)
+    certificate = Certificate.load(file)
+    require_valid(certificate, env.plant)
+    return certificate

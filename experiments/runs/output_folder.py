@@ -19,8 +19,7 @@ from filelock import FileLock, Timeout
 
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.json_values import flat
-from experiments.runs.experiment import INCIDENTAL_SETTINGS
-from experiments.settings import save_settings, settings_json
+from experiments.settings import INCIDENTAL_SETTINGS, save_settings, settings_json
 from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 from ncs_gym.reading import json_values, read_file
 from shields.atomic_write import write_atomically

@@ -1,13 +1,23 @@
-"""What results depend on next to their settings: versions of packages and the source of this project."""
+"""What results depend on: settings, versions of packages, the source of this project, and what a summary says of it."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents.loop import LoopConfig
+from experiments.settings import LearningSettings, lasting_settings
+from ncs_gym.envs.env import ncs_env
+from shields import Certificate
+
+if TYPE_CHECKING:
+    from experiments.runs.training_run import TrainingRun
 
 _DEPENDENCIES = ("ncs-gym", "gymnasium", "stable-baselines3", "sb3-contrib", "torch", "cvxpy", "clarabel")
 _DEPENDENCIES += ("numpy", "scipy", "filterpy")
@@ -38,3 +48,23 @@ def _source_digest() -> str:
     for path in files:
         digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
+
+
+def experiment_provenance(
+    settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
+) -> dict[str, Any]:
+    """Returns what a reader needs to know where the results of a command come from, JSON values."""
+    env = ncs_env(loop.single())
+    channel = env.channel.description
+    if env.downlink is not None:
+        channel += f" Commands: {env.downlink.description}"
+    return {
+        "runs": {run.name: run.key for run in runs},
+        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
+        "settings": lasting_settings(settings),
+        "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},
+        "described": {"plant": str(env.plant), "channel": channel},
+        "certificate": certificate.checksum,
+        "certificate_file": certificate.document,
+        "versions": versions(),
+    }

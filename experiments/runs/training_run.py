@@ -22,6 +22,7 @@ from experiments.baselines import controller, tuned_weights
 from experiments.json_values import to_json
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
+from experiments.settings import LearningSettings
 from experiments.settings.arguments import registration_of
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import LARGEST_NUMBER, counted, shown
@@ -333,3 +334,11 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
         return lambda observations, infos: agent.act(observations)
     env, fallback, weights = ncs_env(run.loop.single()), run.certificate.fallback, tuned_weights(run.loop.env, run.arm)
     return controller(run.policy_kind, env, fallback, run.evaluation_seed, weights)
+
+
+def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
+    """Raises what training would raise later if agents cannot be trained with the hyperparameters given."""
+    if settings.hyperparams or settings.conf_file is not None:
+        from agents import training  # imports torch
+
+        training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)

@@ -21,9 +21,16 @@ from experiments.settings.learning import (
     SweepSettings,
     TrainSettings,
 )
-from experiments.settings.settings_file import config_defaults, save_settings, settings_json
+from experiments.settings.settings_file import (
+    INCIDENTAL_SETTINGS,
+    config_defaults,
+    lasting_settings,
+    save_settings,
+    settings_json,
+)
 
 __all__ = [
+    "INCIDENTAL_SETTINGS",
     "Assignments",
     "AttackSettings",
     "AuditSettings",
@@ -42,6 +49,7 @@ __all__ = [
     "TrainSettings",
     "VerifySettings",
     "config_defaults",
+    "lasting_settings",
     "save_settings",
     "settings_json",
 ]

@@ -11,11 +11,14 @@ from typing import Any
 from experiments.errors import SettingsError
 from experiments.json_values import from_json
 from experiments.settings.arguments import id_alone, registration_of
+from experiments.settings.learning import BackendSettings
 from ncs_gym.reading import json_values, read_file
 from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
+# Settings that results do not depend on.
+INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)
 # Settings of one call, which a file neither keeps nor gives: files outside the output folder are the user's to name.
 _OF_THE_CALL = ("config", "conf_file", "force", "page", "quote")
 # Where runs are executed is kept in a file and not taken from it: a file of others must not connect to a cluster.
@@ -37,6 +40,12 @@ def settings_json(command: str, settings: Any) -> dict[str, Any]:
     kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
     environments = {env_id: digest for env_id in ids if (digest := registration_of(env_id))}
     return {"format": FORMAT, "command": command, "settings": kept, "environments": environments}
+
+
+def lasting_settings(settings: Any) -> dict[str, Any]:
+    """Returns the settings of a command that results depend on, JSON values."""
+    kept = settings_json("", settings)["settings"]
+    return {name: value for name, value in kept.items() if name not in INCIDENTAL_SETTINGS}
 
 
 def save_settings(path: Path, command: str, settings: Any) -> None:

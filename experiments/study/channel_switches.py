@@ -11,9 +11,8 @@ from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs.arms import Arm
-from experiments.runs.experiment import certificate_of, run_of_arm
-from experiments.runs.loops import loop_config, registered_env
+from experiments.runs.arms import Arm, run_of_arm
+from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import Assignments, CompareSettings

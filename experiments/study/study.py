@@ -14,14 +14,13 @@ import pandas as pd
 from experiments.analysis.episodes import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
-from experiments.plots.study_figures import study_figures
 from experiments.report.html import render_page
-from experiments.runs.experiment import lasting_settings
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import versions
-from experiments.settings import CompareSettings, StudySettings
+from experiments.settings import CompareSettings, StudySettings, lasting_settings
 from experiments.settings.learning import short_name
 from experiments.study.channel_switches import channel_switches, trained_agents
+from experiments.study.figures import study_figures
 from experiments.study.summary import study_summary
 from experiments.study.tables import (
     QUOTABLE,

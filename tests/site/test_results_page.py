@@ -7,7 +7,7 @@ from unittest import mock
 import pytest
 
 from experiments.plots.figure_style import CaptionedFigure
-from experiments.plots.study_figures import study_figures
+from experiments.study.figures import study_figures
 from experiments.study.study import quoted, results_page, results_tables
 from experiments.study.tables import tables_by_name
 

@@ -9,8 +9,8 @@ from agents.results import Episode
 from experiments.analysis.episodes import arm_summaries, arm_summary, episodes_table
 from experiments.analysis.statistics import clopper_pearson, gaussian_sentences, gaussian_summary, rounded_up
 from experiments.commands.compare import findings_of, gaussian_noise_of
-from experiments.runs.experiment import certificate_of, run_of_arm
-from experiments.runs.loops import loop_config
+from experiments.runs.arms import run_of_arm
+from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 from ncs_gym import Channel, LinearPlant, bound_violation_probability, register_plant

@@ -12,8 +12,8 @@ from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
 from experiments.commands.compare import findings_of, shortened
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import by_arm
-from experiments.runs.experiment import certificate_of, run_of_arm
+from experiments.runs.arms import by_arm, run_of_arm
+from experiments.runs.loops import certificate_of
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings

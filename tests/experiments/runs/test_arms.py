@@ -6,9 +6,8 @@ import pytest
 from agents.hyperparams import DEFAULTS, with_changes
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
 from experiments.baselines import EstimateFilter, tuned_training
-from experiments.runs.arms import Arm
-from experiments.runs.experiment import certificate_of, run_of_arm
-from experiments.runs.loops import loop_config
+from experiments.runs.arms import Arm, run_of_arm
+from experiments.runs.loops import certificate_of, loop_config
 from experiments.settings import CompareSettings
 from experiments.settings.learning import NETWORK_ENVS, TRAINED_ARMS
 from shields import VectorSafetyShield

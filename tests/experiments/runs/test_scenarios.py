@@ -10,7 +10,7 @@ import pytest
 from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.report.text_tables import scenario_text, summary_text
-from experiments.runs.experiment import run_of_arm
+from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
 from experiments.runs.run_store import RunStore
 from experiments.settings import CompareSettings

@@ -3,9 +3,8 @@ import sys
 import pytest
 
 from experiments.__main__ import COMMANDS
-from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.runs.training_run import TrainingRun
-from experiments.settings import BackendSettings
+from experiments.settings import INCIDENTAL_SETTINGS, BackendSettings
 from experiments.settings.learning import CompareSettings, SweepSettings
 from tests.command import assert_one_sentence, ncs
 

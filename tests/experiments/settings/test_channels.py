@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from experiments.commands.sweep import grid_points, loop_at, name_of
-from experiments.runs.experiment import certificate_of, run_of_arm
-from experiments.runs.loops import changed_channel, losses_text
+from experiments.runs.arms import run_of_arm
+from experiments.runs.loops import certificate_of, changed_channel, losses_text
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env

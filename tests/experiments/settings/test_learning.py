@@ -7,8 +7,8 @@ import pytest
 from agents import tuned_hyperparams, tuned_steps
 from agents.hyperparams import DEFAULTS, complete_hyperparams
 from experiments.__main__ import parse
-from experiments.runs.experiment import require_trainable
 from experiments.runs.loops import loop_config
+from experiments.runs.training_run import require_trainable
 from experiments.settings import CompareSettings, SweepSettings, TrainSettings, save_settings
 
 CART_POLE = "ncs_gym/CartPole-v0"

@@ -9,8 +9,8 @@ import pytest
 
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs.experiment import certificate_of, run_of_arm
-from experiments.runs.loops import changed_channel, loop_config
+from experiments.runs.arms import run_of_arm
+from experiments.runs.loops import certificate_of, changed_channel, loop_config
 from experiments.settings import CompareSettings
 from experiments.settings.learning import NETWORK_ENVS
 from experiments.study.channel_switches import SWITCHES, channel_switches, switched, trained_agents

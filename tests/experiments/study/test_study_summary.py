@@ -5,8 +5,8 @@ import pytest
 
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
-from experiments.plots.study_figures import return_figure, study_figures
 from experiments.study.channel_switches import SWITCHES
+from experiments.study.figures import return_figure, study_figures
 from experiments.study.study import quoted
 from experiments.study.summary import (
     PRIMARY,

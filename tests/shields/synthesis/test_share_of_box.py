@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.runs.experiment import certificate_line
+from experiments.report.text_tables import certificate_line
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
 from ncs_gym.plants.past_inputs import inputs_under_way
 from shields import synthesize, verify
