@@ -37,9 +37,9 @@ def observation_space(
 ) -> Box:
     """Returns the finite box of estimate and task entries that can be reached within some steps, float32.
 
-    The reach of x_hat is that of x from the initial set under every input and disturbance within the horizon,
-    plus the certified error. For an unstable plant it ends where one step out of the safe box, or a start, can end
-    (with a downlink c + 1 steps): what runs away further is clipped, so that rescaled observations still say something.
+    The reach of x_hat is where one step out of the safe box, or out of a start, can end (with a downlink c + 1 steps),
+    plus the certified error; of a stable plant also that of x from the initial set under every input and disturbance
+    within the horizon. What runs away further is clipped, so that rescaled observations still say something.
 
     Args:
         plant: The plant.
@@ -59,16 +59,14 @@ def observation_space(
         powers.append(powers[-1] @ plant.A)
     unforced = np.array(powers)
     added = np.abs(unforced[:-1] @ plant.B) @ plant.largest_input + plant.disturbance.support(unforced[:-1])
-    reach = np.vstack([np.zeros(plant.n), added.cumsum(axis=0)]) + initial_set.support(unforced)
+    pushed = np.vstack([np.zeros(plant.n), added.cumsum(axis=0)])
+    in_box = np.where(np.isfinite(plant.reach[: plant.n]), plant.reach[: plant.n], plant.half_widths)
+    near, late = np.maximum(in_box, initial_set.support(np.eye(plant.n))), input_delay + 2
+    reach = (np.abs(unforced[:late]) @ near + pushed[:late]).max(axis=0)
+    if plant.spectral_radius < 1.0:
+        reach = np.maximum(reach, (pushed + initial_set.support(unforced)).max(axis=0))
     errors = np.sqrt(np.diagonal(error_set.shapes, axis1=1, axis2=2).max(axis=0))
-    estimate = reach.max(axis=0) + errors
-    if plant.spectral_radius >= 1.0:
-        in_box = np.where(np.isfinite(plant.reach[: plant.n]), plant.reach[: plant.n], plant.half_widths)
-        known = np.maximum(in_box, initial_set.support(np.eye(plant.n)))
-        for _ in range(input_delay + 1):
-            pushed = np.abs(plant.B) @ plant.largest_input + plant.disturbance.support(np.eye(plant.n))
-            known = np.maximum(known, np.abs(plant.A) @ known + pushed)
-        estimate = np.minimum(estimate, known + errors)
+    estimate = reach + errors
     known = {"age": np.array([float(horizon)]), "error": errors}
     more = [known[name] for name in observe]
     own = task.observation_bound(plant, horizon)

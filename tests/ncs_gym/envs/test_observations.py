@@ -186,19 +186,23 @@ def test_spec_with_a_certificate_and_observations_is_json(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "limits",
+    ("growth", "limits"),
     [
-        {"state_limits": ([-0.5, -1.0], [9.0, 2.0]), "input_limits": (-2.0, 1.0)},
-        {"box": [[0.5, 0.5], [0.5, -0.5]], "u_max": 2.0},
+        (1.0, {"state_limits": ([-0.5, -1.0], [9.0, 2.0]), "input_limits": (-2.0, 1.0)}),
+        (1.0, {"box": [[0.5, 0.5], [0.5, -0.5]], "u_max": 2.0}),
+        (0.9, {"box": [5.0, 4.0], "u_max": 0.01}),
     ],
-    ids=["two ends", "sums"],
+    ids=["two ends", "sums", "stable and hardly moved by its input"],
 )
-def test_estimates_in_the_safe_box_are_observed_as_they_are(limits):
-    """The plant is unstable, so that observations are clipped somewhere: not at the corners of its box."""
+def test_estimates_in_the_safe_box_and_one_step_out_of_it_are_observed_as_they_are(growth, limits):
     quiet = {"disturbance_bound": 0.01, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[1.02, 0.1], [0.0, 1.01]], B=[[0.5], [0.2]], dt=1.0, **limits, **quiet)
+    plant = LinearPlant(A=[[growth * 1.02, 0.1], [0.0, growth * 1.01]], B=[[0.5], [0.2]], dt=1.0, **limits, **quiet)
     env = NCSEnv(plant=plant, channel=Channel(), contract=ChannelContract(0))
     for ends in product(*plant.box_ends.T):
         corner = np.linalg.solve(plant.box, ends)
         observation, _ = env.reset(seed=0, options={"state": corner})
         np.testing.assert_allclose(observation, corner, rtol=1e-6, atol=1e-6)
+        for action in (-1.0, 1.0):
+            env.reset(seed=0, options={"state": corner})
+            observation, *_, info = env.step(np.array([action], np.float32))
+            np.testing.assert_allclose(observation, info["estimate"], rtol=1e-6, atol=1e-6)
