@@ -26,8 +26,8 @@ from ncs_gym.network.requests import spare_samples
 from ncs_gym.validation import counted
 from shields import Certificate, Network, Requirement, Requirements
 from shields.json_documents import digest
-from shields.synthesis.network_requirements import LargestAge, kind_of_share, largest_age
-from shields.synthesis.requirement_search import Answer, Search
+from shields.synthesis.network_requirements import LargestAge, kind_of_share
+from shields.synthesis.requirement_search import Answer, Search, contract_of_age
 
 _DEFAULT_ENV = "ncs_gym/CartPole-v0"
 # Steps between samples, and losses in a row, that are asked about by default.
@@ -218,12 +218,16 @@ class _SearchRun:
         return _SearchResult(tuple(_StoredAnswer.of(age, answer) for age, answer in answers.items()))
 
     def require(self, result: _SearchResult) -> None:
-        """Raises ValueError unless every certificate is one of its age and verifies."""
-        for age, answer in result.answers.items():
+        """Raises ValueError unless all ages have an answer, and every certificate is one of its age and verifies."""
+        answers, search = result.answers, self.search
+        if missing := set(search.certain) - set(answers):
+            raise ValueError(f"no answer for age {min(missing):g}")
+        for age, answer in answers.items():
             found = answer.certificate
             if found is None:
                 continue
-            if largest_age(found.contract) != age or not shields.verify(found, self.search.plant).valid:
+            is_of_age = found.contract == contract_of_age(age, search.quantization_step)
+            if not (is_of_age and shields.verify(found, search.plant).valid):
                 raise ValueError(f"no certificate of this plant for age {age:g}")
 
 

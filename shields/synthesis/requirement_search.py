@@ -56,6 +56,11 @@ class Search:
     tolerance: bool = False
 
     @property
+    def certain(self) -> tuple[float, ...]:
+        """The ages that have an answer in any case."""
+        return self.ages
+
+    @property
     def count(self) -> int:
         """How many parts of it are reported."""
         return len(self.ages)
@@ -74,7 +79,7 @@ class Search:
             if answers and last is None:
                 answers[age] = Answer(None, searched=False)
             else:
-                last = nearby_certificate(self.plant, _contract(age, self.quantization_step), last)
+                last = nearby_certificate(self.plant, contract_of_age(age, self.quantization_step), last)
                 factor = None if last is None or not self.tolerance else self._tolerance(age, last)
                 answers[age] = Answer(last, tolerance=factor)
             report(1)
@@ -82,13 +87,13 @@ class Search:
 
     def _tolerance(self, age: float, certificate: Certificate) -> float:
         """Returns nearly the largest factor on all radii for which a certificate verifies; at least 1."""
-        margin = margin_of(self.plant, _contract(age, self.quantization_step))
+        margin = margin_of(self.plant, contract_of_age(age, self.quantization_step))
         for share in _FACTOR_STEPS:
             factor = float(f"{share * margin:.3g}")
             if factor <= 1.0:
                 break
             plant = with_radii(self.plant, disturbance=factor, noise=factor)
-            if nearby_certificate(plant, _contract(age, self.quantization_step), certificate, 0) is not None:
+            if nearby_certificate(plant, contract_of_age(age, self.quantization_step), certificate, 0) is not None:
                 return factor
         return 1.0
 
@@ -102,6 +107,11 @@ class BoundarySearch(Search):
     """
 
     start: Certificate
+
+    @property
+    def certain(self) -> tuple[float, ...]:
+        """None: which ages are asked depends on what is found."""
+        return ()
 
     @property
     def count(self) -> int:
@@ -133,7 +143,7 @@ class BoundarySearch(Search):
         report(0)  # the caller may end the search here, and after every age
         while high - low > 1 and low < self._oldest:
             age = min(2 * low + 1, self._oldest) if high == inf else (low + int(high)) // 2
-            certificate = nearby_certificate(self.plant, _contract(age, self.quantization_step), best)
+            certificate = nearby_certificate(self.plant, contract_of_age(age, self.quantization_step), best)
             answers[age] = Answer(certificate)
             if certificate is None:
                 high = age
@@ -145,7 +155,7 @@ class BoundarySearch(Search):
         return answers
 
 
-def _contract(age: float, quantization_step: float) -> ChannelContract | None:
+def contract_of_age(age: float, quantization_step: float) -> ChannelContract | None:
     """Returns the contract of an age; None if it is infinite."""
     return None if age == inf else ChannelContract(int(age), quantization_step)
 
@@ -328,7 +338,7 @@ def _never_less(groups: dict[_Group, _Ages]) -> None:
         for answer in sorted(harder, key=lambda each: share_of(each.certificate), reverse=True):
             if answer.certificate is None or share_of(answer.certificate) <= share_of(own.certificate):
                 break
-            certificate = carried_over(answer.certificate, group.plant, _contract(age, key.quantization_step))
+            certificate = carried_over(answer.certificate, group.plant, contract_of_age(age, key.quantization_step))
             if certificate is not None:
                 own = own._replace(certificate=certificate)
                 break

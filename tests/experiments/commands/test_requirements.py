@@ -51,7 +51,7 @@ def test_requirements_leave_table_figure_certificates_and_are_resumed(plant_file
     assert again.stdout == first.stdout
 
 
-@pytest.mark.parametrize("forged", ["age", "plant", "altered"])
+@pytest.mark.parametrize("forged", ["age", "plant", "altered", "missing"])
 def test_certificates_of_stored_searches_are_verified_again(forged, plant_file, tmp_path, without_workers):
     arguments = ("requirements", "--plant", plant_file, "--send-periods", 1, "--losses", 3, "--out", tmp_path / "r")
     assert ncs(*arguments).returncode == 0
@@ -59,7 +59,9 @@ def test_certificates_of_stored_searches_are_verified_again(forged, plant_file, 
     document = json.loads(file.read_text())["run"]
     (answer,) = document["result"]["found"]
     if forged == "age":
-        answer["age"] = 2
+        answer["certificate"] = certificate_for(LinearPlant.load(plant_file), ChannelContract(2)).document
+    elif forged == "missing":
+        document["result"]["found"] = []
     elif forged == "plant":
         answer["certificate"] = certificate_for(
             gym.make("ncs_gym/CSTR-v0").unwrapped.plant, ChannelContract(3)
@@ -70,7 +72,8 @@ def test_certificates_of_stored_searches_are_verified_again(forged, plant_file, 
     again = ncs(*arguments)
     assert again.returncode == 2
     assert "is no result of its run" in again.stderr
-    assert {"age": "for age 2", "plant": "for age 3", "altered": "checksum does not match"}[forged] in again.stderr
+    words = {"altered": "checksum does not match", "missing": "no answer for age 3"}
+    assert words.get(forged, "no certificate of this plant for age 3") in again.stderr
 
 
 def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file, tmp_path, without_workers):
