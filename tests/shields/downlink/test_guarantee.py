@@ -14,11 +14,10 @@ from ncs_gym import (
     LinearPlant,
     NCSEnv,
     NCSVectorEnv,
-    Packet,
     cart_pole,
     truck_trailer,
 )
-from ncs_gym.network import CommittedInputs, downlink_protocol
+from ncs_gym.network import downlink_protocol
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
@@ -26,7 +25,6 @@ from shields.runtime.guarantee import (
     FAR_OUT,
     LARGE_ERROR,
     LATE_INPUT,
-    NO_DOWNLINK_CONTRACT,
     NOT_KNOWN_INSIDE,
     OLD_SAMPLE,
     OTHER_INPUT,
@@ -44,7 +42,7 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
-from tests.shields.attacks.cases import behind, harmful
+from tests.shields.attacks.cases import behind
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
@@ -62,58 +60,6 @@ def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
 
 def levels(shield, info):
     return shield.certificate.safe_set.gauge(info["state"])
-
-
-def test_a_broken_downlink_ends_the_guarantee_in_the_step_in_which_zero_is_applied():
-    shield = shielded(downlink=Channel(loss=0.4, delay=1), downlink_contract=ChannelContract(3))
-    ended = 0
-    for seed in range(6):
-        _, info = shield.reset(seed=seed)
-        assert info["shield_guaranteed"]
-        broken = False
-        for _ in range(100):
-            *_, info = shield.step(np.array([0.3]))
-            broken |= info["downlink_broken"]
-            assert info["shield_guaranteed"] == (not broken)
-            assert info["shield_reason"] == (LATE_INPUT if broken else "")
-            assert not info["downlink_broken"] or not info["input"].any()
-        ended += broken
-    assert ended >= 3  # three losses in a row within 100 steps
-
-
-def test_a_downlink_without_a_contract_is_simulated_and_never_guaranteed():
-    shield = shielded(downlink=Channel(loss=0.1))
-    _, info = shield.reset(seed=0)
-    assert info["shield_reason"] == NO_DOWNLINK_CONTRACT
-    for _ in range(50):
-        *_, info = shield.step(np.array([0.3]))
-        assert info["shield_reason"] in (NO_DOWNLINK_CONTRACT, LATE_INPUT)
-    vector = VectorSafetyShield(NCSVectorEnv(3, plant=PLANT, downlink=Channel(loss=0.1)), certificate_of(PLANT))
-    assert not vector.reset(seed=0)[1]["shield_guaranteed"].any()
-    assert not vector.step(np.zeros((3, 1)))[4]["shield_guaranteed"].any()
-
-
-def test_no_state_outside_is_guaranteed_wherever_an_episode_starts():
-    """Starts all over the box: some are not covered, and a guarantee that begins later begins for the present."""
-    certificate, late, never = certificate_of(PLANT), 0, 0
-    for downlink in (Channel(delay=3), KEPT):
-        env = NCSVectorEnv(
-            40, plant=PLANT, channel=UPLINK, downlink=downlink, disturbance="adversarial", max_episode_steps=30
-        )
-        shield = VectorSafetyShield(env, certificate)
-        rng = np.random.default_rng(0)
-        for seed in range(5):
-            starts = rng.uniform(-1, 1, (40, 2)) * PLANT.half_widths
-            _, info = shield.reset(seed=seed, options={"state": starts})
-            first = info["shield_guaranteed"]
-            for step in range(25):
-                outside = certificate.safe_set.gauge(info["state"]) > 1.0
-                assert not (outside & info["shield_guaranteed"]).any()
-                late += np.count_nonzero(~first & info["shield_guaranteed"]) * (step == 24)
-                *_, info = shield.step(rng.uniform(-1, 1, (40, 1)))
-            never += np.count_nonzero(~first)
-    assert never > 0
-    assert late > 0
 
 
 @pytest.mark.parametrize(("input_delay", "size"), [(1, 1.001), (1, 1.1), (3, 1.001), (3, 1.2)])
@@ -349,28 +295,6 @@ def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     assert kept > 3
 
 
-@pytest.mark.parametrize("mode", ["project", "lookahead"])
-@pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
-def test_vector_shield_keeps_its_guarantee_through_resets(mode, autoreset):
-    case = behind(PLANT, (UPLINK, KEPT))
-    worst = {"noise": "extreme", "disturbance": harmful(PLANT), "initial_set": Ellipsoid(0.09 * case.certificate.L)}
-    settings = {"channel": UPLINK, "downlink": KEPT, "max_episode_steps": 9, "autoreset_mode": autoreset}
-    env = NCSVectorEnv(12, plant=PLANT, **settings, **worst)
-    shield = VectorSafetyShield(env, case.certificate, mode)
-    _, info = shield.reset(seed=0)
-    assert info["shield_guaranteed"].all()
-    rng = np.random.default_rng(0)
-    for step in range(60):
-        if step == 31:
-            _, info = shield.reset(options={"reset_mask": np.arange(12) % 3 == 0})
-            assert info["shield_guaranteed"].all(), set(info["shield_reason"])
-        *_, truncated, info = shield.step(rng.uniform(-1, 1, (12, 1)))
-        assert info["shield_guaranteed"].all(), set(info["shield_reason"])
-        if autoreset == "SameStep" and truncated.any():
-            assert info["final_info"]["shield_guaranteed"][truncated].all()
-    assert env.episodes.min() > 5
-
-
 def test_resetting_some_environments_makes_no_other_wait_less():
     waits = []
     for others in (0, 3):
@@ -446,16 +370,6 @@ def test_safe_loop_estimates_with_what_the_actuator_says_it_applied():
         assert loop.guaranteed == (told is None)
 
 
-def test_safe_loop_sends_only_what_was_decided_and_is_never_guaranteed_without_a_contract():
-    loop = SafeLoop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(loss=0.4))
-    loop.start(np.zeros(2))
-    assert loop.reason == NO_DOWNLINK_CONTRACT
-    loop.step(0.1)
-    assert loop.command().stamp == 0
-    loop.receive([Packet(1, np.zeros(2))])
-    assert not loop.guaranteed
-
-
 def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
     actuator = Actuator(2, 1)
     plain = SafeLoop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(delay=2))
@@ -476,14 +390,6 @@ def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
     actuator.receive(commands)
     np.testing.assert_array_equal(actuator.apply(4), 0.0)
     assert actuator.missing
-
-
-def test_a_schedule_hands_out_what_was_decided_c_steps_ago():
-    schedule = CommittedInputs(2, 1)
-    assert [schedule.due([float(k)]) for k in range(1, 5)] == [[0.0], [0.0], [1.0], [2.0]]
-    schedule.start()
-    assert schedule.due([9.0]) == [0.0]
-    assert LATE_INPUT in EXPLANATIONS
 
 
 def test_another_process_than_the_plants_equations_may_move_behind_a_downlink():
