@@ -184,14 +184,6 @@ def test_controller_that_starts_in_the_middle_claims_nothing_until_samples_tell_
     assert np.abs(PLANT.box_rows @ world.state).max() <= 1.0
 
 
-def test_wrong_first_estimate_that_is_claimed_to_be_known_is_no_longer_the_only_way():
-    loop = loop_with(downlink=None)
-    loop.start(np.zeros(4))
-    assert loop.guaranteed  # a claim, which may be wrong
-    loop.start(np.zeros(4), known=False)
-    assert not loop.guaranteed
-
-
 @pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False), truck_trailer()])
 def test_first_estimate_holds_what_it_claims_against_the_worst_disturbance_and_noise(plant):
     """The claim is attacked by the extreme disturbances and noises of one direction of the error."""

@@ -149,15 +149,6 @@ def test_measurement_of_one_output_may_be_a_number():
     assert loops[0].measurement_age == 0
 
 
-def test_measurement_that_is_not_finite_is_an_alarm():
-    loop = started(channel=Channel())
-    loop.step(0.0)
-    loop.step(0.0, [Packet(1, [np.nan, 0.0])])
-    assert loop.reason == NOT_FINITE
-    loop.start([0.0, 0.0])
-    assert loop.guaranteed
-
-
 @pytest.mark.parametrize("value", [0.25, np.nan])
 @pytest.mark.parametrize("order", [(0, 1), (1, 0), (0, None, 1)])
 def test_another_value_of_a_sample_ends_the_guarantee_whatever_comes_first(order, value):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym import LinearPlant
 from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
@@ -24,47 +24,11 @@ def many(shield, estimates, shapes, inputs):
     return shield.decide_columns(estimates.T, shield.errors_of_many(shapes), inputs.T)
 
 
-def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
-    """Largest x+' M x+ over the states the estimate allows and all disturbances, by ascent from many starts."""
-    M, D = certificate.M, plant.disturbance.shape_matrix
-    center = plant.A @ estimate + plant.B @ u
-    e, d = Ellipsoid(shape).sample_boundary(rng, tries), plant.disturbance.sample_boundary(rng, tries)
-    for _ in range(40):
-        slopes = (center - e @ plant.A.T + d) @ M
-        e, d = farthest(shape, -slopes @ plant.A), farthest(D, slopes)
-    ends = center - e @ plant.A.T + d
-    return float(np.einsum("ki,ij,kj->k", ends, M, ends).max())
-
-
-def farthest(shape, directions):
-    """The points of E(shape) farthest in each direction, rows of shape (k, n)."""
-    images = directions @ shape
-    return images / np.sqrt(np.einsum("ki,ki->k", directions, images))[:, None]
-
-
 @pytest.fixture(scope="module", params=[(2, 1), (4, 3), pytest.param((3, 2), marks=pytest.mark.slow)], ids=str)
 def case(request):
     n, m = request.param
     plant = random_plant(3, n, m)
     return plant, certificate_of(plant)
-
-
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
-def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
-    plant, certificate = case
-    shield, rng = SafetyFilter(certificate, plant, mode), np.random.default_rng(0)
-    passed = projected = 0
-    for _ in range(75):
-        estimate = 1.4 * certificate.safe_set.sample(rng)
-        shape = certificate.Sigma * rng.uniform(0.05, 1.0)
-        decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random())
-        projected += decision.reason == "projected"
-        assert (np.abs(decision.input) <= plant.u_max).all()
-        if decision.passed:
-            passed += 1
-            assert worst_next_level(certificate, plant, estimate, shape, decision.input, rng) <= 1.0
-    assert passed > 10
-    assert (projected > 2) is (mode == "project")
 
 
 def test_an_input_that_passes_is_returned_untouched(case):
@@ -117,14 +81,6 @@ def test_switch_falls_back_to_the_gain(case):
             expected = np.clip(certificate.K @ estimate, -plant.u_max, plant.u_max)
             np.testing.assert_allclose(decision.input, expected, atol=1e-6 * plant.u_max.max())
     assert seen > 10
-
-
-def test_fallback_within_the_assumptions_needs_no_clipping(case):
-    plant, certificate = case
-    rng = np.random.default_rng(3)
-    for _ in range(300):
-        x, e = certificate.safe_set.sample_boundary(rng), certificate.error_set.sample_boundary(rng)
-        assert (np.abs(certificate.K @ (x + e)) <= plant.u_max).all()
 
 
 @pytest.mark.parametrize(
