@@ -100,13 +100,6 @@ def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name)
         assert not verify_again(each, claims).valid
 
 
-def test_certificate_of_the_plant_without_the_limit_is_none_of_the_plant_with_it():
-    plant = PLANTS["coupled"]
-    found = certificate_of(replace(plant, mixed_rows=None, mixed_ends=None), CONTRACT, "polytope")
-    assert not verify(found, plant).valid
-    assert not verify(replace(found, fingerprint=plant.fingerprint), plant).valid
-
-
 def test_stable_plant_with_limits_of_rates_needs_no_contract():
     plant = PLANTS["rates"]
     assert plant.spectral_radius < 1.0
@@ -206,7 +199,6 @@ def test_file_and_fingerprint_hold_the_limits(tmp_path):
         np.testing.assert_array_equal(again.mixed_rows, plant.mixed_rows)
         np.testing.assert_array_equal(again.mixed_ends, plant.mixed_ends)
         assert replace(plant, mixed_ends=1.01 * plant.mixed_ends).fingerprint != plant.fingerprint
-        certificate(name).save(tmp_path / "certificate.json")
     without = replace(PLANTS["coupled"], mixed_rows=None, mixed_ends=None)
     assert "mixed_rows" not in without.document["plant"]
     open_end = replace(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])

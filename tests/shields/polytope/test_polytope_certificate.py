@@ -17,7 +17,7 @@ from ncs_gym import AdversarialDisturbance, LinearPlant, cart_pole
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import CART_POLE_CHANNEL
-from shields import Certificate, VectorSafetyShield, synthesize, verify
+from shields import VectorSafetyShield, synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
@@ -136,18 +136,6 @@ def test_interrupted_search_for_a_gain_keeps_the_polytope_of_the_first_gain():
     with pytest.raises(SynthesisInterrupted, match="the first gain's") as interrupted:
         with_largest_polytope(certificate, plant, interrupt)
     assert interrupted.value.certificate == wide
-
-
-def test_file_holds_the_polytope_and_one_without_is_as_before(tmp_path):
-    wide, certificate, plant = found("BatchReactor")
-    wide.save(tmp_path / "wide.json")
-    again = Certificate.load(tmp_path / "wide.json")
-    assert again == wide != certificate
-    np.testing.assert_array_equal(again.polytope.multipliers, wide.polytope.multipliers)
-    assert again.polytope.F.shape == (2 * len(wide.polytope.rows), plant.n)
-    assert "polytope" not in certificate.document["certificate"]
-    assert "the polytope" in str(again)
-    assert "the polytope" not in str(certificate)
 
 
 def test_default_has_a_polytope_around_the_same_ellipsoid_bit_for_bit():
