@@ -151,23 +151,6 @@ def test_what_is_no_plan_counts_as_none_of_many_loops_too(least, wrong):
     assert np.isnan(decided.plan).all()
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"least_safe_steps": 3}, "least_safe_steps is for mode \"lookahead\", mode 'project' takes none"),
-        ({"mode": "lookahead", "least_safe_steps": 6, "horizon": 6}, "takes plans of 7 steps, got horizon = 6"),
-        ({"mode": "lookahead", "least_safe_steps": 50}, "least_safe_steps must be a whole number"),
-        ({"mode": "lookahead", "least_safe_steps": -1}, "least_safe_steps must be a whole number"),
-        ({"mode": "lookahead", "least_safe_steps": 2.5}, "least_safe_steps must be a whole number"),
-        ({"least_safe_steps": False}, "least_safe_steps must be a whole number"),
-        ({"mode": "lookahead", "least_safe_steps": None}, "least_safe_steps must be a whole number"),
-    ],
-)
-def test_wrong_numbers_of_steps_are_refused(given, message):
-    with pytest.raises(ValueError, match=message):
-        SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), **given)
-
-
 def test_numbers_of_numpy_are_those_of_a_spec():
     counts = {"least_safe_steps": np.int64(3), "horizon": np.int64(6)}
     env = SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), mode="lookahead", **counts)
