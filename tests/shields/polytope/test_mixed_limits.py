@@ -179,18 +179,6 @@ def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it_also_whe
         assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
 
 
-def test_loop_without_gymnasium_knows_the_limit():
-    plant, found = PLANTS["rates"], certificate("rates")
-    loop = SafeLoop(found, plant, CHANNEL)
-    loop.start(found.resting_state)
-    last = found.resting_state[2:]
-    for k in range(20):
-        decision = loop.decide(plant.input_high if k % 2 else plant.input_low)
-        assert np.abs(decision.input - last).max() <= 0.3
-        last = decision.input
-        loop.receive()
-
-
 def test_file_and_fingerprint_hold_the_limits(tmp_path):
     for name, plant in MIXED.items():
         plant.save(tmp_path / "plant.json")
