@@ -373,16 +373,7 @@ def test_half_widths_and_roots_are_upper_bounds():
 
 
 def test_plant_with_an_oblique_box_has_a_polytope():
-    plant = LinearPlant(
-        A=[[0.9, 0.2], [0.0, 0.8]],
-        B=[[0.0], [0.3]],
-        box=np.array([[1.0, 0.5], [-0.5, 1.0], [0.4, 0.4]]),
-        u_max=1.0,
-        dt=0.1,
-        gamma=1e-4,
-        measurement_noise_cov=1e-5 * np.eye(2),
-        initial_cov=1e-5 * np.eye(2),
-    )
+    plant = small_plant(box=np.array([[1.0, 0.5], [-0.5, 1.0], [0.4, 0.4]]))
     wide = synthesize(plant, safe_set="polytope")
     assert wide.polytope is not None
     assert verified(wide, plant).valid
