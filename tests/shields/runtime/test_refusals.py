@@ -125,6 +125,7 @@ NO_MODEL = r"needs an NCSEnv inside, got PendulumEnv, which has no linear model 
 SHIELDS = (partial(SafetyShield, SCALAR), partial(VectorSafetyShield, VECTOR))
 THIRTEEN = LinearPlant(B=np.ones((2, 13)), u_max=1.0, **STABLE)
 NONSENSE = torch.full((2, 2), np.nan)
+COARSE = (torch.float16, torch.bfloat16, torch.float8_e4m3fn)
 # What is called, the error, and words of its message.
 REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Shields: what they wrap.
@@ -236,6 +237,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
             (r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)", ONE, torch.zeros(3, 2)),
             (r"error_shapes must have shape \(2, 2\) or \(2, 2, 2\)", ONE, NONE, torch.zeros(3, 2, 2)),
             ("estimates must be numbers, got str", ONE, "estimates"),
+            ("estimates must be real numbers, got complex64", ONE, NONE.to(torch.complex64)),
+            ("actions must be numbers, got Tensor.* the meta device", ONE.to("meta"), NONE),
+            ("estimates must be float32 or float64, got float16", ONE, np.zeros((2, 2), np.float16)),
+            *((f"estimates must be float32 or float64, got {kind}", ONE, NONE.to(kind)) for kind in COARSE),
+            *((f"error_shapes must be float32 or float64, got {kind}", ONE, NONE, NONE.to(kind)) for kind in COARSE),
             ("estimates must", ONE, None),
         )
     ],
