@@ -1,4 +1,3 @@
-import pickle
 from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
@@ -69,20 +68,6 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
     assert checked > 10
 
 
-def test_switch_falls_back_to_the_gain(case):
-    plant, certificate = case
-    shield, rng = SafetyFilter(certificate, plant, "switch"), np.random.default_rng(2)
-    seen = 0
-    for _ in range(100):
-        estimate = 1.3 * certificate.safe_set.sample(rng)
-        decision = shield.decide(estimate, certificate.Sigma, plant.u_max * np.sign(rng.standard_normal(plant.m)))
-        if decision.fallback:
-            seen += 1
-            expected = np.clip(certificate.K @ estimate, -plant.u_max, plant.u_max)
-            np.testing.assert_allclose(decision.input, expected, atol=1e-6 * plant.u_max.max())
-    assert seen > 10
-
-
 @pytest.mark.parametrize(
     "proposed",
     [
@@ -103,7 +88,7 @@ def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
     np.testing.assert_allclose(decision.input, certificate.K @ estimate, atol=1e-6)
 
 
-@pytest.mark.parametrize("estimate", [np.array([np.nan, 0.0]), np.zeros(3), np.array([np.inf, 0.0])])
+@pytest.mark.parametrize("estimate", [np.array([np.nan, 0.0]), np.array([np.inf, 0.0]), *map(np.zeros, (3, (2, 1)))])
 def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estimate):
     decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, np.ones(1))
     assert decision.reason == "invalid"
@@ -118,6 +103,8 @@ UNUSABLE_SHAPES = [
     -np.eye(2),
     np.array([[0.01, 5.0], [5.0, 0.01]]),
     np.array([[0.1, 0.5], [0.0, 0.1]]),
+    1e-4 * np.ones(2),
+    1e-4 * np.eye(2).ravel(),
     "none",
 ]
 
@@ -223,6 +210,7 @@ def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loade
     shield = SafetyFilter(certificate, loaded)
     assert np.isnan(shield.margin(np.zeros(2), certificate.Sigma, np.zeros(3)))
     assert np.isnan(shield.margin(np.array([np.nan, 0.0]), certificate.Sigma, np.zeros(1)))
+    assert np.isnan(shield.margin(np.zeros(2), 1e-4 * np.eye(3), np.zeros(1)))
     assert shield.margin([0.0, 0.0], certificate.Sigma.tolist(), [0.0]) > 0.0
     assert not shield.knows_inside(np.array([np.nan, 0.0]), certificate.Sigma)
     assert not shield.knows_inside(np.zeros(2), -certificate.Sigma)
@@ -396,15 +384,6 @@ def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
     assert shield.errors_of(0.05 * Sigma) is first
     shield.errors_of(2.0 * Sigma)  # one too many
     assert shield.errors_of(0.05 * Sigma) is not first
-
-
-def test_a_filter_decides_the_same_after_pickling(certificate, loaded):
-    shield = SafetyFilter(certificate, loaded)
-    case = np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0])
-    for twin in (shield, pickle.loads(pickle.dumps(shield))):
-        first, second = twin.decide(*case), pickle.loads(pickle.dumps(twin)).decide(*case)
-        assert first[1:6] == second[1:6]
-        np.testing.assert_array_equal(first.input, second.input)
 
 
 def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
