@@ -103,6 +103,13 @@ def stepped(shield: Any, **options: Any) -> None:
     shield.step(np.zeros(shield.action_space.shape))
 
 
+def acted(shield: Any, value: float) -> None:
+    """Steps a shield in an episode."""
+    made = shield(CERTIFICATE)
+    made.reset(seed=0)
+    made.step(np.full(made.action_space.shape, value))
+
+
 def node_of(**settings) -> ControllerNode:
     """A controller of a loop with these settings."""
     loop = SafeLoop(OF_CART, CART, Channel(), **settings)
@@ -177,6 +184,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: stepped(SafetyShield(NCSEnv(PLANT), CERTIFICATE)), gym.error.ResetNeeded, "reset"),
     (lambda: stepped(SafetyShield(NCSEnv(PLANT), CERTIFICATE), bad=1), gym.error.ResetNeeded, "reset"),
     (lambda: stepped(VectorSafetyShield(NCSVectorEnv(2, plant=PLANT), CERTIFICATE)), gym.error.ResetNeeded, "reset"),
+    *[
+        (partial(acted, shield, value), ValueError, "must be finite with shape")
+        for shield in SHIELDS
+        for value in (np.nan, np.inf)
+    ],
     # Environments.
     (lambda: gym.make(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
     (lambda: gym.make_vec(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),

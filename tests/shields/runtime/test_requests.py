@@ -7,16 +7,19 @@ from ncs_gym import (
     Actuator,
     Channel,
     ChannelContract,
+    NCSVectorEnv,
     Packet,
     cart_pole,
     lane_keeping,
     truck_trailer,
 )
-from shields import SafeLoop
+from shields import SafeLoop, VectorSafetyShield
 from tests.certificates import certificate_of
 
 PLANT = cart_pole()
+CHANNEL = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
 CONTRACT = ChannelContract(9, 1e-4)
+DOWNLINK = Channel(0.5, delay=1, max_consecutive_losses=1)
 
 
 def test_commands_carry_requests_to_the_actuator():
@@ -74,3 +77,18 @@ def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, con
             packets |= {} if lost else {step + 1 + late.delay: [sample]}
     assert max(ages) == contract.max_age
     assert len(ages) > 50
+
+
+@pytest.mark.parametrize("downlink", [None, DOWNLINK])
+def test_shield_keeps_its_set_whatever_is_asked_for(downlink):
+    env = NCSVectorEnv(40, plant=PLANT, channel=CHANNEL, contract=CONTRACT, downlink=downlink, disturbance="sphere")
+    shield, rng = VectorSafetyShield(env, certificate_of(PLANT, env.certificate_contract)), np.random.default_rng(0)
+    shield.reset(seed=0)
+    packets = 0
+    for _ in range(150):
+        env.request(rng.random(40) < 0.05)
+        *_, info = shield.step(rng.uniform(-1.0, 1.0, (40, 1)))
+        packets = info["packets"].mean()
+        assert info["shield_guaranteed"].all()
+        assert info["episode_violations"].sum() == 0
+    assert packets < 100
