@@ -14,6 +14,7 @@ from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
 from tests.shields.attacks.adversary import farthest
 from tests.shields.attacks.cases import case as attacked_case
+from tests.shields.edges import edge_of
 
 STEPS = 5
 NAMES = (
@@ -213,16 +214,6 @@ def exact_reach(plant, row, x_hat, shape, plan):
     spread = root_of(quadratic(pulls[-1], rational(shape))) + sum(root_of(quadratic(p, D)) for p in pulls[:-1])
     with localcontext(prec=50):
         return abs(Decimal(center.numerator) / Decimal(center.denominator)) + spread
-
-
-def edge_of(passes, high):
-    """The largest number found that passes, by bisection from 0, which must."""
-    low = 0.0
-    assert passes(low)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if passes(middle) else (low, middle)
-    return low
 
 
 QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}

@@ -42,6 +42,7 @@ from shields.verification.rational_matrix import (
 )
 from tests.certificates import certificate_of
 from tests.shields.attacks.cases import behind
+from tests.shields.edges import edge_of
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
@@ -127,14 +128,11 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
     shield, M = SafetyFilter(certificate, plant), rational(certificate.M)
     *_, axes = np.linalg.svd(plant.A)
     for _ in range(count):
-        base, low, high = axes[1] * size * rng.uniform(0.5, 1.0), 0.0, 4.0
-        for _ in range(50):  # to the edge of what is known to be inside
-            middle = 0.5 * (low + high)
-            inside = starts_known(shield, base + middle * axes[0], 1)[1].in_safe_set
-            low, high = (middle, high) if inside else (low, middle)
-        if low > 0.0:
+        base = axes[1] * size * rng.uniform(0.5, 1.0)
+        way = edge_of(lambda x, base=base: starts_known(shield, base + x * axes[0], 1)[1].in_safe_set, 4.0)
+        if way > 0.0:
             known += 1
-            moved = multiply(rational(plant.A), rational((base + low * axes[0])[:, None]))
+            moved = multiply(rational(plant.A), rational((base + way * axes[0])[:, None]))
             assert quadratic(transpose(moved), M) <= 1
     assert known > count // 2
 
@@ -149,13 +147,9 @@ def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_t
     shield, A, L = SafetyFilter(certificate, plant), rational(plant.A), rational(certificate.L)
     for _ in range(count):
         long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
-        low, high = 0.0, 16.0
-        for _ in range(50):  # to the edge of what is known to be inside
-            middle = 0.5 * (low + high)
-            inside = starts_known(shield, Ellipsoid(long + middle * THIN), 1)[1].in_safe_set
-            low, high = (middle, high) if inside else (low, middle)
-        assert low > 0.1
-        assert is_positive_semidefinite(subtract(L, congruence(A, rational(long + low * THIN))))
+        width = edge_of(lambda x, long=long: starts_known(shield, Ellipsoid(long + x * THIN), 1)[1].in_safe_set, 16.0)
+        assert width > 0.1
+        assert is_positive_semidefinite(subtract(L, congruence(A, rational(long + width * THIN))))
 
 
 @pytest.mark.parametrize("many", [False, True])

@@ -10,6 +10,7 @@ from shields import SafetyFilter
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.shields.edges import edge_of
 
 PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
     f"{n}, {m}": random_plant(3, n, m) for n, m in ((2, 1), (3, 2), (4, 3))
@@ -264,12 +265,9 @@ def test_error_shapes_are_enlarged_by_the_rounding_of_moving_them():
 def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
     plant = PLANTS[key]
     shield = SafetyFilter(certificate_of(plant), plant)
-    still, u, low, high = np.zeros((plant.n, 1)), np.zeros(plant.m), 0.0, 1e6
-    for _ in range(80):  # to an error ellipsoid whose h is 5e-6 below 1
-        middle = 0.5 * (low + high)
-        radius = shield.errors_of(middle * np.eye(plant.n)).radius
-        low, high = (middle, high) if radius > 5e-6 else (low, middle)
-    shape = low * np.eye(plant.n)
+    still, u = np.zeros((plant.n, 1)), np.zeros(plant.m)
+    # An error ellipsoid whose h is 5e-6 below 1.
+    shape = edge_of(lambda size: shield.errors_of(size * np.eye(plant.n)).radius > 5e-6, 1e6, 80) * np.eye(plant.n)
     assert 4e-6 < shield.errors_of(shape).radius < 6e-6
     sets = shield.test.reachable(still, shield.errors_of(shape).batch())
     np.testing.assert_array_equal([sets.radius, *sets.margins(u[:, None])], 0.0)

@@ -11,6 +11,7 @@ from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.shields.attacks.cases import RANDOM
+from tests.shields.edges import edge_of
 from tests.shields.runtime.batches import decided_alike
 
 TWO_STATES = random_plant(3, 2, 1)
@@ -288,13 +289,9 @@ def test_boundary_trusts_weak_inputs_of_larger_plants_too():
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
     shield = SafetyFilter(certificate, loaded, "switch")
     shape = 0.1 * certificate.Sigma
-    low, high = 0.0, 4.0  # bisect to the last input that passes
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        passed = shield.decide(np.array([1.6, 0.0]), shape, np.array([middle])).reason == "safe"
-        low, high = (middle, high) if passed else (low, middle)
+    last = edge_of(lambda u: shield.decide(np.array([1.6, 0.0]), shape, np.array([u])).reason == "safe", 4.0, 80)
     sets = shield.test.reachable(np.array([[1.6], [0.0]]), shield.errors_of(shape).batch())
-    assert MARGIN * (1 - 1e-6) <= sets.margins(np.array([[low]]))[0].item() <= 2 * MARGIN  # but for its own rounding
+    assert MARGIN * (1 - 1e-6) <= sets.margins(np.array([[last]]))[0].item() <= 2 * MARGIN  # but for its own rounding
     assert MARGIN >= 1e-10
 
 
