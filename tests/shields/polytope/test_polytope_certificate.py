@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import AdversarialDisturbance, LinearPlant, cart_pole
+from ncs_gym import LinearPlant, cart_pole
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import CART_POLE_CHANNEL
-from shields import VectorSafetyShield, synthesize, verify
+from shields import synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
@@ -64,15 +64,6 @@ def test_gain_with_the_largest_polytope_is_kept_proved_and_says_what_it_gained(n
     assert f"{100.0 * shares[1]:.4g} % of the safe box's volume ({100.0 * shares[0]:.3g} % with the gain" in str(wider)
     assert verified(wider, plant).valid
     assert (wider.K != wide.K).any()
-    # The hardest disturbance and a policy that pushes outwards, from the edge of the polytope.
-    hardest = AdversarialDisturbance(wider.M)
-    envs = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=40, disturbance=hardest)
-    shield, rng = VectorSafetyShield(envs, wider), np.random.default_rng(0)
-    shield.reset(seed=0, options={"state": (1.0 - 1e-9) * wider.polytope.sample_boundary(rng, 40)})
-    for step in range(150):
-        *_, info = shield.step(np.full((40, plant.m), 1.0 if step % 60 < 30 else -1.0, np.float32))
-        assert wider.polytope.gauge(info["state"]).max() <= 1.0
-        assert info["shield_guaranteed"].all()
 
 
 @pytest.mark.parametrize("name", IDS)

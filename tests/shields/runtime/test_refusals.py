@@ -196,17 +196,10 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Filters.
     (lambda: SafetyFilter(replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), CertificateError, r"\(S\)"),
     (lambda: SafetyFilter(CERTIFICATE, OTHER), CertificateError, "another plant"),
-    (lambda: SafetyFilter(PLANT, CERTIFICATE), ValueError, "a shield takes a Certificate"),
-    (
-        lambda: SafetyFilter(CERTIFICATE, "plant"),
-        ValueError,
-        "a shield takes a Certificate",
-    ),
-    (
-        lambda: SafetyFilter("certificate", PLANT),
-        ValueError,
-        "a shield takes a Certificate",
-    ),
+    *[
+        (partial(SafetyFilter, *given), ValueError, "a shield takes a Certificate")
+        for given in ((PLANT, CERTIFICATE), (CERTIFICATE, "plant"), ("certificate", PLANT))
+    ],
     (lambda: SafetyFilter(CERTIFICATE, PLANT, "hope"), ValueError, "mode must be one of"),
     *[
         (partial(SafetyFilter, CERTIFICATE, PLANT, mode, 3), ValueError, 'horizon is for mode "lookahead"')
@@ -217,7 +210,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for wrong in (0, -1, 51, 2.5, "3", True, np.nan)
     ],
     (
-        lambda: SafetyFilter(CERTIFICATE, PLANT, "lookahead", 6, 6),
+        partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", 6, 6),
         ValueError,
         "takes plans of 7 steps, got horizon = 6",
     ),
