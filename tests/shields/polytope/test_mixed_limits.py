@@ -13,7 +13,6 @@ from scipy.optimize import linprog
 from ncs_gym import Channel, Ellipsoid, LinearPlant, contract_of
 from shields import Infeasible, SafeLoop, SafetyShield, VectorSafetyShield, synthesize, verify
 from tests.certificates import certificate_of, feasible_bounds_not_sought
-from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import (
     CHANNEL,
     CONTRACT,
@@ -26,6 +25,7 @@ from tests.shields.polytope.limits import (
     certificate,
     mixed_values,
 )
+from tests.verdicts import verified
 
 
 @pytest.mark.parametrize("name", MIXED)
@@ -96,8 +96,7 @@ def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name)
     few = replace(P, multipliers=P.multipliers[:first], lower_multipliers=P.lower_multipliers[:first])
     forged += [(claimed, closer), (replace(found, polytope=few), plant)]
     for each, claims in forged:
-        assert not verify(each, claims).valid
-        assert not verify_again(each, claims).valid
+        assert not verified(each, claims).valid
 
 
 def test_stable_plant_with_limits_of_rates_needs_no_contract():
@@ -257,8 +256,7 @@ def test_limits_count_beside_times_between_samples():
         MODEL, 0.1, between_samples=4, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
     )
     found = certificate_of(plant, CONTRACT, "polytope")
-    assert verify(found, plant).valid
-    assert verify_again(found, plant).valid
+    assert verified(found, plant).valid
     names = [condition.name[:4] for condition in verify(found, plant).conditions]
     assert names.count("(PM)") == 1
     assert names.count("(PB)") == 4 * len(plant.box)

@@ -32,7 +32,7 @@ from shields.synthesis.invariant_polytope import feedback_of, points_of_box, sha
 from tests.certificates import certificate_of
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
-from tests.verdicts import broken
+from tests.verdicts import broken, verified
 
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
@@ -73,8 +73,7 @@ def test_limit_with_one_end_alone_is_kept():
         state_limits=(20.0, np.inf), input_limits=(0.0, 12.0), disturbance_bound=0.1, **QUIET,
     )  # fmt: skip
     found = certificate_of(room, CONTRACT, "polytope")
-    assert verify(found, room).valid
-    assert verify_again(found, room).valid
+    assert verified(found, room).valid
     assert found.polytope.high[0] == np.inf
     reached = found.polytope.rows[1:] @ np.array([1e6])
     assert ((reached > found.polytope.high[1:]) | (reached < found.polytope.low[1:])).any()
@@ -259,8 +258,7 @@ def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
         **QUIET,
     )
     found = certificate_of(plant, ChannelContract(max_age=2), "polytope")
-    assert verify(found, plant).valid
-    assert verify_again(found, plant).valid
+    assert verified(found, plant).valid
     assert np.isfinite(found.polytope.widths).all()
 
 
@@ -346,8 +344,7 @@ def test_ellipsoid_is_not_kept_by_an_input_that_rests_elsewhere_even_where_that_
     assert found.keeps_ellipsoid
     for resting_input in ([5.0, -5.0], [1e-9, 0.0]):
         forged = replace(found, resting_input=resting_input, polytope=None)
-        assert not verify(forged, plant).valid
-        assert not verify_again(forged, plant).valid
+        assert not verified(forged, plant).valid
 
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
@@ -420,8 +417,7 @@ def test_resting_state_is_taken_where_it_is_one():
     found = synthesize(plant, contract=CONTRACT, resting_state=state)
     np.testing.assert_array_equal(found.resting_state, state)
     np.testing.assert_allclose(plant.A @ state + plant.B @ found.resting_input, state, atol=1e-12)
-    assert verify(found, plant).valid
-    assert verify_again(found, plant).valid
+    assert verified(found, plant).valid
     symmetric = synthesize(plant.symmetric, contract=CONTRACT, resting_state=[0.05, 0.0])
     assert symmetric.resting_state.tolist() == [0.05, 0.0]
     assert verify_again(symmetric, plant.symmetric).valid
