@@ -27,11 +27,9 @@ from ncs_gym import (
     Command,
     Ellipsoid,
     Estimator,
-    LinearPlant,
     NCSEnv,
     NCSVectorEnv,
     Packet,
-    Remainder,
     UnstablePlantError,
     cart_pole,
     certified_error_set,
@@ -53,6 +51,7 @@ from shields.runtime.set_test import certified_root
 from shields.torch import SafeLayer
 from tests import arrays
 from tests.certificates import certificate_of
+from tests.plants import small, with_remainder
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANT, OTHER, CART = truck_trailer(mass=4000.0), truck_trailer(), cart_pole()
@@ -61,9 +60,6 @@ CERTIFICATE, OF_CART = certificate_of(PLANT), certificate_of(CART, CONTRACT)
 SCALAR, VECTOR = gym.make(CRUISE), gym.make_vec(CRUISE, num_envs=2)
 SYNC = gym.make_vec(CRUISE, num_envs=2, vectorization_mode="sync")
 ASKED, KEPT = Channel(on_request=True), Channel(loss=0.2, delay=1, max_consecutive_losses=2)
-BOUNDS = {"box": [1.0, 1.0], "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
-STABLE = {"A": [[0.9, 0.1], [0.0, 0.8]]} | BOUNDS
-LOCAL = LinearPlant(B=[[0.0], [0.3]], u_max=1.0, remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "x"), **STABLE)
 THIN = np.random.default_rng(0).standard_normal((6, 6)) * 10.0 ** np.linspace(-9, 0, 6)
 NONE, ONE, TWO = torch.zeros((2, 2)), torch.zeros((2, 1)), np.zeros(2)
 KNOWN = np.zeros((5, 2)), np.tile(CERTIFICATE.Sigma, (5, 1, 1)), np.zeros((5, 1))
@@ -130,7 +126,7 @@ UNPROVED = r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"
 MISPLACED = r"delay is a setting of the channel: give channel=Channel\(delay=...\)"
 NO_MODEL = r"needs an NCSEnv inside, got PendulumEnv, which has no linear model .*: docs/own_plant\.md says how"
 SHIELDS = (partial(SafetyShield, SCALAR), partial(VectorSafetyShield, VECTOR))
-THIRTEEN = LinearPlant(B=np.ones((2, 13)), u_max=1.0, **STABLE)
+THIRTEEN = small([[0.9, 0.1], [0.0, 0.8]], B=np.ones((2, 13)))
 NONSENSE = torch.full((2, 2), np.nan)
 COARSE = (torch.float16, torch.bfloat16, torch.float8_e4m3fn)
 # What is called, the error, and words of its message.
@@ -224,7 +220,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     ],
     (lambda: certified_root(np.ones((2, 2))), CertificateError, "too thin"),
     (lambda: certified_root(0.5 * (THIN @ THIN.T + (THIN @ THIN.T).T)), CertificateError, "too thin"),
-    (lambda: paper_synthesis(LOCAL), ValueError, "remainder_bound"),
+    (lambda: paper_synthesis(with_remainder()), ValueError, "remainder_bound"),
     # The layer of PyTorch.
     *[
         (partial(lambda *given: SafeLayer(CERTIFICATE, PLANT)(*given), *given), ValueError, words)

@@ -7,13 +7,23 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, Re
 from shields import Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
+from tests.plants import with_remainder
 
 COMMON = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1}
 COMMON |= {"sensor_bound": 0.001, "initial_bound": 0.001}
 BOUND = Ellipsoid(1e-4 * np.eye(2))
 EXACT = LinearPlant(**COMMON, disturbance_bound=BOUND)
 LEFT_OUT = Remainder(BOUND, False, "an example")
-LOCAL = LinearPlant(**COMMON, disturbance_bound=0.0, remainder=LEFT_OUT)
+LOCAL = with_remainder()
+
+
+def late(steps, remainder=LEFT_OUT):
+    """The same plant, whose inputs take effect some steps later."""
+    bounds = {"disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
+    return LinearPlant.from_statespace(
+        model, box=[1.0, 1.0], u_max=1.0, input_delay=steps, remainder=remainder, **bounds
+    )
 
 
 def reasons(plant, start, mode="monitor", **settings):
@@ -66,9 +76,7 @@ def test_certificate_says_what_it_assumes_of_the_remainder():
 
 
 def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
-    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
-    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
-    plant = LinearPlant.from_statespace(model, input_delay=2, remainder=LEFT_OUT, **settings)
+    plant = late(2)
     np.testing.assert_array_equal(plant.remainder_bound.shape_matrix, np.pad(BOUND.shape_matrix, (0, 2)))
     np.testing.assert_allclose(plant.disturbance.shape_matrix[:2, :2], BOUND.shape_matrix, rtol=1e-6)
     assert plant.remainder.sentence == LEFT_OUT.sentence
@@ -78,11 +86,7 @@ def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
 @pytest.mark.parametrize("downlink", [{}, {"downlink": Channel(delay=1)}])
 def test_inputs_under_way_beyond_their_limits_are_outside_the_model(downlink):
     """S reaches to four times the limits in their direction, the bound of the remainder only to the limits."""
-    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
-    plants = [
-        LinearPlant.from_statespace(model, input_delay=1, remainder=each, **settings) for each in (LEFT_OUT, None)
-    ]
+    plants = [late(1), late(1, remainder=None)]
     start = [0.0, 0.0, 1.3]
     assert set(reasons(plants[0], start, **downlink)[:-1]) == {LEFT_MODEL}
     assert set(reasons(plants[0], [0.0, 0.0, 0.9], **downlink)) == {""}
@@ -90,9 +94,7 @@ def test_inputs_under_way_beyond_their_limits_are_outside_the_model(downlink):
 
 
 def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_the_model():
-    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
-    plant = LinearPlant.from_statespace(model, input_delay=1, remainder=LEFT_OUT, **settings)
+    plant = late(1)
     shield = SafetyFilter(certificate_of(plant), plant)
     for error, reason in ((0.0, ""), (0.009, ""), (0.011, LEFT_MODEL)):
         errors = shield.errors_of(np.diag([1e-12, 1e-12, error**2]))
