@@ -51,14 +51,6 @@ def test_what_passes_leaves_enough_or_as_much_as_anything_that_is_tried():
     assert (left > 0).any()
 
 
-def test_no_steps_is_what_is_done_without_asking():
-    estimates, shapes, proposals = beliefs(200)
-    usual = SafetyFilter(CART.certificate, CART.plant, "lookahead", HORIZON)
-    made = usual, cart_filter(0, HORIZON)
-    for one, other in zip(*(each.decide_many(estimates, shapes, proposals) for each in made), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("is_vector", [False, True], ids=["scalar", "vector"])
 def test_silence_uses_them_up_one_by_one_and_samples_bring_them_back(is_vector):
     settings = {"plant": CART.plant, "channel": PAUSES, "contract": CART.contract, "disturbance": "adversarial"}
