@@ -38,6 +38,14 @@ def oscillator(between_samples: int | None = 3) -> LinearPlant:
     )
 
 
+def swinging(damping: float, u_max: float) -> LinearPlant:
+    """Swings once around within a step, whose input pushes it far out and back between two samples."""
+    w = 2.0 * np.pi
+    model = [[0.0, 1.0], [-w * w, -2.0 * damping * w]], [[0.0], [w * w]], np.eye(2), np.zeros((2, 1))
+    bounds = {"gamma": 1e-6, "initial_bound": 1e-3, "sensor_bound": 1e-4}
+    return LinearPlant.from_statespace(model, dt=1.0, box=(1.0, 8.0), u_max=u_max, between_samples=32, **bounds)
+
+
 def servo(factor: float = 1.2, **changes: object) -> LinearPlant:
     """A DC servo; of these radii an ellipsoid bears up to about 1.04 times those of factor 1, a polytope more."""
     motor = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])

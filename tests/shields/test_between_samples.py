@@ -21,6 +21,7 @@ from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
 from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of, feasible_bounds_not_sought
+from tests.plants import servo, swinging
 from tests.second_verifier.verify import verify_again
 from tests.shields.runtime.batches import decided_alike
 from tests.verdicts import verified
@@ -113,30 +114,6 @@ def test_unshielded_cruise_leaves_its_box_between_two_samples_inside_it():
     assert 1.07 < np.abs(rows[::10] @ x[:, inside]).max() < 1.12
 
 
-def test_certificate_of_a_plant_that_counts_otherwise_is_refused():
-    plant, _, wide = found("TruckTrailerCruise", 8)
-    without, plain, _ = found("TruckTrailerCruise")
-    assert not verified(wide, without).valid
-    assert not verified(plain, plant).valid
-    claimed = replace(plain, between_samples=8, fingerprint=plant.fingerprint)
-    broken = [condition.name for condition in verify(claimed, plant).conditions if not condition.holds]
-    assert broken
-    assert all(name.startswith("(B)") for name in broken)
-
-
-def test_polytope_of_samples_alone_is_refused_at_times_between_them():
-    plant = found("TruckTrailerCruise", 8)[0]
-    without = found("TruckTrailerCruise")[2]
-    rows, m = without.polytope.rows, plant.m
-    multipliers = np.concatenate([without.polytope.multipliers, np.zeros((8 * len(plant.box_rows), len(rows)))])
-    closed = plant.grid_rows.state + plant.grid_rows.input @ without.K
-    multipliers[len(rows) + m :] = np.linalg.lstsq(rows.T, closed.reshape(-1, plant.n).T, rcond=None)[0].T
-    polytope = replace(without.polytope, multipliers=multipliers, lower_multipliers=None)
-    claimed = replace(without, polytope=polytope, between_samples=8, fingerprint=plant.fingerprint)
-    broken = {condition.name[:4] for condition in verify(claimed, plant).conditions if not condition.holds}
-    assert "(PB)" in broken
-
-
 def test_certificate_says_when_its_claim_holds_and_its_file_keeps_it(tmp_path):
     _, plain, wide = found("TruckTrailerCruise", 8)
     _, without, _ = found("TruckTrailerCruise")
@@ -158,12 +135,8 @@ def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_cert
 
 @pytest.mark.slow
 def test_quick_search_for_feasible_bounds_knows_the_times_between_samples():
-    motor = [[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]
-    bounds = {"disturbance_bound": [0.0, 0.48], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
-    limits, contract = {"box": [0.2, 4.0], "u_max": 12.0}, ChannelContract(2)
-    plain, plant = (
-        LinearPlant.from_statespace(motor, dt=0.01, **limits, **bounds, between_samples=points) for points in (None, 4)
-    )
+    contract = ChannelContract(2)
+    plain, plant = (servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.48], between_samples=points) for points in (None, 4))
     synthesize(plain, contract=contract)
     with pytest.raises(Infeasible, match="single changes that a search finds enough") as caught:
         synthesize(plant, contract=contract)
@@ -230,17 +203,6 @@ def test_plants_without_a_grid_have_no_rows_of_one():
     np.testing.assert_array_equal(test.at_samples, plant.box_rows)
 
 
-@cache
-def oscillator(damping, limits, u_max):
-    """A plant whose input pushes it far out and back between two samples, and its certificate."""
-    w = 2.0 * np.pi
-    model = [[0.0, 1.0], [-w * w, -2.0 * damping * w]], [[0.0], [w * w]], np.eye(2), np.zeros((2, 1))
-    plant = LinearPlant.from_statespace(
-        model, dt=1.0, box=limits, u_max=u_max, gamma=1e-6, initial_bound=1e-3, sensor_bound=1e-4, between_samples=32
-    )
-    return plant, certificate_of(plant, safe_set="polytope")
-
-
 def test_at_all_times_assumes_that_disturbances_within_a_step_respect_its_bound():
     """A torque constant over each step keeps the bound of a step, and does more in the middle of half a period."""
     A, B, dt, torque = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]]), 3.1, 0.3
@@ -274,7 +236,8 @@ def test_at_all_times_assumes_that_disturbances_within_a_step_respect_its_bound(
 
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_inputs_on_their_way_at_a_start_in_the_middle_count_between_samples(mode):
-    plant, certificate = oscillator(0.3, (1.0, 8.0), 0.9)
+    plant = swinging(damping=0.3, u_max=0.9)
+    certificate = certificate_of(plant, safe_set="polytope")
     times = [expm(np.pad(plant.continuous_model, ((0, 1), (0, 0))) * tau)[:2] for tau in np.linspace(0.0, 1.0, 201)]
     seen = 0
     for guess in np.linspace(0.0, 0.9, 10):
@@ -316,8 +279,8 @@ def test_a_passed_test_does_not_prove_a_step_that_began_where_nothing_did():
 
 
 def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
-    plant, certificate = oscillator(0.4, (1.0, 8.0), 0.95)
-    safety_filter = SafetyFilter(certificate, plant, "switch")
+    plant = swinging(damping=0.4, u_max=0.95)
+    safety_filter = SafetyFilter(certificate_of(plant, safe_set="polytope"), plant, "switch")
     monitor = GuaranteeMonitor(safety_filter, downlink_protocol(Channel(delay=1), None))
     small = safety_filter.errors_of(plant.initial_error.shape_matrix)
     large = safety_filter.errors_of(np.diag([0.16, 9.0]))

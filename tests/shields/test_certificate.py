@@ -7,21 +7,6 @@ from ncs_gym import Ellipsoid
 from shields import Certificate, CertificateError
 
 
-@pytest.fixture
-def path(certificate, tmp_path):
-    certificate.save(tmp_path / "certificate.json")
-    return tmp_path / "certificate.json"
-
-
-def test_saving_and_loading_is_exact(certificate, path):
-    loaded = Certificate.load(path)
-    for name in ("L", "K", "Sigma", "D"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(certificate, name))
-    assert loaded.multipliers == certificate.multipliers
-    assert (loaded.method, loaded.fingerprint) == (certificate.method, certificate.fingerprint)
-    assert loaded.provenance == certificate.provenance
-
-
 def test_matrix_and_sets_are_derived_from_L(certificate):
     np.testing.assert_allclose(certificate.M @ certificate.L, np.eye(2), atol=1e-12)
     assert isinstance(certificate.safe_set, Ellipsoid)
@@ -43,11 +28,6 @@ def test_files_of_another_kind_are_refused_in_one_sentence(content, tmp_path):
     with pytest.raises(CertificateError) as caught:
         Certificate.load(path)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(CertificateError, match=r"nowhere.json: No such file"):
-        Certificate.load(tmp_path / "nowhere.json")
 
 
 def test_a_failed_save_leaves_nothing_behind(certificate, tmp_path):

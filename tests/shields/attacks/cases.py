@@ -24,9 +24,8 @@ from ncs_gym import (
 )
 from ncs_gym.network.contract import contract_of
 from shields import Certificate
-from shields.synthesis.requirement_search import with_radii
 from tests.certificates import certificate_of
-from tests.plants import random_plant
+from tests.plants import random_plant, servo
 
 CHANNELS = {
     "perfect": Channel(),
@@ -140,16 +139,6 @@ def registered(name: str, **settings: Any) -> Case:
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
     age, step = env.contract.max_age, env.contract.quantization_step
     return unstable(env.plant, age, step, process=env.process, safe_set="polytope", **settings)
-
-
-@cache
-def servo(factor: float = 1.2, **changes: Any) -> LinearPlant:
-    """A DC servo whose radii no ellipsoid bears."""
-    motor = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])
-    bounds = {"disturbance_bound": [0.0, 0.25], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
-    given = {"box": [0.2, 4.0], "u_max": 12.0, "between_samples": None} | bounds | changes
-    plant = LinearPlant.from_statespace(motor, dt=0.005, **given)
-    return with_radii(plant, disturbance=factor, noise=factor)
 
 
 @cache

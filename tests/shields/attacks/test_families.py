@@ -13,10 +13,10 @@ from experiments.attack.attack_cases import plant_cases
 from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSVectorEnv, Packet, Remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
-from shields import SafeLoop, VectorSafetyShield, verify
+from shields import SafeLoop, VectorSafetyShield
 from tests.certificates import certificate_of
-from tests.second_verifier.verify import verify_again
 from tests.shields.attacks.cases import varying_cart_pole, varying_truck
+from tests.verdicts import verified
 
 FAMILIES = {
     "truck": (varying_truck, {"channel": CASE_STUDY_CHANNEL}, "ellipsoid"),
@@ -102,12 +102,10 @@ def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
 @pytest.mark.parametrize("name", FAMILIES)
 def test_both_verifiers_agree_and_refuse_the_certificate_of_the_middle(name):
     family = FAMILIES[name][0]()
-    for judge in (verify, verify_again):
-        assert judge(certified(name), family).valid
+    assert verified(certified(name), family).valid
     bare = replace(family, remainder=None)
     wrong = replace(certified(name, bare), fingerprint=family.fingerprint)
-    for judge in (verify, verify_again):
-        assert not judge(wrong, family).valid
+    assert not verified(wrong, family).valid
 
 
 @pytest.mark.parametrize(("count", "steps"), SIZES)

@@ -1,7 +1,6 @@
 """The plan test against extreme errors and disturbances, sampled ones, and rational arithmetic."""
 
 from decimal import Decimal, localcontext
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -13,9 +12,9 @@ from shields.runtime.backup_plans.plan_check import Tightening
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
-from tests.certificates import certificate_of
 from tests.shields.attacks.adversary import farthest
 from tests.shields.attacks.cases import case as attacked_case
+from tests.shields.edges import edge_of
 
 STEPS = 5
 NAMES = (
@@ -140,20 +139,6 @@ def test_plans_are_certified_if_every_possible_state_stays_in_the_box_and_ends_i
     assert max(levels) > 0.9
 
 
-def test_sampled_errors_and_disturbances_stay_inside(case):
-    plant, certificate, test = case
-    rng = np.random.default_rng(3)
-    estimates, shapes, plans = situations(plant, certificate, rng, 30)
-    certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
-    for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
-        for step in np.flatnonzero(passed).tolist()[:1]:
-            x = x_hat + Ellipsoid(shape).sample_boundary(rng, 300)
-            for u in plan[: step + 1]:
-                x = x @ plant.A.T + plant.B @ u + plant.disturbance.sample_boundary(rng, 300)
-                assert (np.abs(x @ plant.box_rows.T) <= 1.0).all()
-            assert (certificate.safe_set.gauge(x) <= 1.0).all()
-
-
 def test_plans_of_one_input_are_certified_by_the_one_step_test(case):
     plant, certificate, test = case
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(4)
@@ -211,46 +196,6 @@ def test_indefinite_shapes_leave_no_room(case):
     assert np.isnan(tightening.radius).all()
 
 
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
-def test_certified_is_true_in_rational_arithmetic_however_far_out_the_estimate_is(size):
-    # Estimates along a direction that A annihilates: products of huge numbers cancel.
-    plant = LinearPlant(
-        A=np.array([[0.5, -0.3], [0.25, -0.15]]),
-        B=np.ones((2, 1)),
-        box=np.eye(2),
-        u_max=1.0,
-        dt=0.1,
-        gamma=1e-6,
-        sensor_bound=0.0,
-        initial_bound=0.0,
-    )
-    certificate, rng = certificate_of(plant), np.random.default_rng(0)
-    test = PlanTest(Prediction(ellipsoid_test(certificate.L, plant), 2), 0.0)
-    known = test.tightenings_of(np.zeros((1, 2, 2)))
-    *_, axes = np.linalg.svd(plant.A)
-    support = plant.disturbance.support(np.eye(2))
-    passed, closest = 0, 0.0
-    for _ in range(100):
-        base = axes[1] * size * rng.uniform(0.5, 1.0)
-        inwards, plan = rng.choice([-1.0, 1.0]) * axes[0], rng.uniform(-1, 1, (1, 1, 2, 1))
-        low, high = 0.0, 8.0
-        for _ in range(50):  # to the edge of what is certified
-            middle = 0.5 * (low + high)
-            passes = test.certified((base + middle * inwards)[None], known, plan)[0, 0, 1]
-            low, high = (middle, high) if passes else (low, middle)
-        x = base + low * inwards
-        if test.certified(x[None], known, plan)[0, 0, 1]:
-            passed += 1
-            for row, u, s in zip(plant.A, plant.B[:, 0], support, strict=True):
-                center = sum(Fraction(a) * Fraction(b) for a, b in zip(row.tolist(), x.tolist(), strict=True))
-                center += Fraction(float(u)) * Fraction(float(plan[0, 0, 0, 0]))
-                assert abs(center) + Fraction(float(s)) * (1 - Fraction(1, 10**14)) <= 1
-                closest = max(closest, float(abs(center) + Fraction(float(s))))
-    assert passed > 20
-    assert closest > 1.0 - 1e-6 or size > 1e7
-
-
 def root_of(number):
     """The square root of a fraction, to fifty digits."""
     with localcontext(prec=50):
@@ -269,16 +214,6 @@ def exact_reach(plant, row, x_hat, shape, plan):
     spread = root_of(quadratic(pulls[-1], rational(shape))) + sum(root_of(quadratic(p, D)) for p in pulls[:-1])
     with localcontext(prec=50):
         return abs(Decimal(center.numerator) / Decimal(center.denominator)) + spread
-
-
-def edge_of(passes, high):
-    """The largest number found that passes, by bisection from 0, which must."""
-    low = 0.0
-    assert passes(low)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if passes(middle) else (low, middle)
-    return low
 
 
 QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}
@@ -337,15 +272,19 @@ def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case
     assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
-@pytest.mark.parametrize(("steps", "margin"), [(1, 0.0), (2, 0.0), (2, 0.05)])
-def test_end_is_certified_in_rational_arithmetic_however_far_out_the_estimate_is(steps, margin, size):
+@pytest.mark.parametrize(
+    ("where", "steps", "margin"),
+    [("end", 1, 0.0), ("end", 2, 0.0), ("end", 2, 0.05), ("box", 1, 0.0), ("box", 2, 0.0), ("box", 2, 0.05)],
+)
+def test_plans_are_certified_in_rational_arithmetic_however_far_out_the_estimate_is(where, steps, margin, size):
     plant = LinearPlant(A=[[0.5, -0.3], [0.0, 0.0]], B=[[1.0], [0.0]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
-    test, rng = PlanTest(Prediction(ellipsoid_test(np.eye(2), plant), steps), margin), np.random.default_rng(0)
+    L, horizon = (1e4 * np.eye(2), steps + 1) if where == "box" else (np.eye(2), steps)  # one of them is far away
+    test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), horizon), margin), np.random.default_rng(0)
     nothing, inwards, levels = np.zeros((2, 2)), np.array([1.0, 0.0]), []
     known = test.tightenings_of(nothing[None])
-    plan = np.array([[0.0], [0.9]])[2 - steps :]
+    plan = np.array([[0.0], [0.9], [0.0]])[2 - steps : 2 - steps + horizon]
     for _ in range(40):
         far = np.array([0.3, 0.5]) * size * rng.uniform(0.5, 1.0)  # which A annihilates, but for rounding
 
@@ -354,7 +293,7 @@ def test_end_is_certified_in_rational_arithmetic_however_far_out_the_estimate_is
 
         if passes(0.0):
             x_hat = far + inwards * edge_of(passes, 16.0)
-            levels.append(exact_reach(plant, inwards, x_hat, nothing, plan))
+            levels.append(exact_reach(plant, inwards, x_hat, nothing, plan[:steps]))
     assert len(levels) > 30
     assert max(levels) <= 1.0 - margin
     assert min(levels) > 1.0 - margin - 1e-13 * size - 1e-6

@@ -171,35 +171,8 @@ def test_what_cannot_be_used_means_the_next_stored_input(what):
     assert shield.decide(*case.values()).reason == "invalid"
 
 
-@pytest.mark.parametrize(
-    "stored",
-    [
-        None,
-        "plan",
-        np.nan,
-        np.zeros((2, 2)),
-        np.full((1, 1), np.nan),
-        np.full((1, 1), 4.1),
-        np.zeros((9, 1)),
-        [[1.0], []],
-    ],
-)
-def test_what_is_no_plan_counts_as_none_stored(stored):
-    shield = shield_of("cruise")
-    decision = shield.decide(np.full(2, 30.0), 0.1 * shield.certificate.Sigma, np.zeros(1), stored)
-    assert decision.reason == "fallback"
-
-
-@pytest.mark.parametrize("horizon", [0, -1, 51, 2.5, "3", True, np.nan])
-def test_horizon_is_a_whole_number(horizon, certificate, loaded):
-    with pytest.raises(ValueError, match="horizon"):
-        SafetyFilter(certificate, loaded, "lookahead", horizon)
-
-
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
-def test_other_modes_take_no_horizon_and_keep_no_plan(mode, certificate, loaded):
-    with pytest.raises(ValueError, match="horizon is for mode"):
-        SafetyFilter(certificate, loaded, mode, 3)
+def test_other_modes_keep_no_plan(mode, certificate, loaded):
     shield = SafetyFilter(certificate, loaded, mode)
     for u in (0.0, 4.0):
         decision = shield.decide(np.array([1.8, 0.5]), 0.1 * certificate.Sigma, np.array([u]), [[1.0]])
@@ -245,16 +218,24 @@ class NoArray:
         raise TypeError
 
 
-@pytest.mark.parametrize("name", ["cart-pole, polytope"])
-def test_what_is_no_plan_counts_as_none(name):
-    shield, rng = shield_of(name), np.random.default_rng(6)
-    cases = situations(shield, rng, 60)
+NO_PLANS = (
+    *(None, "plan", np.nan, NoArray(), [[1.0], []], [[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)]),
+    *(np.zeros((2, 2)), np.full((1, 1), np.nan), np.full((1, 1), 1e9), np.ones((99, 1))),
+)
+
+
+def test_what_is_no_plan_counts_as_none_stored():
+    shield, far = shield_of("cart-pole, polytope"), shield_of("cruise")
+    cases = situations(shield, np.random.default_rng(6), 60)
     expected = decisions(shield, cases)
     assert "projected" in {one.reason for one in expected}
-    for stored in ([[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)], NoArray(), None, "plan", [[1e9]], np.ones((99, 1))):
+    for stored in NO_PLANS:
         for one, other in zip(expected, decisions(shield, cases, stored), strict=True):
             assert one.reason == other.reason
             np.testing.assert_array_equal(one.input, other.input)
+    for stored in (*NO_PLANS, [[4.1]], np.zeros((9, 1))):  # beyond the limits, and longer than plans are
+        decision = far.decide(np.full(2, 30.0), 0.1 * far.certificate.Sigma, np.zeros(1), stored)
+        assert decision.reason == "fallback"
 
 
 @pytest.mark.parametrize("name", NAMES)

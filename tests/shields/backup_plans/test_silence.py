@@ -51,14 +51,6 @@ def test_what_passes_leaves_enough_or_as_much_as_anything_that_is_tried():
     assert (left > 0).any()
 
 
-def test_no_steps_is_what_is_done_without_asking():
-    estimates, shapes, proposals = beliefs(200)
-    usual = SafetyFilter(CART.certificate, CART.plant, "lookahead", HORIZON)
-    made = usual, cart_filter(0, HORIZON)
-    for one, other in zip(*(each.decide_many(estimates, shapes, proposals) for each in made), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("is_vector", [False, True], ids=["scalar", "vector"])
 def test_silence_uses_them_up_one_by_one_and_samples_bring_them_back(is_vector):
     settings = {"plant": CART.plant, "channel": PAUSES, "contract": CART.contract, "disturbance": "adversarial"}
@@ -149,23 +141,6 @@ def test_what_is_no_plan_counts_as_none_of_many_loops_too(least, wrong):
     assert [*decided.reason] == [each.reason for each in alone] == ["invalid", "fallback"]
     np.testing.assert_array_equal(decided.input, [each.input for each in alone])
     assert np.isnan(decided.plan).all()
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"least_safe_steps": 3}, "least_safe_steps is for mode \"lookahead\", mode 'project' takes none"),
-        ({"mode": "lookahead", "least_safe_steps": 6, "horizon": 6}, "takes plans of 7 steps, got horizon = 6"),
-        ({"mode": "lookahead", "least_safe_steps": 50}, "least_safe_steps must be a whole number"),
-        ({"mode": "lookahead", "least_safe_steps": -1}, "least_safe_steps must be a whole number"),
-        ({"mode": "lookahead", "least_safe_steps": 2.5}, "least_safe_steps must be a whole number"),
-        ({"least_safe_steps": False}, "least_safe_steps must be a whole number"),
-        ({"mode": "lookahead", "least_safe_steps": None}, "least_safe_steps must be a whole number"),
-    ],
-)
-def test_wrong_numbers_of_steps_are_refused(given, message):
-    with pytest.raises(ValueError, match=message):
-        SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), **given)
 
 
 def test_numbers_of_numpy_are_those_of_a_spec():

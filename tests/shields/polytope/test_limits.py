@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid
-from shields import Certificate, SafeLoop, SafetyFilter, VectorSafetyShield, verify
+from shields import Certificate, SafetyFilter, VectorSafetyShield, verify
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS, certificate, mixed_values
 
@@ -109,13 +109,3 @@ def test_no_limit_is_passed_while_guaranteed(name, mode):
         assert intervened > 0
         if len(plant.mixed_rows):  # the limit is what binds
             assert (-0.05 if mode in ("project", "lookahead") else -0.5) < closest <= 0.0
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_loop_keeps_its_input_between_the_ends(name):
-    plant, found = PLANTS[name], certificate(name)
-    for proposed in (2.0 * plant.input_high, 2.0 * plant.input_low):
-        loop = SafeLoop(found, plant, CHANNEL)
-        loop.start(found.resting_state)
-        decision = loop.decide(proposed)
-        assert ((plant.input_low <= decision.input) & (decision.input <= plant.input_high)).all()

@@ -13,7 +13,6 @@ from scipy.optimize import linprog
 from ncs_gym import Channel, Ellipsoid, LinearPlant, contract_of
 from shields import Infeasible, SafeLoop, SafetyShield, VectorSafetyShield, synthesize, verify
 from tests.certificates import certificate_of, feasible_bounds_not_sought
-from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import (
     CHANNEL,
     CONTRACT,
@@ -26,6 +25,7 @@ from tests.shields.polytope.limits import (
     certificate,
     mixed_values,
 )
+from tests.verdicts import verified
 
 
 @pytest.mark.parametrize("name", MIXED)
@@ -96,15 +96,7 @@ def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name)
     few = replace(P, multipliers=P.multipliers[:first], lower_multipliers=P.lower_multipliers[:first])
     forged += [(claimed, closer), (replace(found, polytope=few), plant)]
     for each, claims in forged:
-        assert not verify(each, claims).valid
-        assert not verify_again(each, claims).valid
-
-
-def test_certificate_of_the_plant_without_the_limit_is_none_of_the_plant_with_it():
-    plant = PLANTS["coupled"]
-    found = certificate_of(replace(plant, mixed_rows=None, mixed_ends=None), CONTRACT, "polytope")
-    assert not verify(found, plant).valid
-    assert not verify(replace(found, fingerprint=plant.fingerprint), plant).valid
+        assert not verified(each, claims).valid
 
 
 def test_stable_plant_with_limits_of_rates_needs_no_contract():
@@ -186,18 +178,6 @@ def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it_also_whe
         assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
 
 
-def test_loop_without_gymnasium_knows_the_limit():
-    plant, found = PLANTS["rates"], certificate("rates")
-    loop = SafeLoop(found, plant, CHANNEL)
-    loop.start(found.resting_state)
-    last = found.resting_state[2:]
-    for k in range(20):
-        decision = loop.decide(plant.input_high if k % 2 else plant.input_low)
-        assert np.abs(decision.input - last).max() <= 0.3
-        last = decision.input
-        loop.receive()
-
-
 def test_file_and_fingerprint_hold_the_limits(tmp_path):
     for name, plant in MIXED.items():
         plant.save(tmp_path / "plant.json")
@@ -206,7 +186,6 @@ def test_file_and_fingerprint_hold_the_limits(tmp_path):
         np.testing.assert_array_equal(again.mixed_rows, plant.mixed_rows)
         np.testing.assert_array_equal(again.mixed_ends, plant.mixed_ends)
         assert replace(plant, mixed_ends=1.01 * plant.mixed_ends).fingerprint != plant.fingerprint
-        certificate(name).save(tmp_path / "certificate.json")
     without = replace(PLANTS["coupled"], mixed_rows=None, mixed_ends=None)
     assert "mixed_rows" not in without.document["plant"]
     open_end = replace(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])
@@ -277,8 +256,7 @@ def test_limits_count_beside_times_between_samples():
         MODEL, 0.1, between_samples=4, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
     )
     found = certificate_of(plant, CONTRACT, "polytope")
-    assert verify(found, plant).valid
-    assert verify_again(found, plant).valid
+    assert verified(found, plant).valid
     names = [condition.name[:4] for condition in verify(found, plant).conditions]
     assert names.count("(PM)") == 1
     assert names.count("(PB)") == 4 * len(plant.box)

@@ -110,44 +110,6 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
     assert seen == set(EXPLANATIONS) - never
 
 
-@pytest.fixture
-def watched(certificate, loaded):
-    """A monitor, and reports about it with something changed."""
-    shield = SafetyFilter(certificate, loaded)
-
-    def report(estimate=(0.0, 0.0), shape=certificate.Sigma, alarm=False):
-        return LoopObservation(np.array(estimate), shield.errors_of(shape), alarm, stays=True)
-
-    monitor = GuaranteeMonitor(shield)
-    return monitor, report, lambda state: EXPLANATIONS[monitor.reasons(state)]
-
-
-def test_fallback_proves_nothing_while_the_error_is_not_certified(watched, certificate):
-    monitor, report, reason = watched
-    edge, fallback = report((1.9, 0.0)), decision(False, True)
-    state = monitor.start(True, True, edge)
-    state = monitor.advance(state, fallback, True, True, report((1.9, 0.0), 1.01 * certificate.Sigma))
-    assert reason(state) == proof.LARGE_ERROR  # the step itself still began with a certified error
-    state = monitor.advance(state, fallback, True, True, edge)
-    assert reason(state) == proof.NOT_KNOWN_INSIDE
-    state = monitor.advance(state, decision(True, True), True, True, edge)
-    assert reason(state) == ""
-
-
-@pytest.mark.parametrize(
-    "change", [{"estimate": (np.nan, np.nan)}, {"shape": "none"}, {"shape": -np.eye(2)}, {"shape": np.eye(3)}]
-)
-def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(watched, change):
-    monitor, report, reason = watched
-    passed = decision(True, False)
-    state = monitor.start(True, True, report())
-    assert reason(state) == ""
-    state = monitor.advance(state, passed, True, True, report(**change))
-    state = monitor.advance(state, passed, True, True, report())
-    assert reason(state) == proof.UNUSABLE
-    assert reason(monitor.start(True, True, report())) == ""
-
-
 @pytest.mark.parametrize("gaps", [(2, 4, 1, 1), (1, 1, 4, 1)])
 def test_a_guarantee_that_returned_lasts_while_the_contract_is_kept(gaps):
     # Two steps after a sample the error lies in the certified set of three steps, one step later in none.

@@ -20,7 +20,6 @@ from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.processes import nonlinear_cart_pole
 from shields import SafeLoop
 from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT, UNKNOWN_START
-from tests import arrays
 from tests.certificates import certificate_of
 
 PLANT = cart_pole()
@@ -184,14 +183,6 @@ def test_controller_that_starts_in_the_middle_claims_nothing_until_samples_tell_
     assert np.abs(PLANT.box_rows @ world.state).max() <= 1.0
 
 
-def test_wrong_first_estimate_that_is_claimed_to_be_known_is_no_longer_the_only_way():
-    loop = loop_with(downlink=None)
-    loop.start(np.zeros(4))
-    assert loop.guaranteed  # a claim, which may be wrong
-    loop.start(np.zeros(4), known=False)
-    assert not loop.guaranteed
-
-
 @pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False), truck_trailer()])
 def test_first_estimate_holds_what_it_claims_against_the_worst_disturbance_and_noise(plant):
     """The claim is attacked by the extreme disturbances and noises of one direction of the error."""
@@ -252,32 +243,6 @@ def test_too_few_or_too_coarse_samples_are_no_first_estimate():
     local = nonlinear_cart_pole()
     ages = certified_error_set(local, contract)
     assert first_estimate(local, ages, {0: np.zeros(4)}, [], local.sensor_error.shape_matrix) is None
-
-
-@pytest.mark.parametrize("downlink", [None, DOWNLINK])
-@pytest.mark.parametrize("phase", ["received", "decided"])
-def test_pickled_loop_goes_on_where_it_was(downlink, phase):
-    loop = loop_with(downlink=downlink, mode="project")
-    world = World(loop)
-    world.start()
-    for _ in range(30):
-        world.move(5.0)
-    if phase == "received":
-        loop.receive(world.packets, echoes=world.echoes)
-        world.packets, world.echoes = [], []
-        loop.decide(1.0)
-        loop.receive()
-    other = pickle.loads(pickle.dumps(loop))
-    for each in (loop, other):
-        if phase == "decided":
-            each.receive(world.packets, echoes=world.echoes)
-    for step in range(20):
-        arrays.assert_equal(loop.estimate, other.estimate)
-        assert (loop.reason, loop.steps, loop.measurement_age) == (other.reason, other.steps, other.measurement_age)
-        packets = [Packet(loop.steps, np.zeros(4), loop.episode)] if step % 2 else []
-        arrays.assert_equal(loop.decide(3.0).input, other.decide(3.0).input)
-        for each in (loop, other):
-            each.receive(packets)
 
 
 def test_samples_of_before_an_unknown_input_tell_nothing_of_where_the_state_is():

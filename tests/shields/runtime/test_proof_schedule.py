@@ -21,6 +21,7 @@ from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
+from tests.plants import swinging
 
 KEEPING = ("project", "switch", "boundary", "lookahead")
 STEPS = 8
@@ -30,10 +31,7 @@ STARTS = np.array(list(product((-0.8, -0.3, 0.0, 0.4), (-7.5, -6.5, -3.0, 0.0, 4
 
 @cache
 def swing() -> LinearPlant:
-    w = 2.0 * np.pi
-    model = [[0.0, 1.0], [-w * w, -0.6 * w]], [[0.0], [w * w]], np.eye(2), np.zeros((2, 1))
-    bounds = {"gamma": 1e-6, "initial_bound": 1e-3, "sensor_bound": 1e-4}
-    return LinearPlant.from_statespace(model, dt=1.0, box=(1.0, 8.0), u_max=0.9, between_samples=32, **bounds)
+    return swinging(damping=0.3, u_max=0.9)
 
 
 @cache

@@ -27,11 +27,9 @@ from ncs_gym import (
     Command,
     Ellipsoid,
     Estimator,
-    LinearPlant,
     NCSEnv,
     NCSVectorEnv,
     Packet,
-    Remainder,
     UnstablePlantError,
     cart_pole,
     certified_error_set,
@@ -53,6 +51,7 @@ from shields.runtime.set_test import certified_root
 from shields.torch import SafeLayer
 from tests import arrays
 from tests.certificates import certificate_of
+from tests.plants import small, with_remainder
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANT, OTHER, CART = truck_trailer(mass=4000.0), truck_trailer(), cart_pole()
@@ -61,9 +60,6 @@ CERTIFICATE, OF_CART = certificate_of(PLANT), certificate_of(CART, CONTRACT)
 SCALAR, VECTOR = gym.make(CRUISE), gym.make_vec(CRUISE, num_envs=2)
 SYNC = gym.make_vec(CRUISE, num_envs=2, vectorization_mode="sync")
 ASKED, KEPT = Channel(on_request=True), Channel(loss=0.2, delay=1, max_consecutive_losses=2)
-BOUNDS = {"box": [1.0, 1.0], "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
-STABLE = {"A": [[0.9, 0.1], [0.0, 0.8]]} | BOUNDS
-LOCAL = LinearPlant(B=[[0.0], [0.3]], u_max=1.0, remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "x"), **STABLE)
 THIN = np.random.default_rng(0).standard_normal((6, 6)) * 10.0 ** np.linspace(-9, 0, 6)
 NONE, ONE, TWO = torch.zeros((2, 2)), torch.zeros((2, 1)), np.zeros(2)
 KNOWN = np.zeros((5, 2)), np.tile(CERTIFICATE.Sigma, (5, 1, 1)), np.zeros((5, 1))
@@ -103,6 +99,13 @@ def stepped(shield: Any, **options: Any) -> None:
     shield.step(np.zeros(shield.action_space.shape))
 
 
+def acted(shield: Any, value: float) -> None:
+    """Steps a shield in an episode."""
+    made = shield(CERTIFICATE)
+    made.reset(seed=0)
+    made.step(np.full(made.action_space.shape, value))
+
+
 def node_of(**settings) -> ControllerNode:
     """A controller of a loop with these settings."""
     loop = SafeLoop(OF_CART, CART, Channel(), **settings)
@@ -123,8 +126,9 @@ UNPROVED = r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"
 MISPLACED = r"delay is a setting of the channel: give channel=Channel\(delay=...\)"
 NO_MODEL = r"needs an NCSEnv inside, got PendulumEnv, which has no linear model .*: docs/own_plant\.md says how"
 SHIELDS = (partial(SafetyShield, SCALAR), partial(VectorSafetyShield, VECTOR))
-THIRTEEN = LinearPlant(B=np.ones((2, 13)), u_max=1.0, **STABLE)
+THIRTEEN = small([[0.9, 0.1], [0.0, 0.8]], B=np.ones((2, 13)))
 NONSENSE = torch.full((2, 2), np.nan)
+COARSE = (torch.float16, torch.bfloat16, torch.float8_e4m3fn)
 # What is called, the error, and words of its message.
 REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Shields: what they wrap.
@@ -157,6 +161,8 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
             ("penalty", -1.0, "penalty must be"),
             ("penalty", np.nan, "penalty must be"),
             *(("on_unproved", wrong, UNPROVED) for wrong in ("log", None, ["warn"])),
+            ("least_safe_steps", 3, "least_safe_steps is for mode \"lookahead\", mode 'project' takes none"),
+            *(("least_safe_steps", wrong, "must be a whole number") for wrong in (50, -1, 2.5, False, None)),
         )
     ],
     *[
@@ -174,6 +180,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: stepped(SafetyShield(NCSEnv(PLANT), CERTIFICATE)), gym.error.ResetNeeded, "reset"),
     (lambda: stepped(SafetyShield(NCSEnv(PLANT), CERTIFICATE), bad=1), gym.error.ResetNeeded, "reset"),
     (lambda: stepped(VectorSafetyShield(NCSVectorEnv(2, plant=PLANT), CERTIFICATE)), gym.error.ResetNeeded, "reset"),
+    *[
+        (partial(acted, shield, value), ValueError, "must be finite with shape")
+        for shield in SHIELDS
+        for value in (np.nan, np.inf)
+    ],
     # Environments.
     (lambda: gym.make(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
     (lambda: gym.make_vec(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
@@ -181,19 +192,24 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Filters.
     (lambda: SafetyFilter(replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), CertificateError, r"\(S\)"),
     (lambda: SafetyFilter(CERTIFICATE, OTHER), CertificateError, "another plant"),
-    (lambda: SafetyFilter(PLANT, CERTIFICATE), ValueError, "a shield takes a Certificate"),
-    (
-        lambda: SafetyFilter(CERTIFICATE, "plant"),
-        ValueError,
-        "a shield takes a Certificate",
-    ),
-    (
-        lambda: SafetyFilter("certificate", PLANT),
-        ValueError,
-        "a shield takes a Certificate",
-    ),
+    *[
+        (partial(SafetyFilter, *given), ValueError, "a shield takes a Certificate")
+        for given in ((PLANT, CERTIFICATE), (CERTIFICATE, "plant"), ("certificate", PLANT))
+    ],
     (lambda: SafetyFilter(CERTIFICATE, PLANT, "hope"), ValueError, "mode must be one of"),
-    (lambda: SafetyFilter(CERTIFICATE, PLANT, "project", 3), ValueError, 'horizon is for mode "lookahead"'),
+    *[
+        (partial(SafetyFilter, CERTIFICATE, PLANT, mode, 3), ValueError, 'horizon is for mode "lookahead"')
+        for mode in ("project", "switch", "boundary", "monitor")
+    ],
+    *[
+        (partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", wrong), ValueError, "horizon")
+        for wrong in (0, -1, 51, 2.5, "3", True, np.nan)
+    ],
+    (
+        partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", 6, 6),
+        ValueError,
+        "takes plans of 7 steps, got horizon = 6",
+    ),
     (lambda: SafetyFilter(CERTIFICATE, THIRTEEN, "boundary"), ValueError, "at most 12 inputs, got 13"),
     (lambda: safety_filter().fallback_input(np.zeros(3)), ValueError, r"shape \(2,\)"),
     (lambda: safety_filter().fallback_input([np.nan, 0.0]), ValueError, r"shape \(2,\)"),
@@ -204,7 +220,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     ],
     (lambda: certified_root(np.ones((2, 2))), CertificateError, "too thin"),
     (lambda: certified_root(0.5 * (THIN @ THIN.T + (THIN @ THIN.T).T)), CertificateError, "too thin"),
-    (lambda: paper_synthesis(LOCAL), ValueError, "remainder_bound"),
+    (lambda: paper_synthesis(with_remainder()), ValueError, "remainder_bound"),
     # The layer of PyTorch.
     *[
         (partial(lambda *given: SafeLayer(CERTIFICATE, PLANT)(*given), *given), ValueError, words)
@@ -222,6 +238,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
             (r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)", ONE, torch.zeros(3, 2)),
             (r"error_shapes must have shape \(2, 2\) or \(2, 2, 2\)", ONE, NONE, torch.zeros(3, 2, 2)),
             ("estimates must be numbers, got str", ONE, "estimates"),
+            ("estimates must be real numbers, got complex64", ONE, NONE.to(torch.complex64)),
+            ("actions must be numbers, got Tensor.* the meta device", ONE.to("meta"), NONE),
+            ("estimates must be float32 or float64, got float16", ONE, np.zeros((2, 2), np.float16)),
+            *((f"estimates must be float32 or float64, got {kind}", ONE, NONE.to(kind)) for kind in COARSE),
+            *((f"error_shapes must be float32 or float64, got {kind}", ONE, NONE, NONE.to(kind)) for kind in COARSE),
             ("estimates must", ONE, None),
         )
     ],

@@ -21,6 +21,7 @@ from shields.verification.rational_matrix import (
     subtract,
 )
 from tests.certificates import certificate_of, with_proof
+from tests.shields.edges import edge_of
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
 
@@ -54,14 +55,14 @@ def test_passed_means_inside_however_far_out_the_estimate_is(size, count):
     passed, worst = 0, -1.0
     for _ in range(count):
         inwards, u = rng.choice([-1.0, 1.0]) * axes[0], rng.uniform(-1, 1, 1)
-        low, high = 0.0, 8.0
         base = axes[1] * size * rng.uniform(0.5, 1.0)
-        for _ in range(50):  # to the edge of what passes
-            middle = 0.5 * (low + high)
-            passes = shield.decide(base + middle * inwards, np.zeros((2, 2)), u).reason == "safe"
-            low, high = (middle, high) if passes else (low, middle)
-        x = base + low * inwards
-        if shield.decide(x, np.zeros((2, 2)), u).reason == "safe":
+
+        def passes(way, base=base, inwards=inwards, u=u):
+            return shield.decide(base + way * inwards, np.zeros((2, 2)), u).reason == "safe"
+
+        way = edge_of(passes, 8.0)
+        x = base + way * inwards
+        if passes(way):
             passed += 1
             worst = max(worst, exact_level(certificate, plant, x, u, worst_disturbance(certificate, plant, x, u)))
     assert worst <= 0.0
@@ -141,13 +142,9 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
     errors = test.predicted(np.zeros((1, 2, 2)), np.zeros((0, 2, 2))).single()
     for _ in range(60):
         x = factor @ rng.standard_normal(2)
-        low, high = 0.0, 1e3
-        for _ in range(70):  # to the edge of what is known to be inside
-            middle = 0.5 * (low + high)
-            known = test.knows_inside(middle * x, errors, 0.0)
-            low, high = (middle, high) if known else (low, middle)
-        p, q = (Fraction(float(entry)) for entry in low * x)
-        assert low > 0.0
+        size = edge_of(lambda size, x=x: test.knows_inside(size * x, errors, 0.0), 1e3, tries=70)
+        p, q = (Fraction(float(entry)) for entry in size * x)
+        assert size > 0.0
         assert p * p + (q - Fraction(tilt) * p) ** 2 <= 1
 
 
@@ -160,14 +157,14 @@ def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_marg
     for _ in range(count):
         root = factor @ rng.standard_normal((2, 2))
         shape = 0.5 * (root @ root.T + (root @ root.T).T)
-        low, high = 0.0, 1e3
-        for _ in range(60):  # to the edge of what is known to be inside
-            middle = 0.5 * (low + high)
-            known = test.knows_inside(np.zeros(2), test.predicted(middle * shape[None], nothing).single(), 0.0)
-            low, high = (middle, high) if known else (low, middle)
-        assert low > 0.0
-        assert is_positive_semidefinite(subtract(rational(L), rational(low * shape)))
-        grown = scale(1 + Fraction(1, 10**4), rational(low * shape))
+
+        def knows(size, shape=shape):
+            return test.knows_inside(np.zeros(2), test.predicted(size * shape[None], nothing).single(), 0.0)
+
+        size = edge_of(knows, 1e3)
+        assert size > 0.0
+        assert is_positive_semidefinite(subtract(rational(L), rational(size * shape)))
+        grown = scale(1 + Fraction(1, 10**4), rational(size * shape))
         closest += not is_positive_semidefinite(subtract(rational(L), grown))
     assert closest > count // 2
 

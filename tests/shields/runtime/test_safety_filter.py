@@ -1,4 +1,3 @@
-import pickle
 from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
@@ -6,12 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym import LinearPlant
 from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.shields.attacks.cases import RANDOM
+from tests.shields.edges import edge_of
 from tests.shields.runtime.batches import decided_alike
 
 TWO_STATES = random_plant(3, 2, 1)
@@ -24,47 +24,11 @@ def many(shield, estimates, shapes, inputs):
     return shield.decide_columns(estimates.T, shield.errors_of_many(shapes), inputs.T)
 
 
-def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
-    """Largest x+' M x+ over the states the estimate allows and all disturbances, by ascent from many starts."""
-    M, D = certificate.M, plant.disturbance.shape_matrix
-    center = plant.A @ estimate + plant.B @ u
-    e, d = Ellipsoid(shape).sample_boundary(rng, tries), plant.disturbance.sample_boundary(rng, tries)
-    for _ in range(40):
-        slopes = (center - e @ plant.A.T + d) @ M
-        e, d = farthest(shape, -slopes @ plant.A), farthest(D, slopes)
-    ends = center - e @ plant.A.T + d
-    return float(np.einsum("ki,ij,kj->k", ends, M, ends).max())
-
-
-def farthest(shape, directions):
-    """The points of E(shape) farthest in each direction, rows of shape (k, n)."""
-    images = directions @ shape
-    return images / np.sqrt(np.einsum("ki,ki->k", directions, images))[:, None]
-
-
 @pytest.fixture(scope="module", params=[(2, 1), (4, 3), pytest.param((3, 2), marks=pytest.mark.slow)], ids=str)
 def case(request):
     n, m = request.param
     plant = random_plant(3, n, m)
     return plant, certificate_of(plant)
-
-
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
-def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
-    plant, certificate = case
-    shield, rng = SafetyFilter(certificate, plant, mode), np.random.default_rng(0)
-    passed = projected = 0
-    for _ in range(75):
-        estimate = 1.4 * certificate.safe_set.sample(rng)
-        shape = certificate.Sigma * rng.uniform(0.05, 1.0)
-        decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random())
-        projected += decision.reason == "projected"
-        assert (np.abs(decision.input) <= plant.u_max).all()
-        if decision.passed:
-            passed += 1
-            assert worst_next_level(certificate, plant, estimate, shape, decision.input, rng) <= 1.0
-    assert passed > 10
-    assert (projected > 2) is (mode == "project")
 
 
 def test_an_input_that_passes_is_returned_untouched(case):
@@ -105,28 +69,6 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
     assert checked > 10
 
 
-def test_switch_falls_back_to_the_gain(case):
-    plant, certificate = case
-    shield, rng = SafetyFilter(certificate, plant, "switch"), np.random.default_rng(2)
-    seen = 0
-    for _ in range(100):
-        estimate = 1.3 * certificate.safe_set.sample(rng)
-        decision = shield.decide(estimate, certificate.Sigma, plant.u_max * np.sign(rng.standard_normal(plant.m)))
-        if decision.fallback:
-            seen += 1
-            expected = np.clip(certificate.K @ estimate, -plant.u_max, plant.u_max)
-            np.testing.assert_allclose(decision.input, expected, atol=1e-6 * plant.u_max.max())
-    assert seen > 10
-
-
-def test_fallback_within_the_assumptions_needs_no_clipping(case):
-    plant, certificate = case
-    rng = np.random.default_rng(3)
-    for _ in range(300):
-        x, e = certificate.safe_set.sample_boundary(rng), certificate.error_set.sample_boundary(rng)
-        assert (np.abs(certificate.K @ (x + e)) <= plant.u_max).all()
-
-
 @pytest.mark.parametrize(
     "proposed",
     [
@@ -147,7 +89,7 @@ def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
     np.testing.assert_allclose(decision.input, certificate.K @ estimate, atol=1e-6)
 
 
-@pytest.mark.parametrize("estimate", [np.array([np.nan, 0.0]), np.zeros(3), np.array([np.inf, 0.0])])
+@pytest.mark.parametrize("estimate", [np.array([np.nan, 0.0]), np.array([np.inf, 0.0]), *map(np.zeros, (3, (2, 1)))])
 def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estimate):
     decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, np.ones(1))
     assert decision.reason == "invalid"
@@ -162,6 +104,8 @@ UNUSABLE_SHAPES = [
     -np.eye(2),
     np.array([[0.01, 5.0], [5.0, 0.01]]),
     np.array([[0.1, 0.5], [0.0, 0.1]]),
+    1e-4 * np.ones(2),
+    1e-4 * np.eye(2).ravel(),
     "none",
 ]
 
@@ -267,6 +211,7 @@ def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loade
     shield = SafetyFilter(certificate, loaded)
     assert np.isnan(shield.margin(np.zeros(2), certificate.Sigma, np.zeros(3)))
     assert np.isnan(shield.margin(np.array([np.nan, 0.0]), certificate.Sigma, np.zeros(1)))
+    assert np.isnan(shield.margin(np.zeros(2), 1e-4 * np.eye(3), np.zeros(1)))
     assert shield.margin([0.0, 0.0], certificate.Sigma.tolist(), [0.0]) > 0.0
     assert not shield.knows_inside(np.array([np.nan, 0.0]), certificate.Sigma)
     assert not shield.knows_inside(np.zeros(2), -certificate.Sigma)
@@ -344,13 +289,9 @@ def test_boundary_trusts_weak_inputs_of_larger_plants_too():
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
     shield = SafetyFilter(certificate, loaded, "switch")
     shape = 0.1 * certificate.Sigma
-    low, high = 0.0, 4.0  # bisect to the last input that passes
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        passed = shield.decide(np.array([1.6, 0.0]), shape, np.array([middle])).reason == "safe"
-        low, high = (middle, high) if passed else (low, middle)
+    last = edge_of(lambda u: shield.decide(np.array([1.6, 0.0]), shape, np.array([u])).reason == "safe", 4.0, 80)
     sets = shield.test.reachable(np.array([[1.6], [0.0]]), shield.errors_of(shape).batch())
-    assert MARGIN * (1 - 1e-6) <= sets.margins(np.array([[low]]))[0].item() <= 2 * MARGIN  # but for its own rounding
+    assert MARGIN * (1 - 1e-6) <= sets.margins(np.array([[last]]))[0].item() <= 2 * MARGIN  # but for its own rounding
     assert MARGIN >= 1e-10
 
 
@@ -440,15 +381,6 @@ def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
     assert shield.errors_of(0.05 * Sigma) is first
     shield.errors_of(2.0 * Sigma)  # one too many
     assert shield.errors_of(0.05 * Sigma) is not first
-
-
-def test_a_filter_decides_the_same_after_pickling(certificate, loaded):
-    shield = SafetyFilter(certificate, loaded)
-    case = np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0])
-    for twin in (shield, pickle.loads(pickle.dumps(shield))):
-        first, second = twin.decide(*case), pickle.loads(pickle.dumps(twin)).decide(*case)
-        assert first[1:6] == second[1:6]
-        np.testing.assert_array_equal(first.input, second.input)
 
 
 def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):

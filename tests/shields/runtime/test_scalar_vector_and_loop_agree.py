@@ -13,7 +13,6 @@ from ncs_gym import (
     GilbertElliott,
     LinearPlant,
     NCSVectorEnv,
-    Remainder,
     SpeedTracking,
     TraceChannel,
     batch_reactor,
@@ -24,19 +23,12 @@ from shields.runtime import guarantee
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.ncs_gym.envs.same_draws import compare
-from tests.plants import random_plant
+from tests.plants import random_plant, with_remainder
 from tests.shields.attacks.cases import RANDOM
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, TANKS
 
-TRUCK, CART, REACTOR = truck_trailer(mass=4000.0), cart_pole(), batch_reactor()
+TRUCK, CART, REACTOR, LOCAL = truck_trailer(mass=4000.0), cart_pole(), batch_reactor(), with_remainder()
 BOUNDS = {"box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "sensor_bound": 0.001, "initial_bound": 0.001}
-LOCAL = LinearPlant(
-    A=[[0.9, 0.1], [0.0, 0.8]],
-    B=[[0.0], [0.3]],
-    disturbance_bound=0.0,
-    remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"),
-    **BOUNDS,
-)
 RATES = LinearPlant(
     A=[[0.9, 0.1], [0.0, 0.8]],
     B=[[0.0], [0.3]],

@@ -141,16 +141,6 @@ def test_channels_whose_packets_are_used_are_not_named():
         NCSEnv(cart_pole(full_state=False), Channel(loss=0.2, max_consecutive_losses=2))
 
 
-def test_packets_that_come_too_late_for_a_loop_are_named_once(certificate):
-    loop = SafeLoop(certificate, PLANT, Channel(delay=1))
-    loop.start([0.0, 0.0])
-    [loop.step(0.0) for _ in range(4)]
-    with pytest.warns(UnusedPacketsWarning, match="later than the 1 step that"):
-        loop.step(0.0, [Packet(1, np.zeros(2))])
-    loop.step(0.0, [Packet(2, np.zeros(2))])
-    assert loop.discarded.too_late == 2
-
-
 def test_packets_without_the_number_of_a_later_episode_are_named_once(certificate):
     loop = SafeLoop(certificate, PLANT, Channel(delay=1))
     for _ in range(2):

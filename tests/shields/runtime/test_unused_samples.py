@@ -53,17 +53,18 @@ def test_samples_of_a_clock_that_agrees_are_not_named():
     assert loop.discarded == (0, 0, 0)
 
 
-def test_every_reason_is_named_once_and_apart():
+def test_every_reason_is_counted_and_named_once_and_apart():
     loop = started()
     loop.step(0.0)
     for _ in range(3):
         loop.step(0.0)
-    strays = [Packet(1, np.zeros(2)), Packet(90, np.zeros(2)), Packet(4, np.zeros(2), 5)]
+    strays = [Packet(stamp, np.zeros(2)) for stamp in (1, 90, 2000)] + [Packet(4, np.zeros(2), 5)] * 3
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         loop.step(0.0, strays)
         loop.step(0.0, strays)
-    assert loop.discarded == (2, 2, 2)
+    assert loop.discarded == (2, 4, 6)
+    assert (loop.discarded.too_late, loop.discarded.ahead, loop.discarded.other_episode) == (2, 4, 6)
     said = [str(warning.message) for warning in caught]
     assert len(said) == 3
     for text in (
@@ -72,6 +73,8 @@ def test_every_reason_is_named_once_and_apart():
         "episode is not that of the loop",
     ):
         assert sum(text in each for each in said) == 1
+    loop.start(np.zeros(2))
+    assert loop.discarded == (0, 0, 0)
 
 
 def test_echoes_for_a_loop_that_compares_none_are_refused():

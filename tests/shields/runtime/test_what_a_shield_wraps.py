@@ -33,37 +33,25 @@ def vector(**settings):
     return VectorSafetyShield(NCSVectorEnv(2, plant=PLANT, **settings), certificate_of(PLANT))
 
 
-def assert_refused(shield, name):
-    """A reset says what has changed; what goes on without one is not guaranteed."""
+# Where settings are kept: in the environment, inside a vector, or in the vector, which has neither process nor start.
+PLACES = {
+    "environment": (scalar, lambda env: env, CHANGED),
+    "inside a vector": (vector, lambda env: env.single, CHANGED),
+    "vector": (vector, lambda env: env, sorted(set(CHANGED) - {"process", "initial_set"})),
+}
+
+
+@pytest.mark.parametrize(("place", "name"), [(place, name) for place, (*_, names) in PLACES.items() for name in names])
+def test_changed_setting_is_said_at_the_next_reset_and_without_one_nothing_is_guaranteed(place, name):
+    make, holder, _ = PLACES[place]
+    shield = make()
+    shield.reset(seed=0)
+    setattr(holder(shield.unwrapped), *CHANGED[name])
     for _ in range(2):
         with pytest.raises(ValueError, match=f"the {name}.* is not the one that the shield was made for"):
             shield.reset()
     *_, info = shield.step(np.zeros(shield.action_space.shape))
     assert np.all(info["shield_reason"] == OTHER_STEPS)
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_changed_setting_is_said_at_the_next_reset(name):
-    shield = scalar()
-    shield.reset(seed=0)
-    setattr(shield.unwrapped, *CHANGED[name])
-    assert_refused(shield, name)
-
-
-@pytest.mark.parametrize("name", CHANGED)
-def test_changed_setting_inside_a_vector_is_said_at_the_next_reset(name):
-    shield = vector()
-    shield.reset(seed=0)
-    setattr(shield.unwrapped.single, *CHANGED[name])
-    assert_refused(shield, name)
-
-
-@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"process", "initial_set"}))
-def test_changed_setting_of_a_vector_is_said_at_the_next_reset(name):
-    shield = vector()
-    shield.reset(seed=0)
-    setattr(shield.unwrapped, *CHANGED[name])
-    assert_refused(shield, name)
 
 
 @pytest.mark.parametrize("shielded", [scalar, vector])

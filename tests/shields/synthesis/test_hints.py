@@ -15,6 +15,7 @@ from shields.synthesis import certification
 from shields.synthesis.certification import LONGEST_REFUSAL
 from shields.synthesis.diagnosis import Clock
 from tests.certificates import feasible_bounds_not_sought
+from tests.plants import servo
 from tests.verdicts import verified
 
 QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
@@ -24,12 +25,6 @@ PENDULUM = {
 }  # fmt: skip
 ANGLE = {"A": [[1.0, 0.1], [-0.045, 0.9]], "B": [[0.0], [0.1]], "dt": 0.1}
 ROOM = {"A": [[0.98]], "B": [[0.05]], "dt": 60.0, "operating_state": 22.0, "operating_input": 8.0}
-
-
-def servo(**changes):
-    given = {"box": [0.2, 4.0], "u_max": 12.0, "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
-    system = [[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]
-    return LinearPlant.from_statespace(system, 0.01, **given | changes)
 
 
 def tanks(**changes):
@@ -84,8 +79,8 @@ SLOW = {"room": pytest.mark.slow, "one end": pytest.mark.slow, "angle with a rat
 LONG = {
     "sensor": (lambda: LinearPlant(**PENDULUM | {"disturbance_bound": 1e-3, "sensor_bound": 0.2}), 0),
     "age": (lambda: LinearPlant(**PENDULUM | {"disturbance_bound": 1e-3}), 25),
-    "servo": (lambda: servo(disturbance_bound=[0.0, 0.5], u_max=0.5), 0),
-    "servo between samples": (lambda: servo(disturbance_bound=[0.0, 0.48], box=[0.2, 4.0], between_samples=4), 2),
+    "servo": (lambda: servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.5], u_max=0.5), 0),
+    "servo between samples": (lambda: servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.48], between_samples=4), 2),
     "tanks": (tanks, 2),
     "tanks with coupled valves": (lambda: tanks(mixed_limits=[([0.0, 0.0], [1.0, 1.0], 9.0, 11.0)]), 2),
     "platoon far off": (lambda: platoon(0.15), 2),

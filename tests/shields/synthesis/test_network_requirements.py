@@ -14,19 +14,12 @@ from shields import Infeasible, Network, requirements, synthesize, verify
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.network_requirements import kind_of_share
 from shields.synthesis.requirement_search import BoundarySearch, with_radii
-
-SERVO = (([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]), 0.01)
-BOUNDS = {
-    "box": [0.2, 4.0],
-    "u_max": 12.0,
-    "disturbance_bound": [0.0, 0.5],
-    "sensor_bound": 5e-4,
-    "initial_bound": [1e-3, 0.05],
-}
+from tests import plants
 
 
 def servo(**changes):
-    return LinearPlant.from_statespace(*SERVO, **BOUNDS | changes)
+    """The servo at steps of 10 ms."""
+    return plants.servo(1.0, **{"dt": 0.01, "disturbance_bound": [0.0, 0.5]} | changes)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +122,7 @@ def test_stable_plant_may_lose_everything_and_an_unstable_one_may_not():
 
 
 def test_resampled_plant_is_the_model_sampled_at_that_period():
-    direct = LinearPlant.from_statespace(SERVO[0], 0.02, **BOUNDS)
+    direct = servo(dt=0.02)
     resampled = servo().resampled(0.02)
     assert np.array_equal(resampled.A, direct.A)
     assert np.array_equal(resampled.B, direct.B)
@@ -271,11 +264,7 @@ def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
 
 
 def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps():
-    plant = LinearPlant.from_statespace(
-        ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]), dt=0.005,
-        state_limits=([-0.1, -4.0], [0.3, 4.0]), u_max=12.0, disturbance_bound=[0.0, 0.25], sensor_bound=5e-4,
-        initial_bound=[1e-3, 0.05],
-    )  # fmt: skip
+    plant = plants.servo(1.0, box=None, state_limits=([-0.1, -4.0], [0.3, 4.0]))
     points = requirements(plant, losses=[0, 2, 4]).points
     for point in points:
         kept = synthesize(plant, contract=point.network.contract).provenance["polytope_share_of_box"]

@@ -12,12 +12,6 @@ from tests.certificates import certificate_of, with_proof
 from tests.plants import named
 
 
-@pytest.fixture
-def path(certificate, tmp_path):
-    certificate.save(tmp_path / "certificate.json")
-    return tmp_path / "certificate.json"
-
-
 @pytest.fixture(scope="module")
 def by_age():
     return certificate_of(*named("unstable"))
@@ -29,6 +23,7 @@ def test_what_is_loaded_equals_what_was_saved(certificate, by_age, tmp_path):
         loaded = Certificate.load(tmp_path / "c.json")
         assert loaded == each
         assert hash(loaded) == hash(each)
+        assert loaded.method == "certified"
         assert len({loaded, each}) == 1
     assert by_age != certificate
     assert certificate != "certificate"
@@ -53,7 +48,9 @@ def test_any_other_last_digit_makes_another_certificate(certificate, by_age):
     assert replace(certificate, fingerprint="0" * 64) != certificate
 
 
-def test_files_without_today_s_records_load_and_are_saved_byte_by_byte(path):
+def test_files_without_today_s_records_load_and_are_saved_byte_by_byte(certificate, tmp_path):
+    path = tmp_path / "certificate.json"
+    certificate.save(path)
     document = json.loads(path.read_text())
     for name in ("share_of_box", "tolerated_scale", "assumptions"):
         document["certificate"]["provenance"].pop(name, None)

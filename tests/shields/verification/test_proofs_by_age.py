@@ -1,4 +1,4 @@
-"""Proofs by age of the newest sample: valid, kept by their files, and refused for the right condition when changed."""
+"""Proofs by age of the newest sample: one for each, the margins of floating point, and files that say one thing."""
 
 from dataclasses import replace
 
@@ -18,18 +18,9 @@ def promised():
     return plant, certificate_of(plant, contract=contract)
 
 
-def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, tmp_path):
+def test_certificate_under_a_contract_is_proved_for_every_age(promised):
     plant, certificate = promised
     assert verified(certificate, plant).valid
-    certificate.save(tmp_path / "c.json")
-    loaded = Certificate.load(tmp_path / "c.json")
-    assert verified(loaded, plant).valid
-    assert loaded.contract == certificate.contract
-    np.testing.assert_array_equal(loaded.error_shapes, certificate.error_shapes)
-    np.testing.assert_array_equal(loaded.next_error_shapes, certificate.next_error_shapes)
-    for mine, other in zip(loaded.proofs, certificate.proofs, strict=True):
-        np.testing.assert_array_equal(mine.inputs, other.inputs)
-    assert len(loaded.error_shapes) == 3
     names = [condition.name for condition in verified(certificate, plant).conditions]
     assert sum(name.startswith("(C1)") for name in names) == sum(name.startswith("(C2)") for name in names) == 3
     assert sum(name.startswith("(I)") for name in names) == 3
@@ -38,45 +29,6 @@ def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, t
 
 def updates(certificate, **change):
     return replace(certificate, updates=replace(certificate.updates, **change))
-
-
-def at(array, index, factor):
-    changed = array.copy()
-    changed[index] = changed[index] * factor
-    return changed
-
-
-MUTATIONS = {
-    "small first set": (lambda c: with_proof(c, 0, Sigma=1e-6 * c.error_shapes[0]), ["(C0)", "(C2)"]),
-    "a set in between": (lambda c: with_proof(c, 1, Sigma=0.9 * c.error_shapes[1]), ["(C1) Sigma_1"]),
-    "the last set": (lambda c: updates(c, last=0.9 * c.updates.last), ["(C1) Sigma_3"]),
-    "a gain": (lambda c: updates(c, gains=at(c.updates.gains, 1, 1.5)), ["(C2)"]),
-    "no gain": (lambda c: updates(c, gains=at(c.updates.gains, 2, 0.0)), ["(C2)"]),
-    "a rate": (lambda c: with_proof(c, 0, rate=0.5 * c.proofs[0].rate), ["(C1) Sigma_1"]),
-    "a rate above one": (lambda c: with_proof(c, 0, rate=5.0 * c.proofs[0].rate), ["0 < lam_e < 1"]),
-    "a multiplier": (lambda c: updates(c, shares=at(c.updates.shares, 0, 0.01)), ["(C2)"]),
-    "less noise": (lambda c: updates(c, noise=0.9 * c.updates.noise), ["N:"]),
-    "coarser rounding": (lambda c: updates(c, contract=ChannelContract(2, 5e-3)), ["N:"]),
-    "shares of (I)": (
-        lambda c: with_proof(c, 1, shares=at(c.proofs[1].shares, 1, 1e-6)),
-        ["(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0 at age 1"],
-    ),
-    "shares of (U)": (
-        lambda c: with_proof(c, 0, inputs=at(c.proofs[0].inputs, 1, 1e-9)),
-        ["(U) input 2 stays within u_max (1 - 2^-24) at age 0"],
-    ),
-    "multipliers above one": (lambda c: with_proof(c, 2, shares=at(c.proofs[2].shares, 0, 1.5)), ["lx + le + ld <= 1"]),
-}
-
-
-@pytest.mark.parametrize("name", MUTATIONS)
-def test_mutation_of_a_proof_by_age_is_rejected_for_the_right_condition(name, promised):
-    plant, certificate = promised
-    mutate, expected = MUTATIONS[name]
-    report = verified(mutate(certificate), plant)
-    broken = [condition.name for condition in report.conditions if not condition.holds]
-    for mark in expected:
-        assert any(mark in found for found in broken), (mark, broken)
 
 
 def test_margins_by_age_agree_with_floating_point(promised):
