@@ -64,6 +64,13 @@ def ncs(*arguments, cwd=None, **changes: str) -> Run:
         return Run(code, out.read_text("utf-8"), err.read_text("utf-8"))
 
 
+def succeeded(*arguments, cwd=None, **changes: str) -> Run:
+    """Runs `ncs` in this process, and fails if it does not end well."""
+    run = ncs(*arguments, cwd=cwd, **changes)
+    assert run.returncode == 0, run.stderr
+    return run
+
+
 def assert_one_sentence(run, *words):
     assert run.returncode == 2, run.stderr
     assert "Traceback" not in run.stderr

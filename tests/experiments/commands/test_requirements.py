@@ -11,7 +11,7 @@ import pytest
 
 from ncs_gym import LinearPlant
 from shields import Certificate, certificate_for, verify
-from tests.command import ROOT, ncs
+from tests.command import ROOT, ncs, succeeded
 
 
 @pytest.fixture
@@ -32,8 +32,7 @@ def test_requirements_that_are_refused_leave_nothing(plant_file, tmp_path):
 def test_requirements_leave_table_figure_certificates_and_are_resumed(plant_file, tmp_path, without_workers):
     asked = ("--send-periods", 1, 2, "--losses", 0, 12, "--out", tmp_path / "r")
     arguments = ("requirements", "--plant", plant_file, *asked)
-    first = ncs(*arguments)
-    assert first.returncode == 0, first.stderr
+    first = succeeded(*arguments)
     assert "no certificate was found" in " ".join(first.stdout.split())
     assert "Cheapest" in first.stdout
     summary = json.loads((tmp_path / "r/summary.json").read_text())
@@ -55,8 +54,7 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     sent = np.cumsum([0.0] + [0.1] * 99 + [1.5] * 3 + [0.1] * 99 + [0.8] + [0.1] * 99)
     (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each:.1f},{each:.1f}\n" for each in sent))
     asked = ("--send-periods", 1, "--losses", 2, 14, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
-    found = ncs("requirements", "--plant", plant_file, *asked)
-    assert found.returncode == 0, found.stderr
+    found = succeeded("requirements", "--plant", plant_file, *asked)
     assert "may be 10 steps (1 s) old" in (said := " ".join(found.stdout.split()))
     assert "The widest contract with a certificate, 10 steps of 0.1 s, the record breaks 3 times, " in said
     assert "Read as a table: 'sent' in s, 'received' in s." in said
@@ -72,8 +70,7 @@ def test_requirements_say_that_a_record_does_not_count_where_no_sample_is_needed
         "sent,received\n" + "".join(f"{0.1 * k:.1f},{0.1 * k:.1f}\n" for k in range(99))
     )
     asked = ("--losses", 0, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
-    found = ncs("requirements", "--env", "ncs_gym/TruckTrailer-v0", *asked)
-    assert found.returncode == 0, found.stderr
+    found = succeeded("requirements", "--env", "ncs_gym/TruckTrailer-v0", *asked)
     assert "certificate that needs no samples at all keeps whatever the record lost" in " ".join(found.stdout.split())
 
 
@@ -82,8 +79,7 @@ def test_requirements_say_how_often_the_box_can_be_left_over_a_record_today(tmp_
     sent = np.cumsum([0.0] + [0.05] * 50 + [0.2, *[0.05] * 20] * 3 + [0.25] + [0.05] * 50)
     (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each:.2f},{each:.2f}\n" for each in sent))
     asked = ("--losses", 2, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
-    found = ncs("requirements", "--env", "ncs_gym/Pendulum-v0", *asked)
-    assert found.returncode == 0, found.stderr
+    found = succeeded("requirements", "--env", "ncs_gym/Pendulum-v0", *asked)
     said = " ".join(found.stdout.split())
     assert "Today's contract, 2 steps of 0.05 s, the record breaks 4 times" in said
     assert "today's contract allows the box is kept until the newest sample is 3 steps old" in said
@@ -94,8 +90,9 @@ def test_channel_prints_the_contract_that_was_kept(tmp_path):
     rng = np.random.default_rng(0)
     lines = [f"{0.02 * i},{'' if rng.random() < 0.2 else 0.02 * i + 0.01}" for i in range(500)]
     (tmp_path / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--out", tmp_path / "numbers.json")
-    assert found.returncode == 0, found.stderr
+    found = succeeded(
+        "channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--out", tmp_path / "numbers.json"
+    )
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     assert numbers["lost"] == sum(line.endswith(",") for line in lines)
     assert f"max_age = {numbers['kept']}" in found.stdout
@@ -114,8 +111,7 @@ def test_channel_compares_a_record_with_a_certificate_of_one_s_own_as_with_that_
     own = ("--certificate", tmp_path / "certificate.json", "--plant", tmp_path / "plant.json")
     texts = []
     for given in (own, ("--env", "ncs_gym/CartPole-v0")):
-        found = ncs("channel", tmp_path / "packets.csv", *given, "--least-safe-steps", 3)
-        assert found.returncode == 0, found.stderr
+        found = succeeded("channel", tmp_path / "packets.csv", *given, "--least-safe-steps", 3)
         texts.append(" ".join(found.stdout.split()))
     assert texts[0].replace("The certificate's contract", "The environment's contract") == texts[1]
     assert "The certificate's contract, a newest sample of at most 4 steps, was broken" in texts[0]
@@ -127,8 +123,7 @@ def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_pat
     (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each},{each}\n" for each in sent))
     for least, times in ((10, "6 times"), (30, "once"), (49, "once")):
         given = ("--env", "ncs_gym/CartPole-v0", "--least-safe-steps", least)
-        found = ncs("channel", tmp_path / "packets.csv", *given)
-        assert found.returncode == 0, found.stderr
+        found = succeeded("channel", tmp_path / "packets.csv", *given)
         said = " ".join(found.stdout.split())
         assert f"the box is kept at least until the newest sample is {4 + least} steps old" in said
         assert f"In the record it was older {times}" in said
@@ -145,8 +140,7 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_pat
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["wifi_record.py", str(tmp_path / "packets.csv")])
     runpy.run_path(str(ROOT / "examples" / "wifi_record.py"), run_name="__main__")
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", 35)
-    assert found.returncode == 0, found.stderr
+    found = succeeded("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", 35)
     promised = "    If a shield" + found.stdout.partition("If a shield")[2].replace("\n", "\n    ")
     for name in ("contracts.md", "requirements.md"):
         page = (ROOT / "docs" / name).read_text()
@@ -164,8 +158,7 @@ def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
     sent = [0.1 * i for i in range(100)] + [75.0 + 0.1 * i for i in range(1000)]
     lines = "".join(f"{each},{each + 0.25}\n" for each in sent)
     (tmp_path / "packets.csv").write_text("sent,received\n" + lines)
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/Convoy-v0")
-    assert found.returncode == 0, found.stderr
+    found = succeeded("channel", tmp_path / "packets.csv", "--env", "ncs_gym/Convoy-v0")
     said = " ".join(found.stdout.split())
     assert "Contract kept by the record: max_age = 653 (65.3 s; first half 653, second half" in said
     assert "Span and number of packets disagree" in said

@@ -20,7 +20,7 @@ from experiments.study.study import results_tables
 from experiments.study.tables import QUOTABLE
 from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
 from ncs_gym import LinearPlant
-from tests.command import ROOT, ncs
+from tests.command import ROOT, succeeded
 from tests.experiments.results import run, summary_of
 
 WIDTH = 80
@@ -45,8 +45,7 @@ LONG_CAMPAIGN = SafetyCounts(
 
 def printed(*arguments):
     """What a command prints, without the lines that name its files."""
-    done = ncs(*arguments, COLUMNS=str(WIDTH))
-    assert done.returncode == 0, done.stderr
+    done = succeeded(*arguments, COLUMNS=str(WIDTH))
     return "\n".join(
         line for line in done.stdout.splitlines() if not line.startswith(("files: ", "agent: ", "saved to "))
     )
