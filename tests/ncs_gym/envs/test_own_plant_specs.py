@@ -3,7 +3,6 @@
 import copy
 import json
 import pickle
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +27,6 @@ from ncs_gym import (
     SpeedTracking,
     SphereDisturbance,
     TraceChannel,
-    truck_trailer,
 )
 from ncs_gym.processes import CartPoleProcess, nonlinear_cart_pole
 from ncs_gym.registration import registered_ids
@@ -158,31 +156,6 @@ def test_spec_of_a_vector_environment_is_json(register):
         assert isinstance(again, NCSVectorEnv)
         assert again.episode_channels == made.episode_channels
         assert_moves_alike(made, again)
-
-
-@pytest.mark.parametrize(
-    "plant",
-    [
-        replace(truck_trailer(), between_samples=3),
-        LinearPlant.from_statespace(
-            ([[0.0, 1.0], [-1.0, -1.0]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))),
-            0.1,
-            input_delay=2,
-            box=1.0,
-            u_max=1.0,
-            disturbance_bound=Ellipsoid(1e-4 * np.eye(2)),
-            sensor_bound=0,
-            initial_bound=0.01,
-        ),
-        nonlinear_cart_pole(),
-    ],
-    ids=["between_samples", "input_delay", "remainder"],
-)
-def test_document_of_a_plant_has_all_of_it(plant):
-    document = json.loads(json.dumps(plant.document))
-    again = LinearPlant.read(document)
-    assert (again.fingerprint, again.assumptions, str(again)) == (plant.fingerprint, plant.assumptions, str(plant))
-    assert again.document == plant.document == document
 
 
 def test_process_of_a_plant_of_ones_own_is_json():

@@ -149,19 +149,11 @@ def test_without_the_setting_only_samples_count_and_everything_is_as_before():
     env.reset(seed=0)
 
 
-def test_file_of_a_plant_keeps_the_setting(tmp_path):
-    plant = replace(batch_reactor(), between_samples=4)
-    plant.save(tmp_path / "plant.json")
-    again = LinearPlant.load(tmp_path / "plant.json")
-    assert again.fingerprint == plant.fingerprint
-    np.testing.assert_array_equal(again.grid_rows.state, plant.grid_rows.state)
-    assert "at all times: at 4 of each step" in str(plant)
-    assert "at all times" not in str(batch_reactor())
-
-
 def test_once_per_step_is_at_the_sampling_instants_alone():
     plant = replace(truck_trailer(), between_samples=8)
     assert "by any time within a step" in " ".join(plant.assumptions)
+    assert "at all times: at 8 of each step" in str(plant)
+    assert "at all times" not in str(truck_trailer())
     assert replace(plant, between_samples=1).between_samples is None
     assert replace(plant, between_samples=1).fingerprint == truck_trailer().fingerprint
 
