@@ -31,7 +31,6 @@ from ncs_gym import (
     LinearProcess,
     NCSEnv,
     NCSVectorEnv,
-    PacketLog,
     RandomChannel,
     Regulation,
     Remainder,
@@ -184,14 +183,6 @@ def folder_for_a_file(folder):
     plant_in(None)(folder)
 
 
-def log_in(text):
-    def load(folder):
-        (folder / "packets.csv").write_text(text)
-        PacketLog.load(folder / "packets.csv")
-
-    return load
-
-
 def weakened_remainder():
     return replace(modeled(), remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"))
 
@@ -305,13 +296,6 @@ CHANNELS = [
     (lambda: TraceChannel(trace=(0, -1), loss=0.1), "loss of a TraceChannel"),
     (TraceChannel, "trace"),
     (lambda: side_by_side([TraceChannel(trace=(0, 1)), TraceChannel(trace=(0, 2))]), "stands beside equal ones"),
-    (log_in(""), "at least two packets"),
-    (log_in("sent,received\n0.0,0.1\n"), "at least two packets"),
-    (log_in("sent,received\n0.0,0.1\n0.0,0.2\n"), "one after the other"),
-    (log_in("sent,received\n1.0,0.5\n2.0,2.1\n"), "clocks"),
-    (log_in("sent,received\n0.0,0.1\nlate,0.2\n"), "line 3"),
-    (log_in("sent,received\n0.0,0.1\n1.0,1e999\n"), "line 3"),
-    (log_in("episode,sent,received\n77,1,\n"), "line 2 is not an episode"),
     (lambda: Actuator(input_delay=2, inputs=1).start(episode=0.5), "episode must be a whole number >= 0"),
     *called(
         Actuator(input_delay=2, inputs=1).apply,
