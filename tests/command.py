@@ -93,7 +93,7 @@ def killed(*arguments, once: Callable[[], bool]) -> None:
     assert len(children) >= 2
     run.kill()
     run.wait()
-    while any(_is_alive(child) for child in children):
+    while any(is_alive(child) for child in children):
         assert time.monotonic() < deadline, "workers outlive their parent"
         time.sleep(0.1)
 
@@ -104,7 +104,7 @@ def _children_of(pid: int) -> list[int]:
     return [int(head.split()[0]) for head, tail in stats if int(tail.split()[1]) == pid]
 
 
-def _is_alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
     """Whether a process runs (a zombie does not)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
