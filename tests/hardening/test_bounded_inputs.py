@@ -515,14 +515,6 @@ def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     assert refused > 3
 
 
-def test_settings_name_no_more_runs_and_processes_than_there_may_be():
-    from experiments.settings import CompareSettings
-
-    for changes in ({"seeds": 10**9}, {"jobs": 10**6}, {"episodes": 10**9}):
-        with pytest.raises(ValueError, match="at most"):
-            CompareSettings(**changes)
-
-
 @pytest.mark.parametrize("text", ["x" * 1001, "\x1b[2J", "two\nlines"], ids=["long", "escape", "lines"])
 def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
     document = json.loads(json.dumps(truck_trailer().document))

@@ -104,7 +104,7 @@ REFUSED = {
     ChannelContract: {"max_age": [*COUNTS, None, 1001]},
     Regulation: {"state_cost": NOT_COSTS},
     AdversarialDisturbance: {"M": NOT_COSTS},
-    Ellipsoid: {"shape_matrix": NOT_COSTS},
+    Ellipsoid: {"shape_matrix": [*NOT_COSTS, [[np.nan]], np.ones((2, 3))]},
     SpeedTracking: {
         **dict.fromkeys(("fastest", "error_weight", "input_weight"), WRONG),
         "input_index": COUNTS,

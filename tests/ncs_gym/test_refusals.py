@@ -618,7 +618,6 @@ PROCESSES = [
     (lambda: replace(modeled(), remainder=replace(weakened_remainder(), box=[0.2, 1.5]).remainder), "another box"),
 ]
 TASKS = [
-    *changed(Regulation, *(({"state_cost": cost}, "state_cost") for cost in (1.0, -np.eye(2)))),
     *changed(
         partial(NCSEnv, PLANT),
         (
@@ -629,10 +628,6 @@ TASKS = [
     ),
 ]
 UNCERTAINTY = [
-    *called(
-        Ellipsoid,
-        *((shape, "shape") for shape in (np.diag([1.0, -1.0]), [[1.0, 2.0], [0.0, 1.0]], [[np.nan]], np.ones((2, 3)))),
-    ),
     *called(
         lambda value: as_bound(value, 2, "d"),
         (-1.0, r"d must be a number or shape \(2,\), each 0 or between"),
