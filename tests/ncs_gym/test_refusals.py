@@ -58,6 +58,7 @@ from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, Pendulum
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from shields import SafetyShield
+from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"
 PLANT, HEAVY, UNSTABLE = truck_trailer(), truck_trailer(mass=4000.0), cart_pole()
@@ -697,6 +698,7 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(call, error, words, tmp_
     assert set(gym.registry) == before
 
 
+UNUSABLE = [*NOTHING_USABLE, *WRONG_NUMBERS]
 CALLS = {  # What is called, whether with an environment or with three, the argument, and the words.
     "step": [
         *((False, action, "the action must be finite") for action in ([np.nan], [np.inf], [0.0, 0.0], 0.5, "go", None)),
@@ -709,7 +711,10 @@ CALLS = {  # What is called, whether with an environment or with three, the argu
         *((False, {"state": wrong}, "state") for wrong in ([1.0], [np.nan, 0.0], "a", None)),
         *((True, {"state": wrong}, "state") for wrong in (np.zeros(3), np.full((3, 2), np.nan))),
         *((many, {"sate": [0.0, 0.0]}, "reset knows the options") for many in (False, True)),
-        *((True, {"reset_mask": wrong}, "reset_mask") for wrong in (np.ones(2, np.bool_), np.ones(3))),
+        *((many, wrong, "option") for many in (False, True) for wrong in UNUSABLE if type(wrong) is not dict),
+        *((many, wrong, "option") for many in (False, True) for wrong in ({"a": 1}, {1: 2})),
+        *((many, {"state": wrong}, "state") for many in (False, True) for wrong in UNUSABLE),
+        *((True, {"reset_mask": wrong}, "reset_mask") for wrong in (np.ones(2, np.bool_), np.ones(3), *UNUSABLE)),
         (True, {"reset_mask": np.zeros(3, np.bool_)}, "reset_mask"),
         *(
             (many, {name: wrong}, words)
@@ -730,8 +735,9 @@ def test_what_an_environment_refuses_changes_nothing(call, many, wrong, words):
     env, twin = (NCSVectorEnv(3, plant=PLANT) if many else NCSEnv(PLANT) for _ in range(2))
     reset(env)
     reset(twin)
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=words) as caught:
         env.step(wrong) if call == "step" else env.reset(seed=7, options=wrong)
+    assert not re.search(r"\n|[.!?] [A-Z]", str(caught.value))
     action = np.full(env.action_space.shape, 0.25)
     np.testing.assert_array_equal(env.step(action)[4]["state"], twin.step(action)[4]["state"])
 
