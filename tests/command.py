@@ -32,6 +32,11 @@ class Run(NamedTuple):
     stdout: str
     stderr: str
 
+    @property
+    def prose(self) -> str:
+        """What was printed, without its line breaks."""
+        return " ".join(self.stdout.split())
+
 
 def environment(*first: str | os.PathLike[str], **changes: str) -> dict[str, str]:
     """Environment variables of a process that imports from the folders given, then from this tree."""

@@ -372,7 +372,7 @@ def test_command_refuses_without_and_evaluates_with_the_statistics(tmp_path):
     given = "evaluate", tmp_path / "own.zip", "--env", CRUISE, "--episodes", 2, "--shield", "none"
     assert_one_sentence(ncs(*given), "saw observations that VecNormalize normalized: give --vec-normalize", "pkl, or")
     run = succeeded(*given, "--vec-normalize", tmp_path / "vecnormalize.pkl")
-    assert f"with --vec-normalize {tmp_path / 'vecnormalize.pkl'}" in " ".join(run.stdout.split())
+    assert f"with --vec-normalize {tmp_path / 'vecnormalize.pkl'}" in run.prose
 
 
 def test_statistics_for_what_is_no_zip_are_refused(tmp_path):

@@ -86,7 +86,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     lines = run.stdout.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if "training:" in line) :]
     assert all(name in {line.split("  ")[0] for line in table} for name in ("unshielded", "proportional+shielded"))
-    prose = " ".join(run.stdout.split())
+    prose = run.prose
     assert "% of the largest ellipsoid in the box)" in prose
     assert "evaluation episodes; the true state came to" in prose
     assert str(out) in run.stdout
@@ -183,7 +183,7 @@ def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
         with without_pictures():
             run = succeeded(*command, "--smoke", cwd=tmp_path)
         if command[0] == "train":  # so little was tried that nothing happened
-            said = " ".join(run.stdout.split())
+            said = run.prose
             assert "This training had no violation and no override, so it does not show what the shield is for" in said
             assert "leave out --smoke" in said
             assert run.stdout.splitlines()[-1].startswith("agent: ")
@@ -269,8 +269,8 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
         assert set(document["arms"]) == {f"shield: {mode}"}
         assert (document["arms"][f"shield: {mode}"]["plan_rate"] > 0.0) is (mode == "lookahead")
         assert ("from a" in evaluated.stdout) is (mode == "lookahead")
-        assert "The guarantee held after 600 of 600 steps." in " ".join(evaluated.stdout.split())
-    asked = " ".join(ncs("evaluate", out, "--episodes", "3", "--least-safe-steps", "2").stdout.split())
+        assert "The guarantee held after 600 of 600 steps." in evaluated.prose
+    asked = ncs("evaluate", out, "--episodes", "3", "--least-safe-steps", "2").prose
     assert "held after 600 of 600 steps; after 600 the box was promised for one step more at least" in asked
 
 

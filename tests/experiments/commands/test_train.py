@@ -29,7 +29,7 @@ def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, 
     run = succeeded("train", "--arm", arm, *short, "--out", tmp_path / "r")
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())["arms"][arm]
     assert {name for name in ("train_violation_steps", "train_intervention_rate") if summary[name]} == happens
-    prose = " ".join(run.stdout.split())
+    prose = run.prose
     assert (HINT in prose) is (not happens)
     assert ("raise --steps, or run `ncs compare`" in prose) is (not happens)
 

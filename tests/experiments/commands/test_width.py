@@ -19,7 +19,6 @@ from experiments.settings import LoopSettings
 from experiments.study.study import results_tables
 from experiments.study.tables import QUOTABLE
 from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
-from ncs_gym import LinearPlant
 from tests.command import ROOT, succeeded
 from tests.experiments.results import run, summary_of
 
@@ -59,10 +58,7 @@ class Shown:
 
     @property
     def plant(self):
-        """The file of an unstable plant of one state, of which searches take no time."""
-        bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.01}
-        LinearPlant(A=[[1.2]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds).save(self.folder / "plant.json")
-        return self.folder / "plant.json"
+        return self.request.getfixturevalue("plant_file")
 
     def compare(self):
         return self.request.getfixturevalue("smoke")[1].stdout.partition("files: ")[0]
@@ -132,10 +128,8 @@ class Shown:
         return "\n".join(line for text in shown for line in text.splitlines() if " verifies" not in line)
 
     def channel(self):
-        rng = np.random.default_rng(0)
-        lines = [f"{0.02 * i},{'' if rng.random() < 0.2 else 0.02 * i + 0.01}" for i in range(500)]
-        (self.folder / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
-        return printed("channel", self.folder / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+        record = self.request.getfixturevalue("record")
+        return printed("channel", record(0.02 * np.arange(500), delay=0.01, loss=0.2), "--env", "ncs_gym/CartPole-v0")
 
     def requirements(self):
         asked = ("--send-periods", 1, 2, "--losses", *range(12), "--input-delays", 0, 1, "--jobs", 1)
