@@ -368,16 +368,6 @@ def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(mo
     assert "SAID" not in os.environ
 
 
-@pytest.mark.parametrize(
-    "command", ["compare", "train", "evaluate", "sweep", "render", "synthesize", "verify", "audit", "reproduce"]
-)
-def test_every_command_has_help_seed_and_out(command):
-    run = ncs(command, "--help")
-    assert run.returncode == 0
-    assert "--seed" in run.stdout
-    assert "--out" in run.stdout
-
-
 def test_help_shows_every_setting_and_what_a_settings_file_gives(smoke):
     run = ncs("compare", "--config", smoke[0] / "settings.json", "--help")
     assert run.returncode == 0

@@ -171,10 +171,12 @@ def test_everything_that_a_command_prints_fits_into_80_columns(command, shown):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_fits_into_80_columns(command):
+def test_help_fits_into_80_columns_and_every_command_has_a_seed_and_a_place_for_its_files(command):
     usage, *lines = printed(command, "--help").splitlines()
     assert usage.startswith("usage: ")  # tyro's own, which may be longer
     assert [line for line in lines if len(line) > WIDTH] == []
+    assert any("--out" in line for line in lines)
+    assert any("--seed" in line for line in lines) or command == "channel"
 
 
 def test_rows_of_a_campaign_that_breaks_nothing_are_whole():
