@@ -32,6 +32,11 @@ class Run(NamedTuple):
     stdout: str
     stderr: str
 
+    @property
+    def prose(self) -> str:
+        """What was printed, without its line breaks."""
+        return " ".join(self.stdout.split())
+
 
 def environment(*first: str | os.PathLike[str], **changes: str) -> dict[str, str]:
     """Environment variables of a process that imports from the folders given, then from this tree."""
@@ -64,6 +69,13 @@ def ncs(*arguments, cwd=None, **changes: str) -> Run:
         return Run(code, out.read_text("utf-8"), err.read_text("utf-8"))
 
 
+def succeeded(*arguments, cwd=None, **changes: str) -> Run:
+    """Runs `ncs` in this process, and fails if it does not end well."""
+    run = ncs(*arguments, cwd=cwd, **changes)
+    assert run.returncode == 0, run.stderr
+    return run
+
+
 def assert_one_sentence(run, *words):
     assert run.returncode == 2, run.stderr
     assert "Traceback" not in run.stderr
@@ -86,7 +98,7 @@ def killed(*arguments, once: Callable[[], bool]) -> None:
     assert len(children) >= 2
     run.kill()
     run.wait()
-    while any(_is_alive(child) for child in children):
+    while any(is_alive(child) for child in children):
         assert time.monotonic() < deadline, "workers outlive their parent"
         time.sleep(0.1)
 
@@ -97,7 +109,7 @@ def _children_of(pid: int) -> list[int]:
     return [int(head.split()[0]) for head, tail in stats if int(tail.split()[1]) == pid]
 
 
-def _is_alive(pid: int) -> bool:
+def is_alive(pid: int) -> bool:
     """Whether a process runs (a zombie does not)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"

@@ -3,7 +3,6 @@
 import ast
 import builtins
 import importlib
-import os
 import re
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.command import environment
 from tests.programs import output_of
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -180,12 +180,11 @@ def test_programs_of_a_page_that_train_nothing_print_what_follows_them(page):
 @pytest.mark.parametrize("page", SLOW_PAGES)
 def test_programs_of_a_page_print_what_follows_them_in_a_process_of_their_own(page, tmp_path):
     programs = PROGRAM.findall((ROOT / page).read_text())
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     run = subprocess.run(
         [sys.executable, "-c", in_one(programs)],
         capture_output=True,
         text=True,
-        env=os.environ | {"PYTHONPATH": path},
+        env=environment(),
         cwd=tmp_path,
         timeout=600,
     )

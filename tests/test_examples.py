@@ -2,7 +2,6 @@
 
 import ast
 import importlib.util
-import os
 import re
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import environment
 from tests.programs import output_of_file
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -130,10 +130,8 @@ FOREIGN = {
 
 
 def run_example(name, *arguments, cwd, **variables):
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, str(ROOT / "examples" / name), *arguments]
-    environment = os.environ | {"PYTHONPATH": path} | variables
-    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=cwd, timeout=600)
+    return subprocess.run(command, capture_output=True, text=True, env=environment(**variables), cwd=cwd, timeout=600)
 
 
 def test_every_example_is_run_here():

@@ -2,7 +2,6 @@
 
 import csv
 import importlib.util
-import os
 import re
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from gymnasium.wrappers import vector
 from stable_baselines3.common.env_util import make_vec_env
 
 from shields import SafetyShield, VectorSafetyShield
+from tests.command import environment
 
 ROOT = Path(__file__).resolve().parent.parent
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -191,11 +191,8 @@ def test_shield_that_is_a_part_of_the_id_is_inside_monitor(monkeypatch):
 
 
 def zoo(*arguments):
-    path = [str(ROOT), str(ROOT / "examples" / "rl_zoo"), os.environ.get("PYTHONPATH")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))}
-    run = subprocess.run(
-        [sys.executable, "-m", *map(str, arguments)], capture_output=True, text=True, env=environment, timeout=600
-    )
+    command, given = [sys.executable, "-m", *map(str, arguments)], environment(ROOT / "examples" / "rl_zoo")
+    run = subprocess.run(command, capture_output=True, text=True, env=given, timeout=600)
     assert run.returncode == 0, run.stderr
     return run.stdout
 

@@ -183,14 +183,19 @@ def test_specification_of_vector_wrappers_makes_no_environments_without_them():
             gym.make_vec(env.spec)
 
 
-def test_cost_of_packets_may_change_and_is_that_of_the_spec():
-    env = RequestActions(gym.make(ID, **ASKS), cost=0.1)
-    assert gym.make(env.spec).cost == 0.1
-    env.cost = 0.3
-    assert gym.make(env.spec).cost == 0.3
-    with pytest.raises(ValueError, match="cost must be a number >= 0"):
-        env.cost = -3.0
-    assert env.cost == 0.3
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [(lambda: RequestActions(gym.make(ID, **ASKS), cost=0.1), "cost"), (shield, "penalty"), (shields, "penalty")],
+)
+def test_prices_of_wrappers_may_change_and_are_those_of_their_specs(make, name):
+    env = make()
+    for price in (getattr(env, name), 0.5):
+        setattr(env, name, price)
+        assert getattr(env, name) == price
+        assert make is shields or getattr(gym.make(env.spec), name) == price
+    with pytest.raises(ValueError, match=f"{name} must be a number >= 0"):
+        setattr(env, name, -3.0)
+    assert getattr(env, name) == 0.5
 
 
 def test_what_random_channels_draw_from_is_that_of_their_spec():
@@ -198,15 +203,3 @@ def test_what_random_channels_draw_from_is_that_of_their_spec():
     assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.1
     env.draw_from([Channel(loss=0.5)])
     assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.5
-
-
-def test_penalty_of_a_shield_may_change_and_is_that_of_its_spec():
-    for env in (shield(), shields()):
-        env.penalty = 0.5
-        assert env.penalty == 0.5
-        with pytest.raises(ValueError, match="penalty must be a number >= 0"):
-            env.penalty = -1.0
-        assert env.penalty == 0.5
-    made_of = shield()
-    made_of.penalty = 0.5
-    assert gym.make(made_of.spec).penalty == 0.5

@@ -30,16 +30,16 @@ def test_file_names_registered_environments_only():
     assert len(OWN) == 9
 
 
-@pytest.mark.parametrize("env_id", ["ncs_gym/LinearNCS-v0", "Plants/Tanks-v0", "ncs_gym:ncs_gym/CartPole-v0"])
-def test_plant_of_ones_own_has_none(env_id):
-    assert tuned_hyperparams(env_id) is None
-    assert tuned_steps(env_id) is None
-
-
-@pytest.mark.parametrize("algorithm", ["TRPO", "A2C", "SAC", "TD3", "../ppo"])
-def test_algorithm_that_was_not_tuned_has_none(algorithm):
-    assert tuned_hyperparams("ncs_gym/CartPole-v0", algorithm) is None
-    assert tuned_steps("ncs_gym/CartPole-v0", algorithm) is None
+@pytest.mark.parametrize(
+    "given",
+    [
+        *((env_id,) for env_id in ("ncs_gym/LinearNCS-v0", "Plants/Tanks-v0", "ncs_gym:ncs_gym/CartPole-v0")),
+        *(("ncs_gym/CartPole-v0", algorithm) for algorithm in ("TRPO", "A2C", "SAC", "TD3", "../ppo")),
+    ],
+)
+def test_plant_of_ones_own_and_algorithm_that_was_not_tuned_have_none(given):
+    assert tuned_hyperparams(*given) is None
+    assert tuned_steps(*given) is None
 
 
 def test_budget_of_the_main_job_has_not_grown():

@@ -23,9 +23,12 @@ def test_horizon_of_lookahead_reaches_both_kinds_of_environment(certificate, giv
         assert (env.filter.mode, env.filter.horizon) == ("lookahead", horizon)
 
 
-def test_channel_reaches_both_kinds_of_environment():
-    loop = LoopConfig(env=CRUISE, kwargs={"channel": Channel(delay=7)})
-    assert loop.single().unwrapped.channel.delay == loop.vector(2).unwrapped.channel.delay == 7
+def test_channel_and_downlink_reach_both_kinds_of_environment():
+    env = "ncs_gym/TruckTrailerCruiseTwoWay-v0"
+    assert LoopConfig(env=env).single().unwrapped.downlink_protocol.input_delay == 3
+    loop = LoopConfig(env=env, kwargs={"channel": Channel(delay=7), "downlink": Channel(delay=1)})
+    for made in (loop.single().unwrapped, loop.vector(2).unwrapped):
+        assert (made.channel.delay, made.downlink_protocol.input_delay) == (7, 1)
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
@@ -58,14 +61,3 @@ def test_changed_arguments_are_those_of_the_changed_loop_alone():
     changed = loop.with_kwargs(channel=None, noise="gaussian")
     assert (changed.kwargs, changed.channel) == ({"noise": "gaussian"}, None)
     assert (loop.kwargs, loop.channel) == ({"channel": {"delay": 7}}, Channel(delay=7))
-
-
-def test_loop_replaces_the_downlink():
-    env = "ncs_gym/TruckTrailerCruiseTwoWay-v0"
-    assert LoopConfig(env=env).single().unwrapped.downlink_protocol.input_delay == 3
-    loop = LoopConfig(env=env, kwargs={"downlink": Channel(delay=1)})
-    assert (
-        loop.single().unwrapped.downlink_protocol.input_delay
-        == loop.vector(2).unwrapped.downlink_protocol.input_delay
-        == 1
-    )

@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from agents import AgentError, LoopConfig, ShieldSettings, evaluate, pretrained, pretrained_folder
 from ncs_gym.registration import ENVIRONMENTS
 from shields import certificate_for
-from tests.command import ncs
+from tests.command import succeeded
 
 IDS = [env_id for env_id, each in ENVIRONMENTS.items() if each.plant is not None]
 LARGEST = 200_000
@@ -61,13 +61,11 @@ def test_ids_without_an_agent_are_one_sentence(tmp_path):
 
 
 def test_commands_take_pretrained_agents(tmp_path):
-    run = ncs("evaluate", "pretrained", "--env", "ncs_gym/CSTR-v0", "--episodes", 2)
-    assert run.returncode == 0, run.stderr
+    run = succeeded("evaluate", "pretrained", "--env", "ncs_gym/CSTR-v0", "--episodes", 2)
     assert "PPO of" in run.stdout
     assert "shield: project" in run.stdout
     out = tmp_path / "episode.png"
-    drawn = ncs("render", "--env", "ncs_gym/CSTR-v0", "--policy", "pretrained", "--steps", 3, "--out", out)
-    assert drawn.returncode == 0, drawn.stderr
+    succeeded("render", "--env", "ncs_gym/CSTR-v0", "--policy", "pretrained", "--steps", 3, "--out", out)
     assert out.exists()
 
 

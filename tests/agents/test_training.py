@@ -134,22 +134,15 @@ def test_missing_package_is_one_sentence(monkeypatch):
         train(CRUISE, 64, 0, "TQC", TINY_REPLAY)
 
 
-def events_of(folder):
+@pytest.mark.slow
+@pytest.mark.parametrize(("algorithm", "settings"), [("PPO", TINY), ("SAC", TINY_REPLAY)])
+def test_rates_and_evaluations_reach_tensorboard_and_change_nothing(algorithm, settings, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    events = EventAccumulator(str(folder))
-    events.Reload()
-    return events
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("algorithm", "settings", "steps"),
-    [("PPO", TINY, 1024), pytest.param("SAC", TINY_REPLAY, 1024, marks=pytest.mark.slow)],
-)
-def test_rates_and_evaluations_reach_tensorboard_and_change_nothing(algorithm, settings, steps, tmp_path):
+    steps = 1024
     result = train(shielded(), steps, 5, algorithm, settings, log_folder=tmp_path)
-    events = events_of(tmp_path)
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
     tags = events.Tags()["scalars"]
     assert {"safety/violation_rate", "safety/intervention_rate", "safety/violation_steps", "time/fps"} <= set(tags)
     assert max(event.value for event in events.Scalars("safety/mean_correction")) > 0.0
@@ -214,6 +207,10 @@ def logged_alike(model, steps, log_interval, **more):
         found = [values[f"safety/{name}"] for name in names]
         np.testing.assert_allclose(found, rows[start:stop].mean(axis=(0, 1)), rtol=1e-9)
         start = stop
+    assert [callback.violation_steps, callback.interventions] == rows.sum(axis=(0, 1))[:2].tolist()
+    last = callback.history[-1]
+    assert (last.violation_steps, last.interventions) == (callback.violation_steps, callback.interventions)
+    assert last.steps == model.num_timesteps
     return callback
 
 
@@ -237,7 +234,8 @@ def test_logs_are_about_all_steps_since_the_last_one(kind):
 def test_logs_of_algorithms_without_rollouts_are_about_all_steps():
     env = make_vec_env(shielded().single, n_envs=2, seed=0)
     model = SAC("MlpPolicy", env, learning_starts=10_000, seed=0)
-    logged_alike(model, 1000, 1)
+    callback = logged_alike(model, 1000, 1)
+    assert callback.violation_steps == 0 < callback.interventions
 
 
 def test_monitor_keeps_the_episodes_totals():
@@ -248,23 +246,8 @@ def test_monitor_keeps_the_episodes_totals():
     assert all(episode["is_success"] == float(episode["episode_violations"] == 0) for episode in episodes)
 
 
-def test_callback_counts_alike_on_stable_baselines3s_own_vector_environment():
-    from stable_baselines3 import A2C, SAC
-    from stable_baselines3.common.env_util import make_vec_env
-
-    env = make_vec_env(shielded().single, n_envs=2, seed=0)
-    for model in (A2C("MlpPolicy", env, seed=0), SAC("MlpPolicy", env, learning_starts=50, seed=0)):
-        callback = SafetyCallback()
-        model.learn(100, callback=callback)
-        assert callback.violation_steps == 0
-        assert callback.interventions == callback.history[-1].interventions > 0
-        assert callback.history[-1].steps == 100
-
-
 def test_eval_callback_reports_success_on_both_kinds_of_environment(tmp_path):
-    from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import EvalCallback
-    from stable_baselines3.common.env_util import make_vec_env
 
     def successes(env):
         log = tmp_path / type(env).__name__

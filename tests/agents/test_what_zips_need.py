@@ -1,4 +1,4 @@
-"""Zips of stable-baselines3 whose policies need more than weights: it is given, or they are refused and it is named."""
+"""Zips of stable-baselines3: their agents act as they did, nothing in them is unpickled, what they need is named."""
 
 import pickle
 import random
@@ -14,14 +14,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from agents import Agent, LoopConfig
-from agents.agent import load_sb3_zip
+from agents.agent import is_sb3_zip, load_sb3_zip
 from agents.agent_file import AgentError
 from agents.normalization import Normalization, read_statistics
 from agents.pickled_data import Made, Named, array_of, pickled_data
 from agents.sb3_vec_env import SB3VecEnv
 from agents.training import untrained
 from ncs_gym import TraceChannel
-from tests.command import assert_one_sentence, ncs
+from tests.command import assert_one_sentence, ncs, succeeded
+from tests.ncs_gym.networked.environments import Sampled
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 SMALL = {"net_arch": [8]}
@@ -161,6 +162,23 @@ def _spring():
     raise Sprung
 
 
+def test_settings_that_are_pickled_are_refused_unread(tmp_path):
+    saved = PPO("MlpPolicy", env(), policy_kwargs=dict(SMALL), device="cpu")
+    saved.policy_kwargs["trap"] = Trap()
+    saved.save(tmp_path / "own.zip")
+    with pytest.raises(AgentError, match="pickles are not read"):
+        load_sb3_zip(tmp_path / "own.zip", CRUISE)
+
+
+def test_what_fits_no_environment_or_is_no_zip_is_one_sentence(tmp_path):
+    PPO("MlpPolicy", env(), policy_kwargs=dict(SMALL), device="cpu").save(tmp_path / "own.zip")
+    with pytest.raises(AgentError, match="does not fit ncs_gym/CartPole-v0"):
+        load_sb3_zip(tmp_path / "own.zip", "ncs_gym/CartPole-v0")
+    (tmp_path / "no.zip").write_bytes(b"PK")
+    with pytest.raises(AgentError, match="is no agent that stable-baselines3 saved"):
+        load_sb3_zip(tmp_path / "no.zip", CRUISE)
+
+
 @pytest.mark.parametrize("where", ["itself", "statistics", "mean", "epsilon", "unread"])
 def test_nothing_in_a_file_of_statistics_is_run(where, tmp_path):
     normalized = VecNormalize(env())
@@ -273,36 +291,27 @@ def test_agent_of_every_algorithm_acts_as_the_model_did_and_is_saved_and_loaded(
     model = cls(
         "MlpPolicy", env(), policy_kwargs=policy, device="cpu", **(REPLAY if cls not in (PPO, A2C, TRPO) else {})
     )
-    model.save(tmp_path / "own.zip")
-    agent = load_sb3_zip(tmp_path / "own.zip", CRUISE, "none")
+    assert_saved_and_loaded(model, tmp_path)
+
+
+def assert_saved_and_loaded(model, folder):
+    """The agent of a model's zip acts as the model does, also after it was saved as an agent."""
+    model.save(folder / "own.zip")
+    assert is_sb3_zip(folder / "own.zip")
+    agent = load_sb3_zip(folder / "own.zip", CRUISE, "none")
     assert_acts_as(agent, model, OBSERVATIONS)
-    agent.save(tmp_path / "agent")
-    assert_acts_as(Agent.load(tmp_path / "agent"), model, OBSERVATIONS)
+    agent.save(folder / "agent")
+    assert_acts_as(Agent.load(folder / "agent"), model, OBSERVATIONS)
 
 
 @pytest.mark.parametrize("cls", [PPO, SAC])
 def test_noise_that_depends_on_the_state_and_squashed_actions_are_taken_over(cls, tmp_path):
     policy = SMALL | ({"squash_output": True} if cls is PPO else {})
-    model = trained(cls, env(), policy=policy, use_sde=True)
-    model.save(tmp_path / "own.zip")
-    agent = load_sb3_zip(tmp_path / "own.zip", CRUISE, "none")
-    assert_acts_as(agent, model, OBSERVATIONS)
-    agent.save(tmp_path / "agent")
-    assert_acts_as(Agent.load(tmp_path / "agent"), model, OBSERVATIONS)
+    assert_saved_and_loaded(trained(cls, env(), policy=policy, use_sde=True), tmp_path)
 
 
-class Switch(gym.Env):
+class Switch(Sampled):
     """Two actions, of which one may be masked; observations as in the cruise, or of another kind."""
-
-    def __init__(self, observations):
-        self.observation_space, self.action_space = observations, gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), 0.0, True, False, {}
 
     def action_masks(self):
         return np.array([True, False])
@@ -362,9 +371,8 @@ def test_command_refuses_without_and_evaluates_with_the_statistics(tmp_path):
     saved_with_statistics(tmp_path)
     given = "evaluate", tmp_path / "own.zip", "--env", CRUISE, "--episodes", 2, "--shield", "none"
     assert_one_sentence(ncs(*given), "saw observations that VecNormalize normalized: give --vec-normalize", "pkl, or")
-    run = ncs(*given, "--vec-normalize", tmp_path / "vecnormalize.pkl")
-    assert run.returncode == 0, run.stderr
-    assert f"with --vec-normalize {tmp_path / 'vecnormalize.pkl'}" in " ".join(run.stdout.split())
+    run = succeeded(*given, "--vec-normalize", tmp_path / "vecnormalize.pkl")
+    assert f"with --vec-normalize {tmp_path / 'vecnormalize.pkl'}" in run.prose
 
 
 def test_statistics_for_what_is_no_zip_are_refused(tmp_path):

@@ -11,7 +11,6 @@ import tracemalloc
 import zipfile
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -515,14 +514,6 @@ def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     assert refused > 3
 
 
-def test_settings_name_no_more_runs_and_processes_than_there_may_be():
-    from experiments.settings import CompareSettings
-
-    for changes in ({"seeds": 10**9}, {"jobs": 10**6}, {"episodes": 10**9}):
-        with pytest.raises(ValueError, match="at most"):
-            CompareSettings(**changes)
-
-
 @pytest.mark.parametrize("text", ["x" * 1001, "\x1b[2J", "two\nlines"], ids=["long", "escape", "lines"])
 def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
     document = json.loads(json.dumps(truck_trailer().document))
@@ -532,14 +523,6 @@ def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
             LinearPlant.read(changed)
     with pytest.raises(ValueError, match="the basis of a remainder must be printable text"):
         Remainder(Ellipsoid(np.eye(2)), proved=False, basis=text)
-
-
-def test_key_file_is_a_file(endless, tmp_path):
-    from experiments.commands.loop import loop
-    from experiments.settings import LoopSettings
-
-    with pytest.raises(OSError, match="not a regular file"):
-        loop(LoopSettings(role="plant", key_file=Path(endless), out=tmp_path / "out"))
 
 
 def test_key_that_is_too_short_or_too_long_is_refused(write, tmp_path):

@@ -82,12 +82,6 @@ def test_values_are_refused_or_meant(count, tmp_path):
     check()
 
 
-@pytest.mark.parametrize("values", [{"steps": "7"}, {"seed": 7.0}, {"smoke": 1}, {"env": 5}, {"arms": "shielded"}])
-def test_values_of_another_kind_are_named(values, tmp_path):
-    (tmp_path / "s.json").write_bytes(document(values))
-    assert_one_sentence(ncs("compare", "--config", tmp_path / "s.json"), "does not take", next(iter(values)))
-
-
 @given(whole=JSON)
 @examples(15)
 def test_documents_of_any_structure_are_refused(tmp_path_factory, whole):

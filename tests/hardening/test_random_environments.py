@@ -2,7 +2,6 @@
 
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -136,8 +135,3 @@ def test_an_unstable_plant_left_alone_stays_finite_for_ever(many):
     settings = {"plant": plant, "channel": Channel(1.0), "contract": ChannelContract(1)}
     env = NCSVectorEnv(2, **settings) if many else NCSEnv(**settings)
     run_away(env, 0, 1200)
-
-
-def test_registered_environments_need_a_plant_in_one_sentence():
-    with pytest.raises(ValueError, match="no plant of its own"):
-        gym.make("ncs_gym/LinearNCS-v0")

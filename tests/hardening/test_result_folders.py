@@ -143,6 +143,8 @@ def test_only_files_that_commands_write_are_removed_before_they_are_written_agai
     for name in ("data.parquet", "figures/photo.png", "notes.html"):
         (tmp_path / name).write_text("mine")
     before = everything_in(tmp_path)
+    for name in ("summary.json", "report.html", "episodes.parquet", "figures/episode.png"):
+        (tmp_path / name).write_text("{}")
     with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
         (tmp_path / "settings.json").unlink()
     assert everything_in(tmp_path) == before

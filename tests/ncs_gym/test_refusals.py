@@ -31,7 +31,6 @@ from ncs_gym import (
     LinearProcess,
     NCSEnv,
     NCSVectorEnv,
-    PacketLog,
     RandomChannel,
     Regulation,
     Remainder,
@@ -59,6 +58,7 @@ from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, Pendulum
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from shields import SafetyShield
+from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"
 PLANT, HEAVY, UNSTABLE = truck_trailer(), truck_trailer(mass=4000.0), cart_pole()
@@ -184,14 +184,6 @@ def folder_for_a_file(folder):
     plant_in(None)(folder)
 
 
-def log_in(text):
-    def load(folder):
-        (folder / "packets.csv").write_text(text)
-        PacketLog.load(folder / "packets.csv")
-
-    return load
-
-
 def weakened_remainder():
     return replace(modeled(), remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"))
 
@@ -305,13 +297,6 @@ CHANNELS = [
     (lambda: TraceChannel(trace=(0, -1), loss=0.1), "loss of a TraceChannel"),
     (TraceChannel, "trace"),
     (lambda: side_by_side([TraceChannel(trace=(0, 1)), TraceChannel(trace=(0, 2))]), "stands beside equal ones"),
-    (log_in(""), "at least two packets"),
-    (log_in("sent,received\n0.0,0.1\n"), "at least two packets"),
-    (log_in("sent,received\n0.0,0.1\n0.0,0.2\n"), "one after the other"),
-    (log_in("sent,received\n1.0,0.5\n2.0,2.1\n"), "clocks"),
-    (log_in("sent,received\n0.0,0.1\nlate,0.2\n"), "line 3"),
-    (log_in("sent,received\n0.0,0.1\n1.0,1e999\n"), "line 3"),
-    (log_in("episode,sent,received\n77,1,\n"), "line 2 is not an episode"),
     (lambda: Actuator(input_delay=2, inputs=1).start(episode=0.5), "episode must be a whole number >= 0"),
     *called(
         Actuator(input_delay=2, inputs=1).apply,
@@ -427,9 +412,19 @@ PLANTS = [
         ({"operating_state": [20.0, 1.0]}, "operating_state must have shape"),
         ({"operating_input": "10"}, "operating_input must be a vector"),
         ({"box": [1.0]}, "box follows from state_limits"),
+        ({"u_max": 1.0}, "u_max follows from input_limits"),
+        ({"state_limits": (25.0, 18.0)}, "low < high"),
+        ({"output_limits": [([1.0], 0.0)]}, r"a list of \(row, low, high\)"),
+        ({"output_limits": [([0.0], -1.0, 1.0)]}, "must limit something"),
         ({"offset": [1.0, 2.0]}, "offset must have shape"),
         **ROOM,
     ),
+    *changed(
+        partial(LinearPlant, A=[[0.9]], B=[[0.2]], dt=60.0, box=1.0, **QUIET),
+        ({"u_max": 1.0, "box_ends": ([0.1], [1.0])}, "must have 0 between them"),
+        ({"input_ends": ([-1.0], [np.inf])}, "finite, below and above 0"),
+    ),
+    (partial(LinearPlant, A=A, B=B, dt=0.1, u_max=1.0), TypeError, "LinearPlant needs limits: give box or state_lim"),
     *called(PLANT.to_deviation, ([1.0], "the state must have shape")),
     *called(PLANT.from_deviation, ([1.0], "the state must have shape")),
     (partial(PLANT.to_deviation, [1.0, 1.0], "speed"), "of must be one of"),
@@ -624,7 +619,6 @@ PROCESSES = [
     (lambda: replace(modeled(), remainder=replace(weakened_remainder(), box=[0.2, 1.5]).remainder), "another box"),
 ]
 TASKS = [
-    *changed(Regulation, *(({"state_cost": cost}, "state_cost") for cost in (1.0, -np.eye(2)))),
     *changed(
         partial(NCSEnv, PLANT),
         (
@@ -635,10 +629,6 @@ TASKS = [
     ),
 ]
 UNCERTAINTY = [
-    *called(
-        Ellipsoid,
-        *((shape, "shape") for shape in (np.diag([1.0, -1.0]), [[1.0, 2.0], [0.0, 1.0]], [[np.nan]], np.ones((2, 3)))),
-    ),
     *called(
         lambda value: as_bound(value, 2, "d"),
         (-1.0, r"d must be a number or shape \(2,\), each 0 or between"),
@@ -708,6 +698,7 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(call, error, words, tmp_
     assert set(gym.registry) == before
 
 
+UNUSABLE = [*NOTHING_USABLE, *WRONG_NUMBERS]
 CALLS = {  # What is called, whether with an environment or with three, the argument, and the words.
     "step": [
         *((False, action, "the action must be finite") for action in ([np.nan], [np.inf], [0.0, 0.0], 0.5, "go", None)),
@@ -720,7 +711,10 @@ CALLS = {  # What is called, whether with an environment or with three, the argu
         *((False, {"state": wrong}, "state") for wrong in ([1.0], [np.nan, 0.0], "a", None)),
         *((True, {"state": wrong}, "state") for wrong in (np.zeros(3), np.full((3, 2), np.nan))),
         *((many, {"sate": [0.0, 0.0]}, "reset knows the options") for many in (False, True)),
-        *((True, {"reset_mask": wrong}, "reset_mask") for wrong in (np.ones(2, np.bool_), np.ones(3))),
+        *((many, wrong, "option") for many in (False, True) for wrong in UNUSABLE if type(wrong) is not dict),
+        *((many, wrong, "option") for many in (False, True) for wrong in ({"a": 1}, {1: 2})),
+        *((many, {"state": wrong}, "state") for many in (False, True) for wrong in UNUSABLE),
+        *((True, {"reset_mask": wrong}, "reset_mask") for wrong in (np.ones(2, np.bool_), np.ones(3), *UNUSABLE)),
         (True, {"reset_mask": np.zeros(3, np.bool_)}, "reset_mask"),
         *(
             (many, {name: wrong}, words)
@@ -741,8 +735,9 @@ def test_what_an_environment_refuses_changes_nothing(call, many, wrong, words):
     env, twin = (NCSVectorEnv(3, plant=PLANT) if many else NCSEnv(PLANT) for _ in range(2))
     reset(env)
     reset(twin)
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=words) as caught:
         env.step(wrong) if call == "step" else env.reset(seed=7, options=wrong)
+    assert not re.search(r"\n|[.!?] [A-Z]", str(caught.value))
     action = np.full(env.action_space.shape, 0.25)
     np.testing.assert_array_equal(env.step(action)[4]["state"], twin.step(action)[4]["state"])
 

@@ -1,13 +1,14 @@
 """The notebook runs from top to bottom, and is stored with what it printed and drew."""
 
 import json
-import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.command import environment
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOK = ROOT / "examples" / "tour.ipynb"
@@ -57,9 +58,7 @@ def test_cells_have_names_and_are_programs(cells):
 
 @pytest.mark.slow
 def test_notebook_runs_from_top_to_bottom(cells):
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = os.environ | {"PYTHONPATH": path, "MPLBACKEND": "Agg"}
-    command = [sys.executable, "-c", program_of(cells)]
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
+    command, given = [sys.executable, "-c", program_of(cells)], environment(MPLBACKEND="Agg")
+    run = subprocess.run(command, capture_output=True, text=True, env=given, timeout=600)
     assert run.returncode == 0, run.stderr
     assert_shows_what_it_is_about(run.stdout)

@@ -6,23 +6,12 @@ import pytest
 
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.safety_counts import SafetyCounts, counts_table
-
-LONG_CAMPAIGN = SafetyCounts(
-    steps=40_000_000,
-    episodes=200_000,
-    exits=2_500_000,
-    violations=120_000,
-    broken_episodes=4_000,
-    interventions=30_000_000,
-    level=1.25,
-    planned=20_000_000,
-    outside_starts=100_000,
-)
+from tests.experiments.results import LONG_CAMPAIGN
 
 
 @pytest.mark.parametrize("looks_ahead", [False, True])
 def test_steps_of_which_nothing_is_claimed_have_columns_and_a_legend_where_there_are_any(looks_ahead):
-    kept = replace(LONG_CAMPAIGN, exits=0, violations=0, level=0.9)
+    kept = replace(LONG_CAMPAIGN, episodes=200_000, broken_episodes=0, exits=0, violations=0, level=0.9)
     counts = {"CartPole-v0, its channel": kept, "CartPole-v0, late": kept}
     assert "no claim" not in counts_table(counts, looks_ahead=looks_ahead)
     counts["CartPole-v0, its channel"] = replace(kept, lapsed=2_000_000, lapsed_violations=1_234)

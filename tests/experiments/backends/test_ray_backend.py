@@ -22,7 +22,7 @@ from experiments.backends.ray_cluster import portable_task, require_answer  # no
 from experiments.errors import ClusterError, RunError  # noqa: E402
 from experiments.runs.provenance import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
-from tests.command import ROOT  # noqa: E402
+from tests.command import environment, is_alive, ncs_process  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -37,14 +37,8 @@ def command(*arguments):
     return [sys.executable, "-m", "experiments", *map(str, arguments)]
 
 
-def environment(**change):
-    return os.environ | {"PYTHONPATH": str(ROOT)} | change
-
-
 def ncs(*arguments, cwd=None, **change):
-    run = subprocess.run(
-        command(*arguments), cwd=cwd, env=environment(**change), capture_output=True, text=True, timeout=TIMEOUT
-    )
+    run = ncs_process(*arguments, cwd=cwd, **change)
     assert "Traceback" not in run.stderr
     return run
 
@@ -82,13 +76,6 @@ def descendants(pid):
 
 def working(pid):
     return [each for each, title in descendants(pid).items() if title == "ray::work"]
-
-
-def is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 def until(condition, what):

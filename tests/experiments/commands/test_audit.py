@@ -9,7 +9,7 @@ import pytest
 
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
-from tests.command import ROOT, ncs
+from tests.command import ROOT, ncs, succeeded
 
 HOLDS, ROUNDED, FAILS, UNDECIDED = Verdict.HOLDS, Verdict.ROUNDED, Verdict.FAILS, Verdict.UNDECIDED
 
@@ -19,8 +19,7 @@ def audit(made_once):
     """What `ncs audit --json` prints and writes."""
 
     def make(folder):
-        run = ncs("audit", "--json", "--out", folder / "audit.json")
-        assert run.returncode == 0, run.stderr
+        run = succeeded("audit", "--json", "--out", folder / "audit.json")
         (folder / "printed.json").write_text(run.stdout)
 
     folder = made_once("audit", make)

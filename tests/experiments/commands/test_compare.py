@@ -14,7 +14,6 @@ from experiments.commands.compare import findings_of, shortened
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import by_arm, run_of_arm
 from experiments.runs.loops import certificate_of
-from experiments.runs.output_folder import claim_folder
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 
@@ -257,13 +256,3 @@ def test_results_are_grouped_by_arm_in_the_order_of_runs():
     groups = by_arm(results)
     assert list(groups) == ["b", "a"]
     assert [one.index for one in groups["a"]] == [0, 1]
-
-
-def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
-    (tmp_path / "runs").mkdir()
-    (tmp_path / "figures").mkdir()
-    for name in ("summary.json", "report.html", "episodes.parquet", "figures/episode.png"):
-        (tmp_path / name).write_text("{}")
-    with claim_folder("compare", CompareSettings(out=tmp_path, force=True)):
-        assert not any((tmp_path / "figures").iterdir())
-    assert {path.name for path in tmp_path.iterdir()} == {"runs", "figures", "settings.json"}

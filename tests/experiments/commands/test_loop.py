@@ -26,7 +26,7 @@ from experiments.runs.loops import registered_env
 from experiments.settings import LoopSettings
 from ncs_gym import Channel
 from tests.certificates import certificate_of
-from tests.command import environment, ncs, ncs_process
+from tests.command import environment, ncs, ncs_process, succeeded
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -76,8 +76,7 @@ def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     assert "overridden" in done.stdout
     assert ", the box kept for 3 steps" in " ".join(done.stdout.split())
     assert "; margin " in done.stdout  # a line or, with rich, the title of the table
-    drawn = ncs("render", "--env", CRUISE, "--log", out, "--out", tmp_path / "loop.png")
-    assert drawn.returncode == 0, drawn.stderr
+    succeeded("render", "--env", CRUISE, "--log", out, "--out", tmp_path / "loop.png")
     assert Image.open(tmp_path / "loop.png").size[0] > 1000
     other = ncs("render", "--env", "ncs_gym/CSTR-v0", "--log", out, "--out", tmp_path / "other.png")
     assert "are of another plant, without concentration, temperature" in other.stderr

@@ -16,7 +16,7 @@ import pytest
 from agents.hyperparams import complete_hyperparams
 from ncs_gym import truck_trailer
 from shields import Certificate
-from tests.command import assert_one_sentence, environment, ncs
+from tests.command import assert_one_sentence, environment, ncs, succeeded
 from tests.plants import random_plant
 from tests.verdicts import verified
 
@@ -57,8 +57,7 @@ ENV = ("--env", "own_plants:Plants/Truck-v0")
 
 
 def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
-    run = ncs("synthesize", *ENV, cwd=folder)
-    assert run.returncode == 0, run.stderr
+    run = succeeded("synthesize", *ENV, cwd=folder)
     assert "% of the safe box's volume" in run.stdout
     certificate = Certificate.load(folder / "certificate.json")
     assert verified(certificate, truck_trailer(mass=2000.0)).valid
@@ -69,8 +68,7 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
 @pytest.mark.slow
 def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_workers):
     short = ("--mode", "project", "--steps", 5 * 8 * 200, "--envs", 8)
-    run = ncs("attack", *ENV, *short, "--out", "c", cwd=folder)
-    assert run.returncode == 0, run.stderr
+    succeeded("attack", *ENV, *short, "--out", "c", cwd=folder)
     document = json.loads((folder / "c" / "attack.json").read_text())
     kinds = ("its channel", "perfect", "blackout", "bursts", "overtaking")
     assert set(document["cases"]) == {f"Plants/Truck-v0, {kind}" for kind in kinds}
@@ -99,16 +97,14 @@ def test_arms_with_and_without_training_are_compared_where_limits_have_two_ends(
 @pytest.mark.slow
 def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers):
     short = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_steps=16", "n_envs=2")
-    run = ncs("train", *ENV, *short, "--out", "r", cwd=folder)
-    assert run.returncode == 0, run.stderr
+    run = succeeded("train", *ENV, *short, "--out", "r", cwd=folder)
     settings = json.loads((folder / "r" / "settings.json").read_text())
     assert settings["settings"]["env"] == "Plants/Truck-v0"  # a file names no module
     assert settings["settings"]["hyperparams"] == complete_hyperparams("PPO", dict(n_steps=16, n_envs=2))
     assert "PPO, default hyperparameters, as given n_envs, n_steps:" in run.stdout
     model = next((folder / "r" / "models").iterdir())
     assert json.loads((model / "agent.json").read_text())["agent"]["env"] == "Plants/Truck-v0"
-    evaluated = ncs("evaluate", model, *ENV, "--episodes", 2, cwd=folder)
-    assert evaluated.returncode == 0, evaluated.stderr
+    succeeded("evaluate", model, *ENV, "--episodes", 2, cwd=folder)
     other = ncs("evaluate", model, "--env", "ncs_gym/TruckTrailer-v0", cwd=folder)
     assert_one_sentence(other, "was trained in Plants/Truck-v0, not in ncs_gym/TruckTrailer-v0")
     gym.registry.pop("Plants/Truck-v0")
@@ -118,8 +114,7 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers
 
 
 def test_own_plant_is_drawn(folder):
-    run = ncs("render", *ENV, "--out", "frame.png", "--steps", 2, "--shield", "none", cwd=folder)
-    assert run.returncode == 0, run.stderr
+    succeeded("render", *ENV, "--out", "frame.png", "--steps", 2, "--shield", "none", cwd=folder)
     assert (folder / "frame.png").exists()
 
 
@@ -130,14 +125,12 @@ def test_error_of_the_module_itself_is_told(folder):
 
 def test_id_of_this_package_may_name_its_module(certificate, tmp_path):
     certificate.save(tmp_path / "c.json")
-    run = ncs("verify", tmp_path / "c.json", "--env", "ncs_gym:ncs_gym/TruckTrailerCruise-v0")
-    assert run.returncode == 0, run.stderr
+    succeeded("verify", tmp_path / "c.json", "--env", "ncs_gym:ncs_gym/TruckTrailerCruise-v0")
 
 
 def test_plant_of_a_file_is_certified(tmp_path):
     random_plant(3, 3, 2).save(tmp_path / "plant.json")
-    made = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
+    succeeded("synthesize", "--plant", "plant.json", cwd=tmp_path)
     assert Certificate.load(tmp_path / "certificate.json").contract is None
     checked = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
     assert checked.stdout.endswith("\ncertificate.json verifies\n")
@@ -164,8 +157,7 @@ def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tm
         (contract, ("late", "rare", "on request")),
     ):
         folder = f"of {len(kinds)}"
-        run = ncs("attack", *asked, *given, "--out", folder, cwd=tmp_path)
-        assert run.returncode == 0, run.stderr
+        succeeded("attack", *asked, *given, "--out", folder, cwd=tmp_path)
         document = json.loads((tmp_path / folder / "attack.json").read_text())
         assert list(document["cases"]) == [f"plant.json, {kind}" for kind in kinds]
         assert document["total"]["exits"] == document["total"]["unproved"] == document["total"]["lapsed"] == 0
@@ -180,8 +172,7 @@ def test_another_plant_in_the_same_file_is_attacked_anew(tmp_path, without_worke
     totals = []
     for seed in (3, 5):
         random_plant(seed, 2, 1).save(tmp_path / "plant.json")
-        run = ncs("attack", *asked, cwd=tmp_path)
-        assert run.returncode == 0, run.stderr
+        run = succeeded("attack", *asked, cwd=tmp_path)
         assert "step/s" in run.stderr
         totals.append(json.loads((tmp_path / "c" / "attack.json").read_text())["total"])
     assert totals[0] != totals[1]

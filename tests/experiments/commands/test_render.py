@@ -15,7 +15,7 @@ from experiments.settings import RenderSettings
 from ncs_gym import truck_trailer
 from ncs_gym.rendering import theme
 from shields import SafetyShield, synthesize
-from tests.command import assert_one_sentence, ncs
+from tests.command import assert_one_sentence, ncs, succeeded
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -41,8 +41,7 @@ def settings(**changes):
 
 def test_command_writes_a_gif_of_both_arms_below_two_megabytes(tmp_path, certificate_file):
     file = tmp_path / "both.gif"
-    run = ncs("render", "--out", file, "--side-by-side", "--steps", 30, "--certificate", certificate_file)
-    assert run.returncode == 0, run.stderr
+    run = succeeded("render", "--out", file, "--side-by-side", "--steps", 30, "--certificate", certificate_file)
     assert file.stat().st_size < 2e6
     with Image.open(file) as image:
         assert (image.n_frames, image.height) == (31, theme.HEIGHT)

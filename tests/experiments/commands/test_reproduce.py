@@ -6,7 +6,7 @@ import pytest
 from experiments.paper.paper_example import PaperExample
 from experiments.paper.reproduction import Simulation, StateFeedback
 from ncs_gym.registration import CASE_STUDY_BOX
-from tests.command import ncs
+from tests.command import succeeded
 
 
 def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
@@ -29,8 +29,7 @@ def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
 
 @pytest.mark.slow
 def test_command_leaves_figures_and_summary(tmp_path):
-    run = ncs("reproduce", "--starts", 4, "--steps", 50, "--out", tmp_path / "out")
-    assert run.returncode == 0, run.stderr
+    run = succeeded("reproduce", "--starts", 4, "--steps", 50, "--out", tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert len(summary) == 3
     assert all(outcome["steps"] == 200 for outcome in summary.values())

@@ -12,15 +12,7 @@ import pytest
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, certificate_for, verify
 from shields.json_documents import document_of
-from tests.command import ROOT, ncs
-
-
-@pytest.fixture
-def plant_file(tmp_path):
-    """An unstable plant of one state, of which searches take no time."""
-    bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.01}
-    LinearPlant(A=[[1.2]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds).save(tmp_path / "plant.json")
-    return tmp_path / "plant.json"
+from tests.command import ROOT, ncs, succeeded
 
 
 def test_requirements_that_are_refused_leave_nothing(plant_file, tmp_path):
@@ -33,9 +25,8 @@ def test_requirements_that_are_refused_leave_nothing(plant_file, tmp_path):
 def test_requirements_leave_table_figure_certificates_and_are_resumed(plant_file, tmp_path, without_workers):
     asked = ("--send-periods", 1, 2, "--losses", 0, 12, "--out", tmp_path / "r")
     arguments = ("requirements", "--plant", plant_file, *asked)
-    first = ncs(*arguments)
-    assert first.returncode == 0, first.stderr
-    assert "no certificate was found" in " ".join(first.stdout.split())
+    first = succeeded(*arguments)
+    assert "no certificate was found" in first.prose
     assert "Cheapest" in first.stdout
     summary = json.loads((tmp_path / "r/summary.json").read_text())
     assert [point["max_age"] for point in summary["points"]] == [0, 12, 1, 25]
@@ -76,14 +67,12 @@ def test_certificates_of_stored_searches_are_verified_again(forged, plant_file, 
     assert words.get(forged, "no certificate of this plant for age 3") in again.stderr
 
 
-def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file, tmp_path, without_workers):
+def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file, record, tmp_path, without_workers):
     # Samples at every step of .1 s; three silences of 15 steps, and one of 8.
     sent = np.cumsum([0.0] + [0.1] * 99 + [1.5] * 3 + [0.1] * 99 + [0.8] + [0.1] * 99)
-    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each:.1f},{each:.1f}\n" for each in sent))
-    asked = ("--send-periods", 1, "--losses", 2, 14, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
-    found = ncs("requirements", "--plant", plant_file, *asked)
-    assert found.returncode == 0, found.stderr
-    assert "may be 10 steps (1 s) old" in (said := " ".join(found.stdout.split()))
+    asked = ("--send-periods", 1, "--losses", 2, 14, "--log", record(sent), "--out", tmp_path / "r")
+    said = succeeded("requirements", "--plant", plant_file, *asked).prose
+    assert "may be 10 steps (1 s) old" in said
     assert "The widest contract with a certificate, 10 steps of 0.1 s, the record breaks 3 times, " in said
     assert "Read as a table: 'sent' in s, 'received' in s." in said
     assert json.loads((tmp_path / "r/summary.json").read_text())["log"].startswith("Read as a table")
@@ -93,77 +82,55 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     assert "no names" in refused.stderr
 
 
-def test_requirements_say_that_a_record_does_not_count_where_no_sample_is_needed(tmp_path, without_workers):
-    (tmp_path / "packets.csv").write_text(
-        "sent,received\n" + "".join(f"{0.1 * k:.1f},{0.1 * k:.1f}\n" for k in range(99))
-    )
-    asked = ("--losses", 0, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
-    found = ncs("requirements", "--env", "ncs_gym/TruckTrailer-v0", *asked)
-    assert found.returncode == 0, found.stderr
-    assert "certificate that needs no samples at all keeps whatever the record lost" in " ".join(found.stdout.split())
+def test_requirements_say_that_a_record_does_not_count_where_no_sample_is_needed(record, tmp_path, without_workers):
+    asked = ("--losses", 0, "--log", record(0.1 * np.arange(99)), "--out", tmp_path / "r")
+    said = succeeded("requirements", "--env", "ncs_gym/TruckTrailer-v0", *asked).prose
+    assert "certificate that needs no samples at all keeps whatever the record lost" in said
 
 
-def test_requirements_say_how_often_the_box_can_be_left_over_a_record_today(tmp_path, without_workers):
+def test_requirements_say_how_often_the_box_can_be_left_over_a_record_today(record, tmp_path, without_workers):
     # Samples at every step of .05 s; three silences of 2 steps, which the contract does not allow, and one of 3.
     sent = np.cumsum([0.0] + [0.05] * 50 + [0.2, *[0.05] * 20] * 3 + [0.25] + [0.05] * 50)
-    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each:.2f},{each:.2f}\n" for each in sent))
-    asked = ("--losses", 2, "--log", tmp_path / "packets.csv", "--out", tmp_path / "r")
-    found = ncs("requirements", "--env", "ncs_gym/Pendulum-v0", *asked)
-    assert found.returncode == 0, found.stderr
-    said = " ".join(found.stdout.split())
+    asked = ("--losses", 2, "--log", record(sent), "--out", tmp_path / "r")
+    said = succeeded("requirements", "--env", "ncs_gym/Pendulum-v0", *asked).prose
     assert "Today's contract, 2 steps of 0.05 s, the record breaks 4 times" in said
     assert "today's contract allows the box is kept until the newest sample is 3 steps old" in said
     assert "that protects; the record exceeds that once" in said
 
 
-def test_channel_prints_the_contract_that_was_kept(tmp_path):
-    rng = np.random.default_rng(0)
-    lines = [f"{0.02 * i},{'' if rng.random() < 0.2 else 0.02 * i + 0.01}" for i in range(500)]
-    (tmp_path / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--out", tmp_path / "numbers.json")
-    assert found.returncode == 0, found.stderr
-    numbers = json.loads((tmp_path / "numbers.json").read_text())
-    assert numbers["lost"] == sum(line.endswith(",") for line in lines)
+def test_channel_prints_the_contract_that_was_kept(record, tmp_path):
+    file, out = record(0.02 * np.arange(500), delay=0.01, loss=0.2), tmp_path / "numbers.json"
+    found = succeeded("channel", file, "--env", "ncs_gym/CartPole-v0", "--out", out)
+    numbers = json.loads(out.read_text())
+    assert numbers["lost"] == sum(line.endswith(",") for line in file.read_text().splitlines()) > 0
     assert f"max_age = {numbers['kept']}" in found.stdout
     assert numbers["kept"] <= numbers["replay"]
     assert "Read as a table: 'sent' in s, 'received' in s." in found.stdout
     assert "The environment's contract, a newest sample of at most 4 steps, was" in found.stdout
 
 
-def test_channel_compares_a_record_with_a_certificate_of_one_s_own_as_with_that_of_an_environment(tmp_path):
-    rng = np.random.default_rng(1)
-    lines = [f"{0.02 * i},{'' if rng.random() < 0.4 else 0.02 * i + 0.01}" for i in range(500)]
-    (tmp_path / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
+def test_channel_compares_a_record_with_a_certificate_of_one_s_own_as_with_that_of_an_environment(record, tmp_path):
+    file = record(0.02 * np.arange(500), delay=0.01, loss=0.4, seed=1)
     env = gym.make("ncs_gym/CartPole-v0").unwrapped
     env.plant.save(tmp_path / "plant.json")
     certificate_for(env.plant, env.certificate_contract).save(tmp_path / "certificate.json")
     own = ("--certificate", tmp_path / "certificate.json", "--plant", tmp_path / "plant.json")
-    texts = []
-    for given in (own, ("--env", "ncs_gym/CartPole-v0")):
-        found = ncs("channel", tmp_path / "packets.csv", *given, "--least-safe-steps", 3)
-        assert found.returncode == 0, found.stderr
-        texts.append(" ".join(found.stdout.split()))
+    both = own, ("--env", "ncs_gym/CartPole-v0")
+    texts = [succeeded("channel", file, *given, "--least-safe-steps", 3).prose for given in both]
     assert texts[0].replace("The certificate's contract", "The environment's contract") == texts[1]
     assert "The certificate's contract, a newest sample of at most 4 steps, was broken" in texts[0]
 
 
-def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(tmp_path):
+def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(record):
     # Samples at every step of .02 s; five silences of 20 steps and one of 60.
     sent = np.cumsum([0.02] * 99 + [0.42] * 5 + [0.02] * 99 + [1.22] + [0.02] * 99)
-    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{each},{each}\n" for each in sent))
     for least, times in ((10, "6 times"), (30, "once"), (49, "once")):
-        given = ("--env", "ncs_gym/CartPole-v0", "--least-safe-steps", least)
-        found = ncs("channel", tmp_path / "packets.csv", *given)
-        assert found.returncode == 0, found.stderr
-        said = " ".join(found.stdout.split())
+        said = succeeded("channel", record(sent), "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", least).prose
         assert f"the box is kept at least until the newest sample is {4 + least} steps old" in said
         assert f"In the record it was older {times}" in said
-    (tmp_path / "packets.csv").write_text("sent,received\n" + "".join(f"{0.02 * k},{0.02 * k}\n" for k in range(500)))
-    kept = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
-    assert "is 5 steps old, in every mode that protects; the record exceeds that at no time" in " ".join(
-        kept.stdout.split()
-    )
-    assert "was broken at no time; a record of this length excludes more than" in " ".join(kept.stdout.split())
+    kept = succeeded("channel", record(0.02 * np.arange(500)), "--env", "ncs_gym/CartPole-v0").prose
+    assert "is 5 steps old, in every mode that protects; the record exceeds that at no time" in kept
+    assert "was broken at no time; a record of this length excludes more than" in kept
 
 
 @pytest.mark.slow
@@ -171,8 +138,7 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_pat
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["wifi_record.py", str(tmp_path / "packets.csv")])
     runpy.run_path(str(ROOT / "examples" / "wifi_record.py"), run_name="__main__")
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", 35)
-    assert found.returncode == 0, found.stderr
+    found = succeeded("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", 35)
     promised = "    If a shield" + found.stdout.partition("If a shield")[2].replace("\n", "\n    ")
     for name in ("contracts.md", "requirements.md"):
         page = (ROOT / "docs" / name).read_text()
@@ -186,13 +152,9 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_pat
         )
 
 
-def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(tmp_path):
+def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(record):
     sent = [0.1 * i for i in range(100)] + [75.0 + 0.1 * i for i in range(1000)]
-    lines = "".join(f"{each},{each + 0.25}\n" for each in sent)
-    (tmp_path / "packets.csv").write_text("sent,received\n" + lines)
-    found = ncs("channel", tmp_path / "packets.csv", "--env", "ncs_gym/Convoy-v0")
-    assert found.returncode == 0, found.stderr
-    said = " ".join(found.stdout.split())
+    said = succeeded("channel", record(sent, delay=0.25), "--env", "ncs_gym/Convoy-v0").prose
     assert "Contract kept by the record: max_age = 653 (65.3 s; first half 653, second half" in said
     assert "Span and number of packets disagree" in said
     assert "was broken once" in said

@@ -8,7 +8,7 @@ import pytest
 from agents import Agent, SafetyCallback
 from experiments.errors import RunStopped
 from shields import Certificate, CertificateError, SafetyShield
-from tests.command import assert_one_sentence, ncs
+from tests.command import assert_one_sentence, ncs, succeeded
 
 SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
 HINT = "This training had no violation and no override"
@@ -26,11 +26,10 @@ HINT = "This training had no violation and no override"
 def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, without_workers, arm, log_std, happens):
     networks = f"policy_kwargs=dict(net_arch=[8, 8], log_std_init={log_std})"
     short = ("--steps", 512, "--episodes", 1, "--hyperparams", *SMALL, networks)
-    run = ncs("train", "--arm", arm, *short, "--out", tmp_path / "r")
-    assert run.returncode == 0, run.stderr
+    run = succeeded("train", "--arm", arm, *short, "--out", tmp_path / "r")
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())["arms"][arm]
     assert {name for name in ("train_violation_steps", "train_intervention_rate") if summary[name]} == happens
-    prose = " ".join(run.stdout.split())
+    prose = run.prose
     assert (HINT in prose) is (not happens)
     assert ("raise --steps, or run `ncs compare`" in prose) is (not happens)
 
@@ -98,8 +97,7 @@ def stored(folder):
 def test_agents_are_trained_and_evaluated_where_the_box_counts_at_all_times(tmp_path, without_workers):
     folder = tmp_path / "cruise"
     at_all_times = ("--between-samples", "4")
-    trained = ncs("train", "--steps", 512, *SHORT, folder, "--safe-set", "ellipsoid", *at_all_times)
-    assert trained.returncode == 0, trained.stderr
+    succeeded("train", "--steps", 512, *SHORT, folder, "--safe-set", "ellipsoid", *at_all_times)
     certificate = Certificate.load(folder / "certificate.json")
     assert certificate.between_samples == 4
     model = next((folder / "models").iterdir())
@@ -107,6 +105,5 @@ def test_agents_are_trained_and_evaluated_where_the_box_counts_at_all_times(tmp_
     assert ncs("evaluate", model, "--episodes", "2").returncode == 0  # files of agents keep it
     with pytest.raises(CertificateError, match="or for a box that counts at all times"):
         SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
-    made = ncs("synthesize", "--out", tmp_path / "c.json", "--safe-set", "ellipsoid", *at_all_times)
-    assert made.returncode == 0, made.stderr
+    succeeded("synthesize", "--out", tmp_path / "c.json", "--safe-set", "ellipsoid", *at_all_times)
     assert Certificate.load(tmp_path / "c.json") == certificate

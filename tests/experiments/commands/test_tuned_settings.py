@@ -4,7 +4,7 @@ import json
 
 from agents import tuned_hyperparams
 from agents.agent import Agent
-from tests.command import ncs
+from tests.command import succeeded
 
 ENV = "ncs_gym/TruckTrailer-v0"
 SMALL = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_envs=2", "n_steps=16")
@@ -12,9 +12,8 @@ SMALL = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_envs=2", "n_steps=1
 
 def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_path, without_workers):
     networks = "policy_kwargs=dict(net_arch=[8, 8])"
-    run = ncs("train", "--env", ENV, *SMALL, networks, "--out", tmp_path / "r")
-    assert run.returncode == 0, run.stderr
-    prose = " ".join(run.stdout.split())
+    run = succeeded("train", "--env", ENV, *SMALL, networks, "--out", tmp_path / "r")
+    prose = run.prose
     assert f"PPO, hyperparameters tuned for {ENV}, as given n_envs, policy_kwargs, n_steps: n_envs=2, " in prose
     settings = json.loads((tmp_path / "r" / "settings.json").read_text())["settings"]
     agent = Agent.load(tmp_path / "r" / "models" / "shielded-0")
@@ -22,7 +21,6 @@ def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_p
     expected = tuned | {"n_envs": 2, "n_steps": 16, "policy_kwargs": tuned["policy_kwargs"] | {"net_arch": [8, 8]}}
     assert settings["hyperparams"] == agent.hyperparams == expected
     assert settings["steps"] == 64
-    again = ncs("train", "--config", tmp_path / "r" / "settings.json", "--out", tmp_path / "again")
-    assert again.returncode == 0, again.stderr
+    again = succeeded("train", "--config", tmp_path / "r" / "settings.json", "--out", tmp_path / "again")
     assert "PPO, hyperparameters as given: " in again.stdout
     assert Agent.load(tmp_path / "again" / "models" / "shielded-0").checksum == agent.checksum

@@ -11,7 +11,7 @@ import pytest
 
 from experiments.__main__ import COMMANDS
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.safety_counts import SafetyCounts, counts_table, gaussian_table
+from experiments.attack.safety_counts import counts_table, gaussian_table
 from experiments.commands import loop, reproduce
 from experiments.report.text_tables import sweep_table
 from experiments.runs.loops import registered_env
@@ -19,34 +19,18 @@ from experiments.settings import LoopSettings
 from experiments.study.study import results_tables
 from experiments.study.tables import QUOTABLE
 from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
-from ncs_gym import LinearPlant
-from tests.command import ROOT, ncs
-from tests.experiments.results import run, summary_of
+from tests.command import ROOT, succeeded
+from tests.experiments.results import LONG_CAMPAIGN, run, summary_of
 
 WIDTH = 80
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
-LONG_CAMPAIGN = SafetyCounts(
-    steps=40_000_000,
-    episodes=2_000_000,
-    exits=2_500_000,
-    violations=1_200_000,
-    broken_episodes=400_000,
-    interventions=40_000_000,
-    level=1.25,
-    planned=40_000_000,
-    outside_starts=1_000_000,
-    lapsed=40_000_000,
-    lapsed_violations=1_234_567,
-    packets=40_000_000,
-    forced=40_000_000,
-    overdue=1_000_000,
-)
+LAPSED = {"lapsed": 40_000_000, "lapsed_violations": 1_234_567}
+LONGEST_CAMPAIGN = replace(LONG_CAMPAIGN, packets=40_000_000, forced=40_000_000, overdue=1_000_000, **LAPSED)
 
 
 def printed(*arguments):
     """What a command prints, without the lines that name its files."""
-    done = ncs(*arguments, COLUMNS=str(WIDTH))
-    assert done.returncode == 0, done.stderr
+    done = succeeded(*arguments, COLUMNS=str(WIDTH))
     return "\n".join(
         line for line in done.stdout.splitlines() if not line.startswith(("files: ", "agent: ", "saved to "))
     )
@@ -60,10 +44,7 @@ class Shown:
 
     @property
     def plant(self):
-        """The file of an unstable plant of one state, of which searches take no time."""
-        bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.01}
-        LinearPlant(A=[[1.2]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds).save(self.folder / "plant.json")
-        return self.folder / "plant.json"
+        return self.request.getfixturevalue("plant_file")
 
     def compare(self):
         return self.request.getfixturevalue("smoke")[1].stdout.partition("files: ")[0]
@@ -133,17 +114,15 @@ class Shown:
         return "\n".join(line for text in shown for line in text.splitlines() if " verifies" not in line)
 
     def channel(self):
-        rng = np.random.default_rng(0)
-        lines = [f"{0.02 * i},{'' if rng.random() < 0.2 else 0.02 * i + 0.01}" for i in range(500)]
-        (self.folder / "packets.csv").write_text("sent,received\n" + "\n".join(lines))
-        return printed("channel", self.folder / "packets.csv", "--env", "ncs_gym/CartPole-v0")
+        record = self.request.getfixturevalue("record")
+        return printed("channel", record(0.02 * np.arange(500), delay=0.01, loss=0.2), "--env", "ncs_gym/CartPole-v0")
 
     def requirements(self):
         asked = ("--send-periods", 1, 2, "--losses", *range(12), "--input-delays", 0, 1, "--jobs", 1)
         return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r")
 
     def attack(self):
-        cases = dict.fromkeys(attack_cases(0, 4), LONG_CAMPAIGN)
+        cases = dict.fromkeys(attack_cases(0, 4), LONGEST_CAMPAIGN)
         every = [counts_table(cases, looks_ahead=looks_ahead) for looks_ahead in (False, True)]
         shown = self.request.getfixturevalue("attacked")[1].stdout
         return "\n".join([*every, gaussian_table(cases, dict.fromkeys(cases, 0.5)), shown])
@@ -178,16 +157,18 @@ def test_everything_that_a_command_prints_fits_into_80_columns(command, shown):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_fits_into_80_columns(command):
+def test_help_fits_into_80_columns_and_every_command_has_a_seed_and_a_place_for_its_files(command):
     usage, *lines = printed(command, "--help").splitlines()
     assert usage.startswith("usage: ")  # tyro's own, which may be longer
     assert [line for line in lines if len(line) > WIDTH] == []
+    assert any("--out" in line for line in lines)
+    assert any("--seed" in line for line in lines) or command == "channel"
 
 
 def test_rows_of_a_campaign_that_breaks_nothing_are_whole():
     none = {"exits": 0, "violations": 0, "broken_episodes": 0, "level": 0.9, "lapsed": 0, "lapsed_violations": 0}
     cases = attack_cases(0, 4)
-    counts = dict.fromkeys(cases, replace(LONG_CAMPAIGN, episodes=5_000_000 // len(cases), **none))
+    counts = dict.fromkeys(cases, replace(LONGEST_CAMPAIGN, episodes=5_000_000 // len(cases), **none))
     text = counts_table(counts, looks_ahead=False)
     assert sum(line.startswith("case ") for line in text.splitlines()) == 1
 

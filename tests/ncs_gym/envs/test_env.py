@@ -1,5 +1,4 @@
 import json
-import pickle
 import warnings
 from typing import ClassVar
 
@@ -202,18 +201,6 @@ def test_a_reset_that_failed_half_way_needs_another():
         env.reset(options={"state": [1.9, 1.9]})
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros(1, np.float32))
-
-
-def test_environment_survives_pickling_in_the_middle_of_an_episode():
-    env = make(IDS[1]).unwrapped
-    env.reset(seed=0)
-    for _ in range(7):
-        env.step(np.ones(1, np.float32))
-    twin = pickle.loads(pickle.dumps(env))
-    for _ in range(20):
-        np.testing.assert_array_equal(
-            env.step(np.ones(1, np.float32))[4]["estimate"], twin.step(np.ones(1, np.float32))[4]["estimate"]
-        )
 
 
 def test_a_plant_of_another_size_gets_defaults_that_fit():

@@ -23,6 +23,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from tests.ncs_gym.envs.same_draws import compare
+from tests.ncs_gym.networked.environments import Sampled
 
 PLANT = truck_trailer(mass=4000.0)
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.3)
@@ -118,7 +119,8 @@ def test_infos_say_which_channel_an_episode_has():
         lost.append(not state)
     assert np.mean(lost) == pytest.approx(info["channel_loss"], abs=0.02)
     parts = gym.spaces.Dict({"a": gym.spaces.Box(-1.0, 1.0, (1,)), "b": gym.spaces.Box(-1.0, 1.0, (1,))})
-    several = Networked(Nothing(parts), channel={"a": Channel(loss=0.2), "b": Channel(delay=2)}, downlink=Channel())
+    channels = {"a": Channel(loss=0.2), "b": Channel(delay=2)}
+    several = Networked(Sampled(parts), channel=channels, downlink=Channel(), neutral=0)
     info = several.reset(options={"downlink": Channel(loss=0.5)})[1]
     assert info["channel_loss"] == {"a": 0.2, "b": 0.0}
     assert info["channel_delay"] == {"a": 0, "b": 2}
@@ -126,16 +128,6 @@ def test_infos_say_which_channel_an_episode_has():
     many = VectorNetworked(gym.make_vec("CartPole-v1", num_envs=2), Channel(loss=0.2))
     info = many.reset(options={"channel": [Channel(loss=0.4), None]})[1]
     assert info["channel_loss"].tolist() == [0.4, 0.2]
-
-
-class Nothing(gym.Env):
-    """An environment in which nothing happens."""
-
-    def __init__(self, space):
-        self.observation_space, self.action_space = space, gym.spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        return self.observation_space.sample(), {}
 
 
 def test_downlinks_for_each_environment_equal_scalar_ones():

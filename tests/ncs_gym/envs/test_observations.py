@@ -20,7 +20,6 @@ from ncs_gym import (
 )
 from shields import SafetyShield
 from tests.certificates import certificate_of
-from tests.ncs_gym.envs.same_draws import compare
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANT = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4, sensor_bound=0, initial_bound=0)
@@ -163,10 +162,6 @@ def test_only_what_is_asked_for_is_observed_in_its_order():
     age_first = gym.make(CRUISE, observe=("age", "error")).reset(seed=0)[0]
     np.testing.assert_array_equal(error_first[[0, 1, 2, 5, 3, 4]], age_first)
     assert gym.make(CRUISE, observe=["age"]).observation_space.shape == (4,)
-
-
-def test_vector_observes_the_same():
-    compare(gym.make_vec(CRUISE, num_envs=3, observe=("age", "error"), max_episode_steps=31).unwrapped, 70)
 
 
 def test_spec_with_a_certificate_and_observations_is_json(tmp_path):

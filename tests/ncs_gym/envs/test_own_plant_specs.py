@@ -1,9 +1,8 @@
-"""Specs of environments with plants of users' own are JSON, and make the same environment again."""
+"""Plants of users' own are registered; specs of their environments are JSON, and make the same environment again."""
 
 import copy
 import json
 import pickle
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -25,19 +24,22 @@ from ncs_gym import (
     Regulation,
     SetpointTracking,
     SinusoidDisturbance,
+    SpeedTracking,
     SphereDisturbance,
     TraceChannel,
-    truck_trailer,
 )
 from ncs_gym.processes import CartPoleProcess, nonlinear_cart_pole
+from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from tests.certificates import certificate_of
 
 LINEAR = "ncs_gym/LinearNCS-v0"
+TRUCK = "ncs_gym/TruckTrailer-v0"
 BURSTS = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5)
 SETTINGS = [
     {},
     {"channel": Channel(loss=BURSTS, delay=1)},
+    {"channel": Channel(loss=0.1, quantization_step=0.01, delay=1, jitter=2, max_consecutive_losses=3)},
     {"channel": TraceChannel(trace=(0, 1, -1, 2))},
     {"channel": Channel(max_consecutive_losses=1), "contract": ChannelContract(max_age=5)},
     {"channel": Channel(max_consecutive_losses=1), "downlink": Channel(delay=1, max_consecutive_losses=1)},
@@ -54,6 +56,21 @@ SETTINGS = [
     {"initial_set": Ellipsoid(np.diag([0.01, 0.02]))},
     {"process": LinearProcess()},
     {"horizon": np.int64(50), "terminate_on_violation": np.bool_(True), "observe": ("age", "error")},
+]
+# Of a registered plant, which is no part of the spec; some are JSON values already.
+OF_TRUCKS = [
+    {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}, "delay": 3}},
+    {"channel": {"loss": 0.2, "max_consecutive_losses": 1, "on_request": True}, "contract": {"max_age": 6}},
+    {"downlink": Channel(loss=BURSTS, delay=1, max_consecutive_losses=3), "downlink_contract": ChannelContract(5)},
+    {"noise": "gaussian"},
+    {"contract": {"max_age": 5}, "channel": {}},
+    {"task": SpeedTracking(fastest=10.0)},
+    {"task": {"output": [1.0, 0.0], "reach": 0.8, "width": 0.5}},
+    {"disturbance": "sphere"},
+    {"disturbance": {"half_widths": [0.01, 0.01]}},
+    {"disturbance": {"period": 7.0}},
+    {"initial_set": {"shape_matrix": [[1.0, 0.0], [0.0, 2.0]]}},
+    {"terminate_on_violation": True, "allow_assumption_violation": True},
 ]
 
 
@@ -75,6 +92,21 @@ def own_plant():
     )
 
 
+def test_registered_plant_has_its_settings_its_time_limit_and_a_vector_environment_of_its_own(register):
+    plant = own_plant()
+    register("Plants/Own-v0", plant, channel=Channel(loss=0.2), task=SpeedTracking(), max_episode_steps=7)
+    one, many = gym.make("Plants/Own-v0"), gym.make_vec("Plants/Own-v0", num_envs=4)
+    assert isinstance(many, NCSVectorEnv)
+    for env in (one, many):
+        inner = getattr(env.unwrapped, "single", env.unwrapped)
+        assert inner.plant is plant
+        assert (inner.channel, type(inner.task), inner.horizon) == (Channel(loss=0.2), SpeedTracking, 7)
+        env.reset(seed=0)
+        steps = [env.step(np.zeros(env.action_space.shape, np.float32)) for _ in range(7)]
+        assert [np.all(truncated) for _, _, _, truncated, _ in steps] == [False] * 6 + [True]
+    assert "Plants/Own-v0" in registered_ids()
+
+
 def assert_moves_alike(one, other):
     for env in (one, other):
         env.reset(seed=3)
@@ -85,17 +117,23 @@ def assert_moves_alike(one, other):
         np.testing.assert_array_equal(reward, same_reward)
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_spec_of_a_plant_of_ones_own_makes_the_same_environment_again(settings):
-    made = gym.make(LINEAR, plant=own_plant(), **settings)
+@pytest.mark.parametrize(
+    ("env_id", "settings"), [(LINEAR, each) for each in SETTINGS] + [(TRUCK, each) for each in OF_TRUCKS]
+)
+def test_loaded_spec_makes_the_same_environment_again(env_id, settings):
+    made = gym.make(env_id, **{"plant": own_plant()} if env_id == LINEAR else {}, **settings)
     text = made.spec.to_json()
     loaded = gym.make(EnvSpec.from_json(text))
     assert json.loads(loaded.spec.to_json()) == json.loads(text)
     assert loaded.unwrapped.plant.fingerprint == made.unwrapped.plant.fingerprint
-    assert loaded.unwrapped.plant.state_names == ("level", "rate")
-    assert loaded.unwrapped.channel == made.unwrapped.channel
+    assert loaded.unwrapped.plant.state_names == made.unwrapped.plant.state_names
     assert type(loaded.unwrapped.disturbance) is type(made.unwrapped.disturbance)
+    for name in ("channel", "contract", "terminate_on_violation", "downlink", "downlink_contract", "noise", "horizon"):
+        assert getattr(loaded.unwrapped, name) == getattr(made.unwrapped, name)
     assert_moves_alike(made, loaded)
+    vector = gym.make_vec(EnvSpec.from_json(text), num_envs=2)
+    assert isinstance(vector, NCSVectorEnv)
+    assert vector.channel == made.unwrapped.channel
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
@@ -118,31 +156,6 @@ def test_spec_of_a_vector_environment_is_json(register):
         assert isinstance(again, NCSVectorEnv)
         assert again.episode_channels == made.episode_channels
         assert_moves_alike(made, again)
-
-
-@pytest.mark.parametrize(
-    "plant",
-    [
-        replace(truck_trailer(), between_samples=3),
-        LinearPlant.from_statespace(
-            ([[0.0, 1.0], [-1.0, -1.0]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))),
-            0.1,
-            input_delay=2,
-            box=1.0,
-            u_max=1.0,
-            disturbance_bound=Ellipsoid(1e-4 * np.eye(2)),
-            sensor_bound=0,
-            initial_bound=0.01,
-        ),
-        nonlinear_cart_pole(),
-    ],
-    ids=["between_samples", "input_delay", "remainder"],
-)
-def test_document_of_a_plant_has_all_of_it(plant):
-    document = json.loads(json.dumps(plant.document))
-    again = LinearPlant.read(document)
-    assert (again.fingerprint, again.assumptions, str(again)) == (plant.fingerprint, plant.assumptions, str(plant))
-    assert again.document == plant.document == document
 
 
 def test_process_of_a_plant_of_ones_own_is_json():
@@ -176,9 +189,12 @@ def test_relative_path_of_a_plant_and_a_path_object_are_json(register, tmp_path,
     own_plant().save(tmp_path / "plant.json")
     monkeypatch.chdir(tmp_path)
     register("Plants/Own-v0", "plant.json")
-    for spec in (gym.spec("Plants/Own-v0"), gym.make(LINEAR, plant=tmp_path / "plant.json").spec):
-        made = gym.make(EnvSpec.from_json(spec.to_json()))
-        assert made.unwrapped.plant.fingerprint == own_plant().fingerprint
+    register("Plants/Path-v0", tmp_path / "plant.json", channel=Channel(loss=BURSTS), contract=ChannelContract(9))
+    path = gym.make(LINEAR, plant=tmp_path / "plant.json").spec
+    for spec in (path, gym.spec("Plants/Own-v0"), gym.spec("Plants/Path-v0")):
+        made = gym.make(EnvSpec.from_json(spec.to_json())).unwrapped
+        assert made.plant.fingerprint == own_plant().fingerprint
+    assert (made.channel, made.contract) == (Channel(loss=BURSTS), ChannelContract(9))
 
 
 @pytest.mark.parametrize(

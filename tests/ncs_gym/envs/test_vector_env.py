@@ -107,19 +107,6 @@ def test_disabled_autoreset_wants_the_finished_environments_reset():
     env.step(np.zeros((3, 1), np.float32))
 
 
-def test_violations_are_counted_once_per_step_and_reset():
-    env = NCSVectorEnv(2, plant=truck_trailer(mass=4000.0), autoreset_mode="Disabled", max_episode_steps=50)
-    _, info = env.reset(seed=0, options={"state": np.array([[1.95, 1.95], [0.0, 0.0]])})
-    total = info["cost"].copy()
-    for _ in range(20):
-        *_, info = env.step(np.ones((2, 1), np.float32))
-        total += info["cost"]
-        np.testing.assert_array_equal(info["episode_violations"], total)
-    assert total.max() > 0
-    _, info = env.reset(options={"reset_mask": np.array([False, True])})
-    assert info["episode_violations"][0] == total[0]
-
-
 def test_actions_of_any_precision_mean_the_same():
     states = []
     for kind in (np.float32, np.float64, np.float16, int):

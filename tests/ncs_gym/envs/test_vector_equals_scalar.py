@@ -51,6 +51,7 @@ def make(name, count, **settings):
 ASKED = Channel(loss=0.6, delay=1, jitter=1, max_consecutive_losses=2, on_request=True)
 ENDLESS = {"max_episode_steps": None, "terminate_on_violation": False}
 TRUCK, SPEED = truck_trailer(mass=4000.0), SpeedTracking(change_probability=0.2)
+BETWEEN = truck_trailer(mass=4000.0, between_samples=8)
 FAMILY = LinearPlant.family([truck_trailer(mass=mass) for mass in (3000.0, 4000.0, 5000.0)])
 SETPOINT = SetpointTracking(output=(1.0, 0.5), reach=0.8, width=0.3, change_probability=0.3)
 
@@ -87,6 +88,10 @@ ENVIRONMENTS = (
         for mode in ("NextStep", "SameStep")
     }
     | {
+        f"between samples, {mode}": ending(CHANNELS["case study"], mode, plant=BETWEEN)
+        for mode in ("NextStep", "SameStep")
+    }
+    | {
         f"on request, {mode}, {name}": ending(ASKED, mode, **settings)
         for mode in ("NextStep", "SameStep")
         for name, settings in {
@@ -103,6 +108,7 @@ ENVIRONMENTS = (
             Channel(loss=0.3, delay=1, quantization_step=1e-4),
             contract=ChannelContract(2, 1e-4),
         ),
+        "age and error observed": custom(TRUCK, CHANNELS["case study"], observe=("age", "error"), max_episode_steps=31),
         "a broken contract": custom(batch_reactor(), Channel(loss=0.5, jitter=3), contract=ChannelContract(3)),
         "n=3 m=2 p=1": custom(random_plant(5, 3, 2, p=1), Channel(loss=0.4, delay=1, jitter=2)),
         "n=5 m=3 p=2": custom(random_plant(6, 5, 3, p=2), Channel(loss=BURSTS, send_period=2)),

@@ -243,6 +243,15 @@ KINDS = {
         "0.5",
         "sent when its stamps say",
     ),
+    "table with rows and columns in any order": Kind(
+        "received,size,sent\n0.011,60,0.00\n,60,0.02\n0.065,60,0.06\n0.09,60,0.04\n",
+        times("0.02", ["0.011", None, "0.05", "0.005"]),
+        "0.01",
+        "Not used: 'size'",
+    ),
+    "table of whole numbers of seconds": Kind(
+        "sent_s,received_s\n0,15\n20,\n40,61\n60,71\n", times("20", ["15", None, "21", "11"]), "20", "'sent_s' in s"
+    ),
     "table with decimal commas of three digits": Kind(
         "sent\treceived\n0,980\t0,985\n1,000\t1,005\n1,020\t1,025\n",
         times("0.02", ["0.005", "0.005", "0.005"]),
@@ -292,6 +301,8 @@ def test_ages_are_those_of_the_times_in_the_file(name, written):
     expected = ages_by_clock(kind.packets, kind.dt)
     assert log.ages(float(kind.dt)).tolist() == expected
     assert len(log.sent) == len(kind.packets)
+    gaps = np.diff(sorted(float(Fraction(sent)) for sent, _ in kind.packets))
+    assert log.period == pytest.approx(np.median(gaps[gaps > 0.0]))
     assert np.isnan(log.delays).sum() == sum(received is None for _, received in kind.packets)
     assert kind.said in log.read_as
     promised = contract_of(log.channel(float(kind.dt)))
@@ -477,6 +488,9 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ("sent,delay_ms\n0,5\n20,6\n", "'delay_ms' is in ms and 'sent' has no unit: name it sent_ms or sent_s"),
         ("sent,delay\n1700000000000,5\n1700000000020,6\n", "'sent' is in ms and 'delay' has no unit"),
         ("sent_s,latency\n0,5.5\n0.02,6\n", "packets would take 5.5 s as a rule"),
+        ("sent,received\n0,15\n20,\n40,61\n60,71\n", "would take 13 s as a rule: name it, as in sent_ms"),
+        ("sent,received\n0.0,0.1\n0.0,0.2\n", "one after the other"),
+        ("episode,sent,received\n77,1,\n", "line 2 is not an episode"),
         *(
             (f"sent_ms,delay_ms,{name}\n0,5,0\n20,6,{cell}\n", f"'{name}' may say which packets were lost")
             for name, cell in {
@@ -531,7 +545,8 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         (b"\x1f\x8b\x08", "cannot read packets"),
         ("sent,received\n0,1\n" + 70 * "1" + ",2\n", "line 3"),
         (f"{LINUX}{2000 * 'x'} icmp_seq=1\n", "line 2 is longer"),
-        ("\n\n", "at least two packets"),
+        *((text, "at least two packets") for text in ("", "\n\n", "sent,received\n0.0,0.1\n")),
+        *((f"sent,received\n0.0,0.1\n{row}\n", "line 3") for row in ("late,0.2", "1.0,1e999")),
         (stamped([(1, 0), (2, 1), (3, -1), (4, 0)]), "line 3: the clock was set back by 2.000 s"),
         (
             stamped([(n, n if n <= 20 else n - 2) for n in range(1, 40) if not 18 <= n < 22]),
@@ -667,6 +682,8 @@ def test_replay_in_an_environment_has_the_ages_of_the_record(record):
     log = PacketLog(sent, np.array([np.nan if r is None else r - s for s, r in zip(sent, received, strict=True)]))
     ages, trace = log.ages(1.0), log.trace(1.0)
     assert ages.tolist() == ages_by_clock(list(zip(sent, received, strict=True)), "1")
+    promised = contract_of(log.channel(1.0))
+    assert promised is None or ages.max() <= promised.max_age
     env = NCSEnv(PLANT, channel=log.channel(1.0), terminate_on_violation=False)
     replayed = set()
     for seed in range(200):  # the replay begins with a random sample

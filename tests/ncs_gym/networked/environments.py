@@ -50,3 +50,26 @@ class Counter(gym.Env):
         if self.kind == "dict":
             return {"count": count, "image": image, "odd": np.int64(self.steps % 2)}
         return image
+
+
+class Sampled(gym.Env):
+    """Nothing moves: what is seen is drawn from a space, or is the one thing that is given.
+
+    Args:
+        space: Of observations.
+        seen: What is observed after every step; drawn if it is None.
+    """
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, space: spaces.Space[Any], seen: Any = None) -> None:
+        self.observation_space, self.seen, self.given = space, seen, []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.given = [self.observation_space.sample()]
+        return self.given[0], {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.given.append(self.observation_space.sample() if self.seen is None else self.seen)
+        return self.given[-1], 0.0, False, False, {}

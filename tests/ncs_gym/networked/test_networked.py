@@ -25,7 +25,7 @@ from ncs_gym import (
     VectorNetworked,
     VectorRandomChannel,
 )
-from tests.ncs_gym.networked.environments import Counter
+from tests.ncs_gym.networked.environments import Counter, Sampled
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 LATE = Channel(loss=0.3, delay=1, jitter=2)
@@ -231,26 +231,14 @@ def test_large_observations_are_what_they_were_when_they_were_taken(kind, channe
     ],
 )
 def test_observations_without_arrays_are_late_one_by_one(space):
-    class Odd(gym.Env):
-        observation_space, action_space, given = space, gym.spaces.Discrete(2), None
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            self.given = [space.sample()]
-            return self.given[0], {}
-
-        def step(self, action):
-            self.given.append(space.sample())
-            return self.given[-1], 0.0, False, False, {}
-
-    env = Networked(Odd(), Channel(delay=2))
+    env = Networked(Sampled(space), Channel(delay=2))
     env.reset(seed=0)
     for k in range(1, 8):
         seen = env.step(0)[0]
         assert env.observation_space.contains(seen)
         assert gym.utils.env_checker.data_equivalence(seen, env.unwrapped.given[max(k - 2, 0)])
     with pytest.raises(ValueError, match=r"takes observations that are arrays, not .*: put Networked around each"):
-        VectorNetworked(gym.vector.SyncVectorEnv([Odd] * 2), Channel(delay=2))
+        VectorNetworked(gym.vector.SyncVectorEnv([lambda: Sampled(space)] * 2), Channel(delay=2))
 
 
 def test_quantized_floats_stay_in_their_space():
@@ -264,18 +252,8 @@ def test_quantized_floats_stay_in_their_space():
 
 @pytest.mark.parametrize(("dtype", "step"), [(np.float16, 1e-3), (np.float32, 1e-46)])
 def test_coarse_types_are_rounded_to_small_steps(dtype, step):
-    class Constant(gym.Env):
-        observation_space = gym.spaces.Box(-1000.0, 1000.0, (3,), dtype)
-        action_space = gym.spaces.Discrete(2)
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return np.zeros(3, dtype), {}
-
-        def step(self, action):
-            return np.array([100.0, -70.0, 0.0], dtype), 0.0, False, False, {}
-
-    env = Networked(Constant(), Channel(quantization_step=step))
+    constant = Sampled(gym.spaces.Box(-1000.0, 1000.0, (3,), dtype), np.array([100.0, -70.0, 0.0], dtype))
+    env = Networked(constant, Channel(quantization_step=step))
     env.reset(seed=0)
     with np.errstate(all="raise"):
         seen = env.step(0)[0]
@@ -380,20 +358,7 @@ def test_channels_of_episodes_are_drawn_or_given_and_other_options_reach_the_env
     assert inner.episode_channel.delay == 1
 
 
-class Sensors(gym.Env):
-    """Two sensors, that say nothing."""
-
-    observation_space = gym.spaces.Dict({name: gym.spaces.Box(-1.0, 1.0, (1,)) for name in "ab"})
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), 0.0, False, False, {}
-
-
+TWO_SENSORS = gym.spaces.Dict({name: gym.spaces.Box(-1.0, 1.0, (1,)) for name in "ab"})
 DELAYED = [Channel(delay=1), Channel(delay=3)]
 NETWORK = {"a": Channel(), "b": Channel(delay=5)}
 
@@ -401,9 +366,10 @@ NETWORK = {"a": Channel(), "b": Channel(delay=5)}
 @pytest.mark.parametrize("many", [False, True])
 def test_channels_of_several_sensors_are_drawn_by_their_keys(many):
     if many:
-        inner, drawn = VectorNetworked(SyncVectorEnv([Sensors] * 8), NETWORK), VectorRandomChannel
+        inner = VectorNetworked(SyncVectorEnv([lambda: Sampled(TWO_SENSORS)] * 8), NETWORK)
+        drawn = VectorRandomChannel
     else:
-        inner, drawn = Networked(Sensors(), NETWORK), RandomChannel
+        inner, drawn = Networked(Sampled(TWO_SENSORS), NETWORK), RandomChannel
 
     def delays(env, **options):
         """The different pairs of delays in many episodes."""

@@ -179,14 +179,6 @@ def test_channels_given_to_some_stay_for_their_episodes():
     np.testing.assert_array_equal(info["measurement_age"], [3, 0])
 
 
-def test_many_large_observations_are_what_they_were():
-    env = VectorNetworked(SyncVectorEnv([lambda: Counter("image")] * 2, copy=False), LATE)
-    env.reset(seed=0)
-    for k in range(40):
-        seen, *_, info = env.step(np.zeros((2, 1)))
-        assert (seen == ((k + 1 - info["measurement_age"]) % 256)[:, None, None, None]).all()
-
-
 def test_what_vector_environments_cannot_have_is_one_sentence():
     with pytest.raises(ValueError, match="samples on request are for single environments"):
         VectorNetworked(SyncVectorEnv([Counter]), Channel(on_request=True))

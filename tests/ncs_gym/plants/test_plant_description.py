@@ -2,11 +2,14 @@
 
 import json
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym.processes import nonlinear_cart_pole
+from tests.plants import delayed
 
 ODD = LinearPlant(
     A=[[0.1 + 0.2, 1 / 3], [1e-300 + 1e-20, np.pi / 10]],
@@ -23,7 +26,19 @@ ODD = LinearPlant(
     state_names=["heat", "flow"],
     state_units=["K", ""],
 )
-PLANTS = {"truck": truck_trailer(), "pole": cart_pole(full_state=False), "reactor": batch_reactor(), "odd": ODD}
+QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
+STABLE = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.5]], "dt": 0.1} | QUIET
+PLANTS = {
+    "truck": truck_trailer(),
+    "pole": cart_pole(full_state=False),
+    "reactor": batch_reactor(),
+    "odd": ODD,
+    "between samples": replace(batch_reactor(), between_samples=4),
+    "input delay": delayed(2),
+    "remainder": nonlinear_cart_pole(),
+    "two ends, one open": LinearPlant(**STABLE, state_limits=([-1.0, -2.0], [3.0, np.inf]), input_limits=(-0.5, 2.0)),
+    "rows of any signs": LinearPlant(**STABLE, box=np.array([[-1.0, -2.0], [1.0, 3.0]]), u_max=1.0),
+}
 
 
 @pytest.mark.parametrize("name", PLANTS)
@@ -33,11 +48,15 @@ def test_file_gives_back_the_same_plant(name, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         twin = LinearPlant.load(tmp_path / "plant.json")
-    assert twin.fingerprint == plant.fingerprint
-    assert str(twin) == str(plant)
+    assert (twin.fingerprint, twin.assumptions, str(twin)) == (plant.fingerprint, plant.assumptions, str(plant))
     assert (twin.state_names, twin.input_units) == (plant.state_names, plant.input_units)
     for bound in ("disturbance", "sensor_error", "initial_error"):
         np.testing.assert_array_equal(getattr(twin, bound).shape_matrix, getattr(plant, bound).shape_matrix)
+    for array in ("box_ends", "input_ends", "box"):
+        np.testing.assert_array_equal(getattr(twin, array), getattr(plant, array))
+    if plant.between_samples:
+        np.testing.assert_array_equal(twin.grid_rows.state, plant.grid_rows.state)
+    assert twin.document == plant.document == json.loads(json.dumps(plant.document, allow_nan=False))
 
 
 def test_file_written_by_hand_takes_plain_terms(tmp_path):

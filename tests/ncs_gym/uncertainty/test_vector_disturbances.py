@@ -15,20 +15,12 @@ from ncs_gym import (
     truck_trailer,
 )
 
-DISTURBANCES = {
-    "ball": BallDisturbance(),
-    "box": BoxDisturbance((0.02, 0.01)),
-    "sinusoid": SinusoidDisturbance(period=7.0),
-    "sphere": SphereDisturbance(),
-    "adversarial": AdversarialDisturbance(),
-    "adversarial in M": AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]])),
-    "callable": lambda rng, plant, nominal: 0.5 * plant.disturbance.sample_boundary(rng),
-}
+IN_M = AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]]))
 
 
-@pytest.mark.parametrize("name", ["sinusoid", "adversarial", "adversarial in M"])
-def test_batched_draws_equal_scalar_ones(name):
-    plant, rng, source = truck_trailer(), np.random.default_rng(0), DISTURBANCES[name]
+@pytest.mark.parametrize("source", [SinusoidDisturbance(period=7.0), AdversarialDisturbance(), IN_M])
+def test_batched_draws_equal_scalar_ones(source):
+    plant, rng = truck_trailer(), np.random.default_rng(0)
     memory = source.begin_many(rng, plant, 30)
     nominal, steps = rng.standard_normal((2, 30)), rng.integers(0, 50, 30)
     drawn = source.draw_many(rng, plant, nominal, steps, memory)
@@ -76,8 +68,7 @@ class Loud(BoxDisturbance):
 class Misshapen(Loud):
     """A user's class that returns one disturbance for all steps."""
 
-    vectorized = True
-    memoryless = True
+    vectorized = memoryless = True  # which is not inherited where `draw` is another
 
     def draw(self, rng, plant, nominal_next, step, memory):
         return np.zeros((plant.n, 1))
