@@ -169,26 +169,6 @@ def test_updates_shrink_the_running_ellipsoid():
     assert np.trace(ends[-1]) < 0.3 * np.trace(Sigma)
 
 
-def test_forged_packet_raises_a_latched_alarm():
-    plant = truck_trailer()
-    estimator = Estimator(plant, Channel())
-    estimator.advance(np.zeros(1), [Packet(1, np.array([0.0, 0.0]))])
-    assert not estimator.alarm
-    estimator.advance(np.zeros(1), [Packet(2, np.array([0.5, 0.5]))])
-    assert estimator.alarm
-    estimator.advance(np.zeros(1), [Packet(3, plant.H @ estimator.estimate.mean)])
-    assert estimator.alarm
-    estimator.reset(np.zeros(2))
-    assert not estimator.alarm
-
-
-def test_damaged_packet_is_not_used_and_raises_the_alarm():
-    estimator = Estimator(truck_trailer(), Channel())
-    estimator.advance(np.zeros(1), [Packet(1, np.array([np.nan, 0.0]))])
-    assert estimator.alarm
-    assert np.isfinite(estimator.estimate.mean).all()
-
-
 def test_two_sensors_that_contradict_each_other_raise_the_alarm_where_one_of_them_says_what_was_predicted():
     """So exact, and so alike, that no inverse vouches for a residual: infinite weights times zero are no number."""
     settings = {"disturbance_bound": 0.1, "sensor_bound": 1e-9, "initial_bound": 0.1}

@@ -12,6 +12,8 @@ from scipy.stats import chi2
 from ncs_gym import LinearPlant, truck_trailer
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 
+BOUNDS = ("disturbance_bound", "sensor_bound", "initial_bound")
+
 
 def test_truck_trailer_reproduces_the_printed_matrices():
     plant = truck_trailer()
@@ -94,10 +96,22 @@ def test_fingerprint_changes_with_every_number():
         truck_trailer(initial_cov=2e-4 * np.eye(2)),
         truck_trailer(H=np.array([[1.0, 0.0]])),
         replace(base, error_gain=[[1.0, 0.0]]),
+        replace(base, A=0.9 * base.A),
+        replace(base, operating_state=[1.0, 0.0]),
+        replace(base, operating_input=[1.0]),
+        *(replace(base, between_samples=points) for points in (8, 9)),
+        *(replace(base, **{name: 0.04}) for name in BOUNDS),
+        (ends := replace(base, box_ends=-base.box_ends[::-1] * [1.0, 0.9])),
     ]
+    for name in ("box_ends", "input_ends"):
+        for i in range(2):
+            (moved := getattr(ends, name).copy())[i] *= 1.0 + 1e-12
+            others.append(replace(ends, **{name: moved}))
     prints = {plant.fingerprint for plant in (base, *others)}
     assert len(prints) == 1 + len(others)
-    assert truck_trailer().fingerprint == base.fingerprint
+    zero = {"operating_state": [0.0, 0.0], "between_samples": 1} | dict.fromkeys(BOUNDS, 0.0)
+    for same in (truck_trailer(), replace(base), replace(base, A=base.A), replace(base, **zero)):
+        assert same.fingerprint == base.fingerprint
 
 
 def test_constructor_for_type_checkers_is_the_one_that_there_is():

@@ -82,13 +82,6 @@ def test_registered_plants_keep_their_fingerprints(make):
     assert replace(plant, dt=2.0 * plant.dt, remainder=None).fingerprint != plant.fingerprint
 
 
-def test_bounds_survive_replace_and_belong_to_the_fingerprint():
-    plant = plain(disturbance_bound=([[1.0], [0.5]], 0.1))
-    assert replace(plant, A=plant.A).fingerprint == replace(plant).fingerprint == plant.fingerprint
-    assert len({plain().fingerprint, *(plain(**{name: 0.04}).fingerprint for name in BOUNDS)}) == 4
-    assert replace(plant, A=0.6 * np.eye(2)).fingerprint != plant.fingerprint
-
-
 @pytest.mark.parametrize("name", BY_NAME)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("gamma", [0.0, 1e-3])
