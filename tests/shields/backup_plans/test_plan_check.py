@@ -9,6 +9,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from shields import SafetyFilter
 from shields.runtime.backup_plans import PlanTest, Prediction, plan_check
 from shields.runtime.backup_plans.plan_check import Tightening
+from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
@@ -95,6 +96,22 @@ def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
             rows = test.prediction.rows
             reached = (rows * (extreme_ends(plant, x_hat, shape, plan, rows, step) - nominal[step])).sum(axis=1)
             np.testing.assert_allclose(reached, 1.0 - limits[step], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["cruise, at all times", "reactor, at all times"])
+def test_tightenings_between_samples_are_what_extreme_errors_and_disturbances_attain(name):
+    known = attacked_case(name)
+    plant, rows = known.plant, rows_within_step(known.plant)
+    test = PlanTest(Prediction(SafetyFilter(known.certificate, plant).test, STEPS), MARGIN)
+    estimates, shapes, plans = situations(plant, known.certificate, np.random.default_rng(0), 4)
+    for x_hat, shape, (plan,), limits in zip(
+        estimates, shapes, plans, test.tightenings_of(shapes).between, strict=True
+    ):
+        nominal = [x_hat, *states(plant, x_hat, plan, np.zeros((STEPS, plant.n)))]
+        for step in range(STEPS):
+            ends = extreme_ends(plant, x_hat, shape, plan, rows.state, step - 1)  # of no input for the first
+            reached = (rows.state * (ends - nominal[step])).sum(axis=1) + rows.disturbed
+            np.testing.assert_allclose(1.0 - limits[step], reached, rtol=1e-6, atol=1e-9)
 
 
 def largest_level(plant, certificate, x_hat, shape, plan, step, rng):
