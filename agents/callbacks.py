@@ -31,6 +31,9 @@ class SafetyCallback(BaseCallback):
     mean norm of applied minus proposed input since the last log, with a shield), `safety/guaranteed_rate` (steps after
     which the state is proved safe, since the last log, with a shield) and `safety/violation_steps` (total).
 
+    A training step is counted once. Behind action repeat, which takes several control steps in one, infos are those of
+    the last: `episode_violations` and `episode_interventions` count all.
+
     Totals begin anew where the model counts its steps anew (`learn` with `reset_num_timesteps`).
 
     Args:
@@ -221,6 +224,7 @@ def _counted(callback: BaseCallback) -> dict[str, Any]:
     if isinstance(env, SB3VecEnv) and "cost" in env.batch_info:
         return env.batch_info
     infos = callback.locals["infos"]
-    if not infos or "cost" not in infos[0]:
+    if not infos or not all("cost" in info for info in infos):
         raise ValueError('SafetyCallback counts "cost" of every info, which the infos of these environments have not')
-    return {key: [info[key] for info in infos] for key in _COUNTED if key in infos[0]}
+    known = {key: [info[key] for info in infos if key in info] for key in _COUNTED}  # some may be without a shield
+    return {key: values for key, values in known.items() if values}

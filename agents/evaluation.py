@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from agents.loop import LoopConfig
 from agents.results import Episode, Evaluation, Trajectory
@@ -34,7 +35,8 @@ def evaluate(
     """Returns what a policy does in a number of episodes, played side by side.
 
     Args:
-        loop: The control loop, whose penalties are left out.
+        loop: The control loop, whose penalties are left out. Every episode is played once, to its end, whatever
+            autoreset the loop has.
         policy: Maps observations and infos to actions.
         episodes: Number of episodes, at least 1.
         seed: Seed of all random numbers (see `Episode.index`).
@@ -42,7 +44,7 @@ def evaluate(
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
-        ValueError: If there is no episode to play.
+        ValueError: If there is no episode to play, or the id is registered with SAME_STEP autoreset.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
@@ -50,7 +52,8 @@ def evaluate(
     trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
-        played, infos = _played(loop.without_penalties, policy, indices, seed, level_matrix, on_progress)
+        alone = loop.without_penalties.with_kwargs(autoreset_mode=None)
+        played, infos = _played(alone, policy, indices, seed, level_matrix, on_progress)
         trajectory = trajectory or _first_trajectory(infos)
         finished += played
     return Evaluation(finished, trajectory)  # type: ignore[arg-type]
@@ -67,6 +70,8 @@ def _played(
     """Returns episodes played side by side, and the infos of episode 0, of its reset and its steps."""
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
+    if envs.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
+        raise ValueError(f"{loop.env} is registered with SAME_STEP autoreset, whose infos are of the next episode")
     single = inner.single if isinstance(inner, NCSVectorEnv) else ncs_env(inner.envs[0])
     terminates, plant = single.terminate_on_violation, single.plant
     if terminates and isinstance(inner, NCSVectorEnv):

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers.vector import NormalizeObservation
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -25,6 +26,8 @@ torch.set_num_threads(1)
 
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
+# What gymnasium reports of ends of episodes, beside the infos of the next ones.
+_FINAL = ("final_obs", "final_info")
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
 _EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
@@ -51,9 +54,9 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
     once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
     Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`,
-    `is_success` and `episode_guaranteed` where there are such infos. The dicts of all steps have all keys of
-    the infos; values are taken out of the arrays when they are read (`StepInfo`). `batch_info` has the arrays of the
-    last step.
+    `is_success` and `episode_guaranteed` where there are such infos. The dict of an environment has the keys that it
+    reported, in an `NCSVectorEnv` all keys at all steps; values are taken out of the arrays when they are read
+    (`StepInfo`). `batch_info` has the arrays of the last step.
 
     Importing this class sets torch to one thread, with which small networks train fastest; call
     `torch.set_num_threads` after the import for another number.
@@ -79,6 +82,14 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
             raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
         if isinstance(vector_env.single_observation_space, (gym.spaces.Dict, gym.spaces.Tuple)):
             raise ValueError(f"observations must be arrays, got {vector_env.single_observation_space}")
+        layer: Any = vector_env
+        while isinstance(layer, gym.vector.VectorWrapper):
+            if isinstance(layer, NormalizeObservation):
+                raise ValueError(
+                    "NormalizeObservation of vector environments cannot reset some of them: put stable-baselines3's "
+                    "VecNormalize around SB3VecEnv in its place"
+                )
+            layer = layer.env
         self.vector_env = vector_env
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._masks = isinstance(vector_env.unwrapped, _WITH_RESET_MASK)
@@ -132,12 +143,16 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             last = info["final_obs"]
             self.batch_info = _with_final(info, done)
-        dense = _dense(self.batch_info)
-        infos = step_infos(dense, self.num_envs)
-        if not self._masks:  # other people's vector environments may write into arrays of earlier steps
-            infos = [each.copy() for each in infos]
+        if _is_dense(info):
+            infos = step_infos(_dense(self.batch_info), self.num_envs)
+            if not self._masks:  # other people's vector environments may write into arrays of earlier steps
+                infos = [each.copy() for each in infos]
+        else:
+            infos = [{"TimeLimit.truncated": False} | _info_of(info, e) for e in range(self.num_envs)]
+        # In SAME_STEP mode the others are those of the next episodes.
+        final = info.get("final_info", info) if self._mode is AutoresetMode.SAME_STEP else info
         for e in np.flatnonzero(done).tolist():
-            infos[e] = self._last_info(e, dense, last[e], bool(truncated[e] and not terminated[e]))
+            infos[e] = self._last_info(e, _info_of(final, e), last[e], bool(truncated[e] and not terminated[e]))
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._mode is AutoresetMode.SAME_STEP:
@@ -155,11 +170,10 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
     def _keep_first_infos(self, chosen: np.ndarray, info: dict[str, Any]) -> None:
         """Keeps the infos of the first observations of some environments' episodes, bool (N,)."""
         for e in np.flatnonzero(chosen).tolist():
-            self.reset_infos[e] = {key: value[e] for key, value in _dense(info).items()}
+            self.reset_infos[e] = _info_of(info, e)
 
-    def _last_info(self, e: int, dense: dict[str, np.ndarray], observation: np.ndarray, cut: bool) -> dict[str, Any]:
-        """Returns the info of environment e, whose episode ends in this step."""
-        info = {key: value[e] for key, value in dense.items()}
+    def _last_info(self, e: int, info: dict[str, Any], observation: np.ndarray, cut: bool) -> dict[str, Any]:
+        """Returns the info of environment e, whose episode ends in this step, given what was reported."""
         elapsed = round(time.time() - self._started, 6)
         info["episode"] = {"r": float(self._returns[e]), "l": int(self._lengths[e]), "t": elapsed}
         info["episode"] |= {key: float(info[key]) for key in _EPISODE_KEYS if key in info}
@@ -210,19 +224,24 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of each environment of gymnasium's sync and async vector environments.
+        """Calls a method of environments of gymnasium's sync vector environments, or of all of async ones.
 
         Raises:
             AttributeError: For any other vector environment.
+            ValueError: For some of the environments of an async one, which calls all.
         """
-        inner = self.vector_env.unwrapped
+        inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
             hint = f": call vec_env.vector_env.{method_name}" if hasattr(self.vector_env, method_name) else ""
             raise AttributeError(
                 f"the environments of {type(inner).__name__} have no methods of their own to call{hint}"
             )
+        if isinstance(inner, SyncVectorEnv):
+            return [inner.envs[e].get_wrapper_attr(method_name)(*method_args, **method_kwargs) for e in chosen]
+        if sorted(chosen) != list(range(self.num_envs)):
+            raise ValueError("AsyncVectorEnv calls methods of all its environments: use SyncVectorEnv, or no indices")
         results = inner.call(method_name, *method_args, **method_kwargs)
-        return [results[e] for e in self._get_indices(indices)]
+        return [results[e] for e in chosen]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None
@@ -257,7 +276,27 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
 def _dense(info: dict[str, Any]) -> dict[str, np.ndarray]:
     """Returns those infos that are arrays with an entry per environment."""
     return {
-        key: value for key, value in info.items() if not key.startswith(("_", "final_")) and not isinstance(value, dict)
+        key: value
+        for key, value in info.items()
+        if not key.startswith("_") and key not in _FINAL and not isinstance(value, dict)
+    }
+
+
+def _is_dense(info: dict[str, Any]) -> bool:
+    """Returns whether every environment reported every info, and none is a dictionary."""
+    return not any(
+        isinstance(value, dict) or (key.startswith("_") and not np.all(value))
+        for key, value in info.items()
+        if key.removeprefix("_") not in _FINAL
+    )
+
+
+def _info_of(info: dict[str, Any], e: int) -> dict[str, Any]:
+    """Returns what environment e reported: gymnasium fills arrays up, and marks what was in them before."""
+    return {
+        key: _info_of(value, e) if isinstance(value, dict) else value[e]
+        for key, value in info.items()
+        if not key.startswith("_") and key not in _FINAL and (f"_{key}" not in info or info[f"_{key}"][e])
     }
 
 

@@ -44,7 +44,9 @@ def evaluate(settings: EvaluateSettings) -> None:
     loop = with_channel(loop, settings.channel)
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
-    if settings.shield == "as-trained" and folder.is_file():
+    from agents.agent import is_sb3_zip  # imports torch
+
+    if settings.shield == "as-trained" and is_sb3_zip(folder):
         say(f"{folder.name} does not say whether the agent was trained behind a shield: none is used; give --shield")
     require_horizon(settings, mode)
     least, horizon = settings.least_safe_steps, settings.horizon

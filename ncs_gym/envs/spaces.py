@@ -204,8 +204,8 @@ def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray
     """Reads an action, once: whoever writes into it later, or makes numbers of it anew, changes nothing any more.
 
     Returns:
-        A copy of the action, float32 if it is an array of that and float64 otherwise, and the float64 input
-        that it stands for, shape (m,) each: -1 the low end of the limits, 1 the high one, clipped to these.
+        A copy of the action, float32 if it is an array of that and float64 otherwise, clipped to [-1, 1], and the
+        float64 input that it stands for, shape (m,) each: -1 the low end of the limits, 1 the high one.
 
     Raises:
         ValueError: If the action is not finite or does not have shape (m,).
@@ -221,7 +221,7 @@ def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray
             return numbers, plant.input_half * numbers + plant.input_middle
         if all(map(isfinite, values)):
             clipped = np.array([min(max(value, -1.0), 1.0) for value in values])
-            return numbers, plant.input_half * clipped + plant.input_middle
+            return clipped.astype(numbers.dtype), plant.input_half * clipped + plant.input_middle
     raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
 
 
@@ -239,5 +239,6 @@ def read_actions(plant: LinearPlant, actions: Any, count: int) -> tuple[np.ndarr
         if farthest <= 1.0:  # the usual case
             return numbers, half * numbers.T + middle
         if np.isfinite(farthest):
-            return numbers, half * np.minimum(np.maximum(numbers.T, -1.0), 1.0) + middle
+            numbers = np.minimum(np.maximum(numbers, -1.0), 1.0)
+            return numbers, half * numbers.T + middle
     raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")

@@ -166,3 +166,14 @@ def test_progress_is_reported_in_steps():
 def _of(env_id):
     env = gym.make(env_id).unwrapped
     return env.plant, env.contract
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+def test_last_steps_of_episodes_count_whatever_the_autoreset(mode):
+    usual, others = (
+        evaluate(CRUISE.with_kwargs(max_episode_steps=3, **more), throttle, episodes=6, seed=0)
+        for more in ({}, {"autoreset_mode": mode})
+    )
+    assert sum(each.violation_steps for each in usual.episodes) > 3
+    assert usual.episodes == others.episodes
+    np.testing.assert_array_equal(usual.trajectory.states, others.trajectory.states)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -287,3 +287,61 @@ print(torch.get_num_threads())
     environment = os.environ | {"OMP_NUM_THREADS": "4", "OMP_WAIT_POLICY": "passive"}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=600)
     assert run.stdout.split() == ["1", "2"], run.stderr
+
+
+class Laps(gym.Env):
+    """Reports a lap in the step that ends one, nested numbers always, and how far it was at the end of an episode."""
+
+    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, lap):
+        self.lap, self.steps, self.scale = lap, 0, 1.0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {"start": 1.0}
+
+    def step(self, action):
+        self.steps += 1
+        info = {"terms": {"speed": float(self.steps)}, "final_distance": float(self.lap), "scale": self.scale}
+        info |= {"lap_time": float(self.lap)} if self.steps % self.lap == 0 else {}
+        ends = self.steps == 7 + self.lap
+        return np.zeros(1, np.float32), 0.0, False, ends, info | ({"end": float(self.steps)} if ends else {})
+
+    def set_scale(self, scale):
+        self.scale = scale
+        return scale
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_infos_are_those_that_each_environment_reported(mode):
+    makes = [lambda: Laps(2), lambda: Laps(3)]
+    ours, theirs = SB3VecEnv(gym.vector.SyncVectorEnv(makes, autoreset_mode=mode)), DummyVecEnv(makes)
+    ours.reset(), theirs.reset()
+    ends = 0
+    for _ in range(40):
+        for mine, expected in zip(ours.step(np.zeros((2, 1)))[3], theirs.step(np.zeros((2, 1)))[3], strict=True):
+            ends += "terminal_observation" in expected
+            assert {key: mine[key] for key in mine if key != "episode"} == expected
+        assert [dict(each) for each in ours.reset_infos] == theirs.reset_infos == [{"start": 1.0}] * 2
+    assert ends > 6
+
+
+def test_methods_are_called_of_the_environments_asked_for():
+    sync = SB3VecEnv(gym.vector.SyncVectorEnv([lambda: Laps(2)] * 3))
+    sync.reset()
+    assert sync.env_method("set_scale", 5.0, indices=[1]) == [5.0]
+    assert [info["scale"] for info in sync.step(np.zeros((3, 1)))[3]] == [1.0, 5.0, 1.0]
+    several = SB3VecEnv(gym.vector.AsyncVectorEnv([lambda: Laps(2)] * 2))
+    several.reset()
+    with pytest.raises(ValueError, match="calls methods of all its environments"):
+        several.env_method("set_scale", 5.0, indices=[1])
+    assert several.env_method("set_scale", 4.0) == [4.0, 4.0]
+    assert [info["scale"] for info in several.step(np.zeros((2, 1)))[3]] == [4.0, 4.0]
+    several.close()
+
+
+def test_normalization_that_cannot_reset_some_environments_is_refused():
+    with pytest.raises(ValueError, match="VecNormalize around SB3VecEnv"):
+        SB3VecEnv(NormalizeObservation(gym.make_vec(CRUISE, num_envs=2)))

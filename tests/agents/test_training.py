@@ -10,10 +10,12 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import SafetyCallback, SB3VecEnv, evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
+from shields import SafetyShield
 from tests.certificates import certificate_of
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
@@ -263,3 +265,25 @@ def test_what_the_library_takes_is_not_refused():
     linear = {"clip_range": "lin_0.2", "target_kl": None, "normalize": {"norm_reward": False, "clip_obs": 5}}
     require_trainable(CRUISE, 100_000, "PPO", linear | {"gamma": 1, "use_sde": True, "policy": "MlpPolicy"})
     require_trainable(CRUISE, 100_000, "SAC", {"ent_coef": 0.1, "noise_type": "normal", "noise_std": 0.1})
+
+
+class Totals(BaseCallback):
+    """Sums of what the infos of all environments say themselves."""
+
+    violations = interventions = 0
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            self.violations += info["cost"] > 0.0
+            self.interventions += info.get("shield_intervened", False)
+        return True
+
+
+@pytest.mark.parametrize("order", [1, -1], ids=["bare first", "shielded first"])
+def test_overrides_are_counted_where_only_some_environments_have_a_shield(order, certificate):
+    makes = [lambda: gym.make(CRUISE.env), lambda: SafetyShield(gym.make(CRUISE.env), certificate)]
+    counted, totals = SafetyCallback(), Totals()
+    model = PPO("MlpPolicy", DummyVecEnv(makes[::order]), n_steps=64, batch_size=64, n_epochs=1, seed=0)
+    model.learn(256, callback=[counted, totals])
+    assert (counted.interventions, counted.violation_steps) == (totals.interventions, totals.violations)
+    assert counted.interventions > 10

@@ -251,3 +251,29 @@ def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, auto
         assert np.all(one["shield_guaranteed"])
         overridden += np.count_nonzero(one["shield_intervened"])
     assert overridden > 10
+
+
+@pytest.mark.parametrize("kind", ["scalar", "vector"])
+def test_what_is_handed_on_lies_in_the_action_space(kind, certificate):
+    """A recorder inside the shield stores what was applied."""
+    seen = []
+
+    def spy(base):
+        class Spy(base):
+            def step(self, action):
+                seen.append(np.array(action))
+                return self.env.step(action)
+
+        return Spy
+
+    if kind == "scalar":
+        env, shape = SafetyShield(spy(gym.Wrapper)(gym.make(CRUISE)), certificate), (1,)
+    else:
+        inner = spy(gym.vector.VectorWrapper)(gym.make_vec(CRUISE, num_envs=3))
+        env, shape = VectorSafetyShield(inner, certificate), (3, 1)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        *_, info = env.step((3.0 * rng.standard_normal(shape)).astype(np.float32))
+        assert env.action_space.contains(seen[-1])
+        np.testing.assert_array_equal(seen[-1], info["action_applied"])
