@@ -243,6 +243,14 @@ def test_one_agent_is_trained(tmp_path, without_workers):
     summary = json.loads((tmp_path / "one" / "summary.json").read_text())
     assert summary["arms"]["shielded"]["train_violation_steps"] == 0
     assert Agent.load(model).algorithm == "A2C"
+    evaluated = succeeded("evaluate", model / "model.zip", "--episodes", "2")  # beside what the agent is known by
+    assert "shield: project" in evaluated.stdout
+    assert "none is used" not in evaluated.stderr
+    (tmp_path / "alone.zip").write_bytes((model / "model.zip").read_bytes())
+    alone = ("--env", "ncs_gym/TruckTrailerCruise-v0", "--vec-normalize", "none", "--episodes", "2")
+    bare = succeeded("evaluate", tmp_path / "alone.zip", *alone)
+    assert "shield: none" in bare.stdout
+    assert "none is used; give --shield" in bare.stderr
 
 
 @pytest.mark.slow
