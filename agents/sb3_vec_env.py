@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -151,8 +151,8 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
             infos = [{"TimeLimit.truncated": False} | _info_of(info, e) for e in range(self.num_envs)]
         # In SAME_STEP mode the others are those of the next episodes.
         final = info.get("final_info", info) if self._mode is AutoresetMode.SAME_STEP else info
-        for e in np.flatnonzero(done).tolist():
-            infos[e] = self._last_info(e, _info_of(final, e), last[e], bool(truncated[e] and not terminated[e]))
+        for e, reported in _reported(final, done):
+            infos[e] = self._last_info(e, reported, last[e], bool(truncated[e] and not terminated[e]))
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._mode is AutoresetMode.SAME_STEP:
@@ -169,8 +169,8 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
 
     def _keep_first_infos(self, chosen: np.ndarray, info: dict[str, Any]) -> None:
         """Keeps the infos of the first observations of some environments' episodes, bool (N,)."""
-        for e in np.flatnonzero(chosen).tolist():
-            self.reset_infos[e] = _info_of(info, e)
+        for e, reported in _reported(info, chosen):
+            self.reset_infos[e] = reported
 
     def _last_info(self, e: int, info: dict[str, Any], observation: np.ndarray, cut: bool) -> dict[str, Any]:
         """Returns the info of environment e, whose episode ends in this step, given what was reported."""
@@ -289,6 +289,16 @@ def _is_dense(info: dict[str, Any]) -> bool:
         for key, value in info.items()
         if key.removeprefix("_") not in _FINAL
     )
+
+
+def _reported(info: dict[str, Any], chosen: np.ndarray) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yields the environments chosen, bool (N,), each with what it reported."""
+    numbers = np.flatnonzero(chosen).tolist()
+    if numbers and _is_dense(info):
+        dense = _dense(info)
+        yield from ((e, {key: value[e] for key, value in dense.items()}) for e in numbers)
+    else:
+        yield from ((e, _info_of(info, e)) for e in numbers)
 
 
 def _info_of(info: dict[str, Any], e: int) -> dict[str, Any]:
