@@ -144,7 +144,7 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
             last = info["final_obs"]
             self.batch_info = _with_final(info, done)
         if _is_dense(info):
-            infos = step_infos(_dense(self.batch_info), self.num_envs)
+            infos = step_infos(_dense(info), self.num_envs)
             if not self._masks:  # other people's vector environments may write into arrays of earlier steps
                 infos = [each.copy() for each in infos]
         else:
