@@ -243,6 +243,13 @@ KINDS = {
         "0.5",
         "sent when its stamps say",
     ),
+    "ping -D with a late answer": Kind(
+        f"[1700000000.012] {ping([(1, 12)])}[1700000000.212] {ping([(2, 12)])}[1700000000.612] {ping([(4, 12)])}"
+        f"[1700000000.700] {ping([(3, 300)])}[1700000000.812] {ping([(5, 12)])}",
+        times("0.2", ["0.012", "0.012", "0.3", "0.012", "0.012"]),
+        "0.1",
+        "sent when its stamps say",
+    ),
     "table with rows and columns in any order": Kind(
         "received,size,sent\n0.011,60,0.00\n,60,0.02\n0.065,60,0.06\n0.09,60,0.04\n",
         times("0.02", ["0.011", None, "0.05", "0.005"]),

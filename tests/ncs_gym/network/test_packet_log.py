@@ -20,6 +20,12 @@ def test_log_of_a_loop_is_read_in_steps_with_the_packets_that_are_missing(tmp_pa
     assert [log.send_period(dt) for dt in (0.05, 0.025)] == [1, 2]
 
 
+@pytest.mark.parametrize("dt", [0.01, 0.02, 0.05])
+def test_times_since_1970_are_placed_in_the_steps_they_are_rounded_from(dt):
+    sent = 1_764_000_000.0 + dt * np.arange(1000)
+    assert PacketLog(sent, np.full(1000, dt)).trace(dt) == (1,) * 1000
+
+
 def ages_by_hand(trace, period, steps):
     """Looks at every packet at every step; the first estimate is one."""
     ages = []
