@@ -30,7 +30,7 @@ from agents.agent_file import (
 )
 from agents.algorithms import algorithm_class, build_model, policy_arguments
 from agents.hyperparams import ALGORITHMS, ON_POLICY, complete_hyperparams, require_moderate_networks
-from agents.loop import LoopConfig, ShieldSettings, with_gain
+from agents.loop import BasePolicy, LoopConfig, ShieldSettings
 from agents.normalization import Normalization, read_statistics, statistics_beside
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
@@ -52,7 +52,7 @@ class Agent:
         channel: Channel the agent was trained with; None for that of the id.
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
-        residual_gain: Normalized gain, shape (m, n), to whose action that of the model is added; None for none.
+        base_policy: Policy to whose action that of the model is added; None for none.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
         least_safe_steps: Steps for which that shield sought to keep the box whatever the network does.
@@ -65,7 +65,7 @@ class Agent:
     channel: Channel | None
     model: BaseAlgorithm
     normalization: Normalization
-    residual_gain: np.ndarray | None = None
+    base_policy: BasePolicy | None = None
     shield_mode: str | None = None
     horizon: int | None = None
     least_safe_steps: int = 0
@@ -97,8 +97,8 @@ class Agent:
         if not np.isfinite(batch).all():
             raise ValueError("observations must be finite numbers, got NaN or infinity")
         actions = self.model.predict(self.normalization(batch), deterministic=True)[0]
-        if self.residual_gain is not None:
-            actions = with_gain(self.residual_gain, batch, actions)
+        if self.base_policy is not None:
+            actions = self.base_policy.plus(batch, actions)
         return actions[0] if len(shape) == 1 else actions
 
     def predict(
@@ -151,8 +151,8 @@ class Agent:
             },
             "sha256_of_model": hashlib.sha256(buffer.getvalue()).hexdigest(),
         }
-        if self.residual_gain is not None:
-            content["residual_gain"] = self.residual_gain.tolist()
+        if self.base_policy is not None:
+            content["base_policy"] = {name: each.tolist() for name, each in vars(self.base_policy).items()}
         if self.kwargs:
             content["kwargs"] = self.kwargs
         return {"model.zip": buffer.getvalue(), "agent.json": document_of(content)}
@@ -247,6 +247,8 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
             f"the agent was trained in {shown(str(env_id))[1:-1]}, which is not registered here: import the module "
             "that registers it, or on the command line give --env module:id, with the name of that module"
         )
+    if unknown := content.keys() - _ENTRIES:
+        raise AgentError(f"its agent.json is of another version: it has {', '.join(map(shown, sorted(unknown)))}")
     kwargs = content.get("kwargs", {})
     require_kept(kwargs, env_id)
     if not _is_for_plant_of(env_id, kwargs, content["plant"]):
@@ -269,12 +271,11 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     usable = mean.shape == variance.shape == model.observation_space.shape
     if not (usable and np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise AgentError("the agent is damaged: its normalization has a wrong shape or value")
-    gain = content.get("residual_gain")
-    if gain is not None:
-        gain = np.array(gain, dtype=np.float64)
-        fits = gain.ndim == 2 and gain.shape[:1] == model.action_space.shape and gain.shape[1] <= len(mean)
-        if not (fits and np.isfinite(gain).all()):
-            raise AgentError("the agent is damaged: its residual gain has a wrong shape or value")
+    base = content.get("base_policy")
+    if base is not None:
+        base = BasePolicy(**base)
+        if base.gain.shape[:1] != model.action_space.shape or base.gain.shape[1] > len(mean):
+            raise AgentError("the agent is damaged: its base policy has a wrong shape")
     return Agent(
         algorithm=algorithm,
         hyperparams=hyperparams,
@@ -282,7 +283,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         channel=loop.channel,
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
-        residual_gain=gain,
+        base_policy=base,
         shield_mode=shield_mode,
         horizon=horizon,
         least_safe_steps=least_safe_steps,
@@ -372,6 +373,11 @@ def _normalization_for(
     )
 
 
+# What an agent.json has: what else it says might be a part of the policy.
+_ENTRIES = {
+    *("algorithm", "hyperparams", "env", "kwargs", "channel", "plant", "shield", "normalization", "base_policy"),
+    "sha256_of_model",
+}
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {
     *("task", "disturbance", "noise", "initial_set", "terminate_on_violation", "allow_assumption_violation", "process"),
@@ -450,10 +456,10 @@ def _figures(evaluation: Evaluation) -> list[str]:
 
 
 def _residual_text(agent: Agent) -> str:
-    if agent.residual_gain is None:
+    if (base := agent.base_policy) is None:
         return ""
-    gain = agent.residual_gain.tolist()
-    return f"`Agent` adds {gain} x_hat [input limits]; the weights alone are a part of the policy"
+    offset = f" + {base.offset.tolist()}" if base.offset.any() else ""
+    return f"`Agent` adds {base.gain.tolist()} x_hat{offset} [actions]; the weights alone are a part of the policy"
 
 
 def _shield_text(shield: ShieldSettings | None) -> str:

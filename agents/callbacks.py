@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from agents.evaluation import evaluate
-from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, with_gain
+from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 
@@ -209,11 +209,11 @@ class EvaluationCallback(RegularCallback):
 
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
-        env, gain, seen = self.model.get_env(), self._loop.residual_gain, observations
+        env, base, seen = self.model.get_env(), self._loop.base_policy, observations
         if isinstance(env, VecNormalize):
             seen = np.asarray(env.normalize_obs(observations))
         actions = self.model.predict(seen, deterministic=True)[0]
-        return actions if gain is None else with_gain(gain, observations, actions)
+        return actions if base is None else base.plus(observations, actions)
 
 
 def _counted(callback: BaseCallback) -> dict[str, Any]:

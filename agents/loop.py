@@ -11,10 +11,19 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
-from ncs_gym import Channel
+from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import from_json
-from ncs_gym.validation import AroundEnvironments, as_matrix, as_number, shown
+from ncs_gym.validation import (
+    FILLED_IN_LATER,
+    AroundEnvironments,
+    ReadOnlyArrays,
+    as_matrix,
+    as_number,
+    as_vector,
+    shown,
+)
 from shields import Certificate, SafetyShield, VectorSafetyShield
+from shields.certificate import Fallback
 from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import plan_horizon
 
@@ -71,6 +80,45 @@ class LagrangianSettings:
                 raise ValueError(f"{entry.name} must be >= 0, got {value!r}")
 
 
+@dataclass(frozen=True, eq=False)
+class BasePolicy(ReadOnlyArrays):
+    """The policy a = gain x_hat + offset, to whose action a residual agent adds its own (Silver et al. 2018).
+
+    Attributes:
+        gain: Shape (m, n), normalized actions per unit of each state.
+        offset: Shape (m,), in normalized actions; zero by default.
+
+    Raises:
+        ValueError: If one has a wrong shape or is not finite.
+    """
+
+    gain: np.ndarray
+    offset: np.ndarray = FILLED_IN_LATER
+
+    def __post_init__(self) -> None:
+        gain = as_matrix(self.gain, (None, None), "gain")
+        offset = np.zeros(len(gain)) if self.offset is None else as_vector(self.offset, len(gain), "offset")
+        object.__setattr__(self, "gain", gain)
+        object.__setattr__(self, "offset", offset)
+        self._make_arrays_read_only()
+
+    @classmethod
+    def of(cls, fallback: Fallback, plant: LinearPlant) -> BasePolicy:
+        """Returns the input of a certificate's gain as normalized actions of its plant."""
+        half = plant.input_half
+        return cls(fallback.gain / half[:, None], (fallback.constant - plant.input_middle) / half)
+
+    def plus(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Returns actions (N, m) that add an agent's to those of this policy, within the limits.
+
+        Args:
+            observations: Shape (N, entries), the first n of which are the estimate.
+            actions: The agent's part, shape (N, m).
+        """
+        own = observations[:, : self.gain.shape[1]] @ self.gain.T + self.offset
+        return np.clip(own + actions, -1.0, 1.0).astype(np.float32)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LoopConfig:
     """A registered environment, and everything that stands between it and an agent.
@@ -84,11 +132,11 @@ class LoopConfig:
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
-        residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
+        base_policy: Policy to whose action an agent in training adds its own.
 
     Raises:
-        ValueError: If the shield is something else than its settings, another filter is given beside it, the id is
-            not registered, a penalty or gain is wrong, or `lagrangian` limits the cost of episodes without an end.
+        ValueError: If shield or base policy are something else, another filter is given beside a shield, the id is
+            not registered, a penalty is wrong, or `lagrangian` limits the cost of episodes without an end.
     """
 
     env: str
@@ -97,7 +145,7 @@ class LoopConfig:
     filter: Callable[[VectorEnv], VectorEnv] | None = None
     violation_penalty: float = 0.0
     lagrangian: LagrangianSettings | None = None
-    residual_gain: np.ndarray | None = None
+    base_policy: BasePolicy | None = None
 
     def __post_init__(self) -> None:
         if self.shield is not None and not isinstance(self.shield, ShieldSettings):
@@ -114,8 +162,8 @@ class LoopConfig:
         object.__setattr__(self, "violation_penalty", penalty)
         if penalty and self.lagrangian is not None:
             raise ValueError("give either violation_penalty or lagrangian, which adapts it from its own multiplier")
-        if self.residual_gain is not None:
-            object.__setattr__(self, "residual_gain", as_matrix(self.residual_gain, (None, None), "residual_gain"))
+        if not (self.base_policy is None or isinstance(self.base_policy, BasePolicy)):
+            raise ValueError(f"base_policy must be a BasePolicy, got {shown(self.base_policy)}")
         given = {name: value for name, value in self.kwargs.items() if value is not None}
         object.__setattr__(self, "kwargs", given)
         if self.lagrangian is not None and self.episode_steps is None:
@@ -143,7 +191,7 @@ class LoopConfig:
     def without_penalties(self) -> LoopConfig:
         """The same loop as it is evaluated: with the environment's own rewards, the policy's actions being complete."""
         shield = self.shield and replace(self.shield, penalty=0.0)
-        return replace(self, shield=shield, violation_penalty=0.0, lagrangian=None, residual_gain=None)
+        return replace(self, shield=shield, violation_penalty=0.0, lagrangian=None, base_policy=None)
 
     def single(self, **settings: Any) -> gym.Env:
         """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
@@ -160,8 +208,8 @@ class LoopConfig:
                 envs = VectorSafetyShield(envs, **vars(self.shield))
         if self.filter is not None:
             envs = self.filter(envs)
-        if self.residual_gain is not None:
-            envs = ResidualActions(envs, self.residual_gain)
+        if self.base_policy is not None:
+            envs = ResidualActions(envs, self.base_policy)
         if self.lagrangian is not None:
             return CostPenalty(envs, self.lagrangian.multiplier)
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
@@ -191,21 +239,19 @@ class CostPenalty(AroundEnvironments, VectorWrapper):
 
 
 class ResidualActions(AroundEnvironments, VectorWrapper):
-    """Applies u = gain x_hat plus the agent's part, clipped to the limits (Silver et al. 2018).
+    """Applies the action of a base policy plus the agent's part, clipped to the limits (Silver et al. 2018).
 
     Args:
         env: A vector environment whose observations begin with the estimate.
-        gain: Normalized gain, shape (m, n): the input in units of its limit for an estimate in physical units.
+        base: The base policy.
     """
 
-    def __init__(self, env: VectorEnv, gain: np.ndarray) -> None:
+    def __init__(self, env: VectorEnv, base: BasePolicy) -> None:
         actions, observations = env.single_action_space.shape, env.single_observation_space.shape
-        if actions is None or observations is None or gain.shape[0] != actions[0] or gain.shape[1] > observations[0]:
-            raise ValueError(f"residual_gain must have the shape (m, n) of actions and states, got {gain.shape}")
-        plant = getattr(env.unwrapped, "plant", None)
-        if plant is not None and plant.input_middle.any():
-            raise ValueError("residual_gain is for input limits that are symmetric (plant.symmetric)")
-        self.gain = gain
+        (m, n) = base.gain.shape
+        if actions is None or observations is None or m != actions[0] or n > observations[0]:
+            raise ValueError(f"base_policy must have a gain of the shape (m, n) of actions and states, got {(m, n)}")
+        self.base = base
         super().__init__(env)
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
@@ -215,16 +261,5 @@ class ResidualActions(AroundEnvironments, VectorWrapper):
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Steps the environments with the sum of both parts."""
-        self._observation, *rest = self.env.step(with_gain(self.gain, self._observation, actions))
+        self._observation, *rest = self.env.step(self.base.plus(self._observation, actions))
         return (self._observation, *rest)  # type: ignore[return-value]
-
-
-def with_gain(gain: np.ndarray, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Returns actions (N, m) that add u = gain x_hat to an agent's, within the limits.
-
-    Args:
-        gain: Normalized gain, shape (m, n).
-        observations: Shape (N, entries), the first n of which are the estimate.
-        actions: The agent's part, shape (N, m).
-    """
-    return np.clip(observations[:, : gain.shape[1]] @ gain.T + actions, -1.0, 1.0).astype(np.float32)

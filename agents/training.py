@@ -164,7 +164,7 @@ def _trainable(
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     envs = loop.vector(hyperparams["n_envs"])
-    if hyperparams.get("stored_action") == "applied" and loop.residual_gain is not None:
+    if hyperparams.get("stored_action") == "applied" and loop.base_policy is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
     env = normalized_env(algorithm, SB3VecEnv(envs), hyperparams)
     model = build_model(algorithm, env, hyperparams, seed, before + steps)
@@ -206,7 +206,7 @@ def _agent(
         channel=loop.channel,
         model=model,
         normalization=Normalization.of(env),
-        residual_gain=loop.residual_gain,
+        base_policy=loop.base_policy,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
         least_safe_steps=0 if loop.shield is None else loop.shield.least_safe_steps,

@@ -9,7 +9,7 @@ from functools import cache
 
 from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import with_changes
-from agents.loop import LoopConfig, ShieldSettings
+from agents.loop import BasePolicy, LoopConfig, ShieldSettings
 from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS, EstimateFilterSettings, tuned_training
 from experiments.runs.loops import other_scenarios, under
 from experiments.runs.policies import PRETRAINED
@@ -112,11 +112,8 @@ class Arm:
             given = self.violation_weight
             training = replace(training, violation_penalty=settings.violation_penalty if given is None else given)
         if self.is_residual:
-            try:
-                u_max = ncs_env(loop.single()).plant.u_max
-            except ValueError as error:
-                raise ValueError(f"arm {self.name}: {error}") from None
-            training = replace(training, residual_gain=certificate.K / u_max[:, None])
+            base = BasePolicy.of(certificate.fallback, ncs_env(loop.single()).plant)
+            training = replace(training, base_policy=base)
         return training, filtered()
 
 

@@ -199,10 +199,10 @@ class CompareSettings(LearningSettings):
             shielded:MODE, lookahead, trusting and trusting:lookahead (certainty-equivalent: without an error set), psf
             (a nominal predictive safety filter), these also with a margin in percent as in psf:20, psf:tube.
             shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
-            intervention, +residual adds the agent's action to K x_hat. Controllers that are not trained: proportional,
-            lqr, governor (lqr with a reference governor, governor:20 with a margin), random, K-x_hat, zero-input,
-            untrained and pretrained (the agent that comes with the package), alone or behind a filter as in
-            proportional+shielded.
+            intervention, +residual adds the agent's action to that of K. Controllers that are not trained:
+            proportional, lqr, governor (lqr with a reference governor, governor:20 with a margin), random, K-x_hat,
+            zero-input, untrained and pretrained (the agent that comes with the package), alone or behind a filter as
+            in proportional+shielded.
         baselines: Arms that are listed below the others and not drawn.
         scenarios: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
             loss, later packets, within the contract), ideal-channel, attacked (the worst disturbance, noise of full

@@ -11,7 +11,7 @@ from agents.agent import Agent, Normalization
 from agents.agent_file import AgentError
 from agents.evaluation import evaluate
 from agents.hyperparams import with_changes
-from agents.loop import LoopConfig, ShieldSettings
+from agents.loop import BasePolicy, LoopConfig, ShieldSettings
 from agents.results import TrainingPoint
 from agents.training import train
 from ncs_gym import Channel, GilbertElliott, truck_trailer
@@ -64,9 +64,9 @@ def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
         assert again.channel == bursts
 
 
-@pytest.mark.parametrize("gain", [None, np.array([[0.2, -0.1]])])
-def test_single_observation_gives_the_action_of_a_batch_of_one(agent, gain):
-    one = replace(agent, residual_gain=gain)
+@pytest.mark.parametrize("base", [None, BasePolicy(np.array([[0.2, -0.1]]), np.array([0.1]))])
+def test_single_observation_gives_the_action_of_a_batch_of_one(agent, base):
+    one = replace(agent, base_policy=base)
     action = one.act(OBSERVATIONS[7])
     assert action.shape == (1,)
     np.testing.assert_array_equal(action, one.act(OBSERVATIONS[7:8])[0])
@@ -149,11 +149,12 @@ def test_totals_that_are_no_numbers_are_equal():
     assert [one] != [replace(one, steps=9)]
 
 
-def test_card_of_a_residual_agent_has_its_gain(agent, tmp_path):
+@pytest.mark.parametrize(("offset", "text"), [([0.0], "x_hat [actions]"), ([0.5], "x_hat + [0.5] [actions]")])
+def test_card_of_a_residual_agent_has_its_base_policy(offset, text, agent, tmp_path):
     agent.save(tmp_path)
     assert "residual" not in (tmp_path / "README.md").read_text()
-    replace(agent, residual_gain=np.array([[0.3, 0.1]])).save(tmp_path)
-    assert "`Agent` adds [[0.3, 0.1]] x_hat [input limits]" in (tmp_path / "README.md").read_text()
+    replace(agent, base_policy=BasePolicy(np.array([[0.3, 0.1]]), np.array(offset))).save(tmp_path)
+    assert f"`Agent` adds [[0.3, 0.1]] {text}" in (tmp_path / "README.md").read_text()
 
 
 def test_card_without_a_shield_names_none(folder, agent, certificate):
@@ -257,6 +258,9 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
         (lambda folder: change(folder, algorithm="DQN"), "unknown algorithm"),
         (lambda folder: change(folder, hyperparams={"tensorboard_log": "/"}), "damaged: PPO: unknown hyperparameter"),
         (lambda folder: change(folder, channel={"loss": 7}), "damaged"),
+        (lambda folder: change(folder, residual_gain=[[1.0, 1.0]]), "of another version: it has 'residual_gain'"),
+        (lambda folder: change(folder, base_policy=[[1.0, 1.0]]), "damaged"),
+        (lambda folder: change(folder, base_policy={"gain": [[float("nan"), 1.0]]}), "damaged"),
         (lambda folder: change(folder, normalization={"mean": [0.0] * 3}), "damaged"),
         (
             lambda folder: change(folder, normalization=SHORT),

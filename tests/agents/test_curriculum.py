@@ -11,7 +11,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from agents import SB3VecEnv
-from agents.loop import CostPenalty, ResidualActions
+from agents.loop import BasePolicy, CostPenalty, ResidualActions
 from ncs_gym import (
     Channel,
     Networked,
@@ -54,7 +54,7 @@ WRAPPED = {
     "randoms": (lambda: VectorRandomChannel(shields(), [Channel()]), ("channel", "penalty")),
     "asking": (lambda: VectorRequestActions(gym.make_vec(ID, num_envs=2, **ASKS)), ("channel", "noise")),
     "penalty": (lambda: CostPenalty(shields(), 1.0), ("channel", "certificate")),
-    "residual": (lambda: ResidualActions(shields(), np.zeros((1, 2))), ("channel", "initial_set")),
+    "residual": (lambda: ResidualActions(shields(), BasePolicy(np.zeros((1, 2)))), ("channel", "initial_set")),
     "adapter": (lambda: SB3VecEnv(shields()), ("channel", "disturbance", "penalty", "certificate")),
 }
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from agents import evaluate
-from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
+from agents.loop import BasePolicy, LagrangianSettings, LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
-from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym import truck_trailer
 from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
 
@@ -27,10 +27,6 @@ PAPER = PaperCertificate(
     epsilon_up=0.1,
     fingerprint=CERTIFICATE.fingerprint,
 )
-UNEVEN = LinearPlant(
-    A=[[0.9]], B=[[0.1]], box=[1.0], input_limits=(0.0, 2.0), operating_input=0.5, dt=1.0,
-    disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-)  # fmt: skip
 NAN, INF = float("nan"), float("inf")
 OBSERVED = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \(N, 3\), got "
 
@@ -89,9 +85,11 @@ CALLS = [
       for value in (-50.0, NAN, "5")),
     (partial(LoopConfig, env=CRUISE.env, violation_penalty=1.0, lagrangian=LagrangianSettings()),
      "give either violation_penalty or lagrangian"),
-    (partial(LoopConfig(env=CRUISE.env, residual_gain=np.ones((3, 3))).vector, 2), "residual_gain must have the shape"),
-    (partial(LoopConfig(env="ncs_gym/LinearNCS-v0", kwargs={"plant": UNEVEN}, residual_gain=[[0.1]]).vector, 2),
-     "residual_gain is for input limits that are symmetric"),
+    (partial(LoopConfig(env=CRUISE.env, base_policy=BasePolicy(np.ones((3, 3)))).vector, 2),
+     "base_policy must have a gain of the shape"),
+    (partial(LoopConfig, env=CRUISE.env, base_policy=np.ones((1, 2))), "base_policy must be a BasePolicy"),
+    *((partial(BasePolicy, *given), said) for given, said in
+      ((([[NAN]],), "gain must be finite"), (([[0.1]], [0.0, 0.0]), r"offset must have shape \(1,\)"))),
     (partial(ShieldSettings, CERTIFICATE, penalty=-1.0), "penalty must be a number >= 0"),
     (partial(LoopConfig, env=CRUISE.env, shield=CERTIFICATE),
      r"^shield must be ShieldSettings\(certificate\), got Certificate$"),

@@ -106,7 +106,8 @@ def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of,
     run = run_of("shielded+residual")
     assert layers(run.training_loop.vector(2)) == [ResidualActions, VectorSafetyShield]
     assert layers(run.loop.vector(2)) == [VectorSafetyShield]
-    np.testing.assert_allclose(run.training_loop.residual_gain, certificate.K / loaded.u_max)
+    np.testing.assert_allclose(run.training_loop.base_policy.gain, certificate.K / loaded.u_max)
+    np.testing.assert_array_equal(run.training_loop.base_policy.offset, 0.0)
 
 
 @pytest.mark.cases(2)

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.loop import LagrangianSettings
+from agents.loop import BasePolicy, LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
 from experiments.errors import ResultsError
@@ -56,7 +56,7 @@ def test_result_of_other_settings_is_not_taken(store, run, change):
         {"kwargs": {"noise": "gaussian"}},
         {"kwargs": {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}}}},
         {"lagrangian": LagrangianSettings()},
-        {"residual_gain": np.ones((1, 2))},
+        {"base_policy": BasePolicy(np.ones((1, 2)))},
         {"shield": None},
     ],
 )
