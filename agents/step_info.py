@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
-# An info has it whether an episode ends or not, as under stable-baselines3's own vector environments.
-_GOES_ON = {"TimeLimit.truncated": False}
+# What an info has before its values are taken out of the arrays. The first key is there whether an episode ends or not,
+# as under stable-baselines3's own vector environments. The second is no text: code that reads the memory of a dictionary
+# instead of asking it (orjson, pyarrow) fails at it, where it would take the info for an empty one.
+_UNTAKEN = object()
+_GOES_ON = {"TimeLimit.truncated": False, _UNTAKEN: "values are taken when they are read: pass dict(info)"}
 
 
 def step_infos(arrays: dict[str, np.ndarray], count: int) -> list[dict[str, Any]]:
@@ -63,6 +66,7 @@ class StepInfo(dict):
     def take_all(self) -> None:
         """Takes all values out of the arrays; from then on it is a dictionary like any other."""
         arrays, self._arrays = self._arrays, {}
+        dict.pop(self, _UNTAKEN, None)
         for key, value in arrays.items():
             dict.__setitem__(self, key, value[self._e])
 

@@ -65,3 +65,10 @@ def test_an_info_equals_a_dictionary_of_the_same_entries():
         step_infos(arrays, 2)[0]["none"]
     with pytest.raises(TypeError, match="unhashable"):
         hash(step_infos(arrays, 2)[0])
+
+
+def test_code_that_reads_the_memory_of_an_info_fails_and_takes_it_for_no_empty_one():
+    info = step_infos(ARRAYS, 2)[1]
+    assert any(not isinstance(key, str) for key in dict.keys(info))  # what orjson and pyarrow see, and refuse
+    assert len(info) == 3
+    assert sorted(dict.keys(info)) == ["TimeLimit.truncated", "cost", "input"]
