@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 # What an info has before its values are taken out of the arrays. The first key is there whether an episode ends or not,
-# as under stable-baselines3's own vector environments. The second is no text: code that reads the memory of a dictionary
-# instead of asking it (orjson, pyarrow) fails at it, where it would take the info for an empty one.
+# as under stable-baselines3's own vector environments. The second is no text: code that reads a dictionary's memory
+# instead of asking it (orjson, pyarrow) fails there, where it would take the info for an empty one.
 _UNTAKEN = object()
 _GOES_ON = {"TimeLimit.truncated": False, _UNTAKEN: "values are taken when they are read: pass dict(info)"}
 
