@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -281,6 +282,7 @@ def _has_gradient(value: Any) -> bool:
 def reason_of(error: BaseException) -> str:
     """Returns what an error says, as messages quote it: on one line, not without end; its type if it says nothing."""
     text = " ".join(str(error)[: 2 * MAX_QUOTED_LENGTH].split()).rstrip(".") or type(error).__name__
+    text = re.sub(r"\. Did you mean (.*)\?$", r" (did you mean \1?)", text)  # as Python asks from 3.13 on
     return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
 
 

@@ -45,7 +45,7 @@ HYPERPARAMS = [
     ("SAC", {"policy": "CnnPolicy"}, "SAC: policy must be 'MlpPolicy' here, got 'CnnPolicy'"),
     ("SAC", {"replay_buffer_class": "HerReplayBuffer"}, "replay_buffer_class cannot be 'HerReplayBuffer'"),
     ("PPO", {"batch_size": 10**11}, "batch_size must be a whole number >= 1 and at most 10,000,000, got 1000000000"),
-    ("PPO", {"policy_kwargs": {"net_arc": [8]}}, "PPO: .*'net_arc'; its hyperparameters are"),
+    ("PPO", {"policy_kwargs": {"net_arc": [8]}}, r"PPO: [^.]*\.__init__[^.]*'net_arc'[^.]*; its hyperparameters are"),
     ("PPO", {"batch_size": 1}, "PPO: .*batch_size.*; its hyperparameters are"),
     *(("PPO", {"normalize": value}, "PPO: normalize must be true or") for value in (False, {"norm_obs": False})),
     ("PPO", {"normalize": {"gain": 2.0}}, "PPO: normalize: unknown hyperparameter 'gain'"),
