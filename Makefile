@@ -16,12 +16,13 @@ DOCS_INSTALLED := $(VENV)/.installed-docs
 AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
+LOWEST := $(VENV)-lowest
 
 # The project's public address, written into pyproject.toml, CITATION.cff, README.md, the notebook and the site by `make address`.
 ADDRESS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
+.PHONY: help compare study pretrained test test-other-processor test-lowest coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
 	example-times docs words audit dist address clean
 
 help: ## this list
@@ -48,6 +49,9 @@ test-other-processor: $(INSTALLED) ## what proves and decides, as on another pro
 		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/uncertainty tests/shields tests/hardening \
 		--ignore=tests/shields/nodes --ignore=tests/shields/paper --ignore=tests/hardening/test_bounded_inputs.py \
 		--ignore=tests/hardening/test_result_folders.py
+
+test-lowest: $(LOWEST)/.installed ## the tests, with the lowest versions of dependencies that pyproject.toml allows
+	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal
 
 # The suite, and the share of lines and branches it runs, by package. Tracing takes half as much time again.
 coverage: $(INSTALLED) ## the tests, and what share of the code they run
@@ -125,6 +129,15 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[train,contrib,render,video,zmq,live,dev]'
+	touch $@
+
+# Torch is the one of constraints.txt: it takes the longest to fetch.
+$(LOWEST)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt uv
+	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct "$$(grep '^torch==' constraints.txt)" \
+		-e '.[train,contrib,render,video,zmq,live,dev]'
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)

@@ -116,7 +116,7 @@ class Task(ReadOnlyArrays, ABC):
         """
         value = self.reward(plant, task_state, guarded(state), u)
         try:
-            reward = float(value + 0.0)
+            reward = nan if getattr(value, "ndim", 0) else float(value + 0.0)
         except (TypeError, ValueError):
             reward = nan
         if reward != reward:
