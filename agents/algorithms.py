@@ -190,6 +190,8 @@ class AppliedActionBuffer(ReplayBuffer):
     `stored_action="applied"`.
     """
 
+    _steps: np.ndarray | None = None  # of the episodes, when the last transition was added
+
     def add(
         self,
         obs: np.ndarray,
@@ -202,8 +204,8 @@ class AppliedActionBuffer(ReplayBuffer):
         """Adds a transition of every environment.
 
         Raises:
-            ValueError: If infos do not say what was applied, actions have entries that are no inputs, or something but
-                the shield changes them.
+            ValueError: If infos do not say what was applied, actions have entries that are no inputs, something but the
+                shield changes them, or an action takes several steps.
         """
         if any(APPLIED not in info for info in infos):
             raise ValueError(f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym')
@@ -219,4 +221,12 @@ class AppliedActionBuffer(ReplayBuffer):
                 f'"{APPLIED}" is not the action of the agent, although nothing overrode it: a wrapper outside the '
                 "shield changes actions, and the buffer cannot say which of the agent's stands for what was applied"
             )
+        steps = np.array([info["episode_steps"] for info in infos])
+        before = steps - 1 if self._steps is None else self._steps
+        if not ((steps == before + 1) | (steps == 1)).all():
+            raise ValueError(
+                "an action of the agent takes several steps of the environment (action repeat, frame skipping), of "
+                f'which "{APPLIED}" says the last action alone: the buffer cannot store them as one'
+            )
+        self._steps = steps
         super().add(obs, next_obs, applied.astype(action.dtype), reward, done, infos)

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
@@ -32,6 +32,8 @@ _FINAL = ("final_obs", "final_info")
 _EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
 _STATEFUL_ATTRIBUTES = (
+    "state",
+    "known",
     "steps",
     "episodes",
     "episode_channel",
@@ -114,7 +116,10 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
             self._reset_options()
-            raise ValueError("a vector environment takes the same options for all environments")
+            raise ValueError(
+                "a vector environment takes the same options for all environments; for channels that differ give a "
+                'list, {"channel": [c_1, ..., c_N]}, or draw them with VectorRandomChannel'
+            )
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
@@ -186,10 +191,12 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Returns an attribute of each environment; of a vector environment that is one object, the same for all.
+        """Returns an attribute of each environment, or of the outermost wrapper of vector environments that has it.
+
+        Of a vector environment or a wrapper that is one object, the same for all.
 
         Raises:
-            AttributeError: If there is no such attribute, or it is an array, which may hold anything.
+            AttributeError: If there is no such attribute, or it holds arrays, which may be about all environments.
         """
         chosen = self._get_indices(indices)
         inner = self.vector_env.unwrapped
@@ -198,10 +205,12 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         if isinstance(inner, _WITH_RESET_MASK[1:]):
             values = inner.get_attr(attr_name)
             return [values[e] for e in chosen]
-        source = inner.single if isinstance(inner, NCSVectorEnv) and attr_name not in _STATEFUL_ATTRIBUTES else inner
+        if isinstance(inner, NCSVectorEnv) and attr_name not in _STATEFUL_ATTRIBUTES:
+            inner = inner.single
+        source = _wrapper_with(attr_name, self.vector_env) or inner
         value = getattr(source, attr_name)
-        if isinstance(value, np.ndarray):
-            raise AttributeError(f"{attr_name} is an array of {type(inner).__name__}: read it from vector_env")
+        if any(isinstance(each, np.ndarray) for each in (value if isinstance(value, tuple) else (value,))):
+            raise AttributeError(f"{attr_name} is an array of {type(source).__name__}: read it from vector_env")
         return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
@@ -323,6 +332,17 @@ def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
 def _names_of(kind: type) -> set[str]:
     """Returns the names of a class and of its subclasses."""
     return {kind.__name__}.union(*map(_names_of, kind.__subclasses__()))
+
+
+def _wrapper_with(name: str, envs: VectorEnv) -> VectorEnv | None:
+    """Returns the outermost wrapper that has an attribute of its own, which vector environments do not have as such."""
+    if hasattr(VectorWrapper, name):
+        return None
+    while envs is not envs.unwrapped:
+        if name in vars(envs) or hasattr(type(envs), name):
+            return envs
+        envs = envs.env  # pyright: ignore[reportAttributeAccessIssue]
+    return None
 
 
 def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:

@@ -81,7 +81,11 @@ class Factory:
         Raises:
             ValueError: If there is no default plant and none is given, or a setting is wrong.
         """
-        return (NCSVectorEnv if self.is_vector else NCSEnv)(**self.settings(**settings))
+        if not self.is_vector:
+            return NCSEnv(**self.settings(**settings))
+        if settings.get("max_episode_steps", -1) is None:  # the id's own for gym.make, but gym.make_vec hides that one
+            raise ValueError("max_episode_steps must be a number: leave it out for that of the id, -1 is for no end")
+        return NCSVectorEnv(**self.settings(**settings))
 
     def settings(
         self,

@@ -103,6 +103,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in halves of its range; positive is violated |
     | `worst_constraint_values` | `(k + q,)` | - | the largest since the last step, and those of limits of x and u |
     | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
+    | `episode_steps` | int | steps | steps taken in this episode |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
     | `packet_arrived` | bool | - | whether a packet arrived at this step |
     | `assumption_violated` | bool | - | whether a measurement or the process broke a bound since the last reset |
@@ -278,6 +279,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         read = [links.read((options or {}).get(name), name) for name, links in self._links()]
         fixed = self._process.read_parameters((options or {}).get("parameters"))
         super().reset(seed=seed)
+        read = [links.drawn(each, self.np_random) for (_, links), each in zip(self._links(), read, strict=True)]
         self._consistent = False
         if seed is not None:
             self._process.forget()
@@ -470,7 +472,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
-        happened = estimator.mean, self._state, missing, arrived
+        happened = estimator.mean, self._state, self.steps, missing, arrived
         told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant, read)
         return loop_info(self._known, *happened, self._oldest, *told)
 

@@ -82,6 +82,27 @@ class EpisodeChannels:
                 self._checked(channel, name)
         return [own if given is None else given for given, own in zip(each, self._own, strict=True)]
 
+    def drawn(self, sources: list[Any], rng: np.random.Generator, rows: Sequence[int] | None = None) -> list[Any]:
+        """Returns sources in which those that draw have drawn for the next episodes of some environments.
+
+        Args:
+            sources: What `read` returned.
+            rng: Draws.
+            rows: Indices of these environments; all by default.
+
+        Raises:
+            ValueError: If what was drawn is no channel that the environments can have; nothing has changed then.
+        """
+        if not any(callable(each) or isinstance(each, EveryEpisode) for each in sources):
+            return sources
+        found = list(sources)
+        for e in range(len(found)) if rows is None else rows:
+            if isinstance(each := found[e], EveryEpisode):
+                found[e] = each._replace(first=self._channel(each.draw if each.first is None else each.first, rng))
+            else:
+                found[e] = self._channel(each, rng)
+        return found
+
     def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
         """Takes what `read` returned for some environments, given by their indices; for all by default."""
         if chosen is None or len(chosen) == len(self._own):
@@ -108,9 +129,7 @@ class EpisodeChannels:
             source, later = self._sources[e], self._own[e]
             if isinstance(source, EveryEpisode):
                 source, later = source.draw if source.first is None else source.first, EveryEpisode(source.draw)
-            if callable(source):
-                source = self._checked(from_json(source(rng), (Channel,), "what was drawn"), "what was drawn")
-            self.now[e] = source
+            self.now[e] = self._channel(source, rng)
             self._sources[e] = later
         return self.now
 
@@ -126,6 +145,12 @@ class EpisodeChannels:
         if not many:
             return {f"{name}_loss": losses[0], f"{name}_delay": delays[0]}
         return {f"{name}_loss": np.array(losses), f"{name}_delay": np.array(delays)}
+
+    def _channel(self, source: Any, rng: np.random.Generator) -> Any:
+        """Returns the channel of an episode: what is given, or what it draws."""
+        if not callable(source):
+            return source
+        return self._checked(from_json(source(rng), (Channel,), "what was drawn"), "what was drawn")
 
     def _checked(self, channel: Any, name: str) -> Channel:
         if not isinstance(channel, Channel):

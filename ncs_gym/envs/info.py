@@ -10,7 +10,10 @@ from ncs_gym.estimation.error_table import ErrorTable
 from ncs_gym.network.requests import Requested
 
 # What is a number in the info of one environment, and of many an array that the environments go on using.
-SHARED = "measurement_age", "assumption_violated", "downlink_broken", "requested", "request_forced", "packets"
+SHARED = (
+    *("measurement_age", "assumption_violated", "downlink_broken", "requested", "request_forced", "packets"),
+    "episode_steps",
+)
 
 
 class Known(NamedTuple):
@@ -62,6 +65,7 @@ def loop_info(
     known: Known,
     mean: np.ndarray,
     state: np.ndarray,
+    steps: Any,
     missing: Any,
     arrived: Any,
     oldest: float,
@@ -76,6 +80,7 @@ def loop_info(
         known: What is known now.
         mean: The present estimate, shape (n,) or (n, N).
         state: x, shape (n,) or (n, N).
+        steps: Steps taken in the episode, an int or shape (N,).
         missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
         oldest: The largest age of the newest sample that the contract allows [steps]; infinite without one.
@@ -97,6 +102,7 @@ def loop_info(
         "constraint_values": values.T,
         "worst_constraint_values": worst.copy().T,
         "cost": cost,
+        "episode_steps": steps,
         "measurement_age": known.age,
         "packet_arrived": arrived,
         "assumption_violated": known.alarm,

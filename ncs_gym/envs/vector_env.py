@@ -49,7 +49,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
 
     Args:
         num_envs: N.
-        max_episode_steps: Truncation; None never truncates. A `horizon` that is shorter becomes as long.
+        max_episode_steps: Truncation; None or, as for `gym.make`, -1 never truncates. A `horizon` that is shorter
+            becomes as long.
         autoreset_mode: `AutoresetMode.NEXT_STEP` or "NextStep" (the step after an episode's last ignores the action
             and returns the new episode's first observation), "SameStep" (`final_obs` and `final_info` hold the last
             ones) or "Disabled" (reset with `options={"reset_mask": ...}`).
@@ -108,14 +109,14 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         **settings: Any,
     ) -> None:
         self.num_envs = as_count(num_envs, "num_envs", low=1)
-        limit = max_episode_steps
+        limit = None if type(max_episode_steps) is int and max_episode_steps == -1 else max_episode_steps
         self._max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
         self._autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset_mode}
         self.rendered_env = as_count(rendered_env, "rendered_env", low=0, high=self.num_envs - 1)
         own = [self._one_each(each, name) for name, each in zip(CHANNELS, (channel, downlink), strict=True)]
         if self._max_episode_steps is not None:
-            own_horizon = settings.get("horizon", DEFAULT_HORIZON)
+            own_horizon = as_count(settings.get("horizon", DEFAULT_HORIZON), "horizon", low=1, high=LONGEST_HORIZON)
             settings["horizon"] = max(own_horizon, min(self._max_episode_steps, LONGEST_HORIZON))
         settings |= {name: each and widest(each) for name, each in zip(CHANNELS, own, strict=True)}
         self._single = single = NCSEnv(**settings)
@@ -217,9 +218,11 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             self._process.forget()
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
+        chosen = np.flatnonzero(mask).tolist()
+        read = [each.drawn(sources, self.np_random, chosen) for (_, each), sources in zip(links, read, strict=True)]
         self._consistent, self._ended = False, None
         for (_, each), sources in zip(links, read, strict=True):
-            each.give(sources, np.flatnonzero(mask).tolist())
+            each.give(sources, chosen)
         self._begin(mask, starts, fixed)
         self._worst = np.where(mask, self._plant.values_at_start(self._state), self._worst)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
@@ -467,7 +470,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
-        happened = self._estimator.mean, self._state, missing, arrived
+        happened = self._estimator.mean, self._state, self.steps, missing, arrived
         sampled = Requested(asked, forced, self._packets)
         told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant)
         return loop_info(self._known, *happened, self._oldest, *told)

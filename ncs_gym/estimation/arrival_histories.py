@@ -178,12 +178,13 @@ class ArrivalHistories:
     @property
     def uses_samples(self) -> bool:
         """Whether a sample of one of the first steps moves the estimate towards it, if it arrives at once."""
-        number, H = self.present.item(self.root), self.recursion.plant.H
+        number, H, table = self.present.item(self.root), self.recursion.plant.H, self.table
         with self._lock:
             for _ in range(FIRST_STEPS):
-                number = self.table.after_step(number)
-                self.table.after_update(number)
-                if np.diagonal(H @ self.table.update(number)[0]).max() >= SMALLEST_SHARE:
+                number = table.after_step(number)
+                updated = table.after_update(number)
+                is_used = self.recursion.prefers(table.statistics(updated), table.statistics(number))
+                if is_used and np.diagonal(H @ table.update(number)[0]).max() >= SMALLEST_SHARE:
                     return True
         return False
 

@@ -145,13 +145,16 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             chosen = np.ones(count, np.bool_)
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
+        if first is not None:
+            self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
+        every, rows = (*self._uplinks, self._downlinks), np.flatnonzero(chosen).tolist()
+        given = zip(every, (*sources, downlink), strict=True)
+        read = [links.drawn(each, self.np_random, rows) for links, each in given]
         observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorNetworked")
         require_no_network(info)
-        if first is not None:
-            self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
-        for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
-            links.give(given, np.flatnonzero(chosen).tolist())
+        for links, each in zip(every, read, strict=True):
+            links.give(each, rows)
         everywhere = bool(chosen.all())
         if not everywhere:
             self._over = self._over & ~chosen  # what is reset now begins no episode in the next step

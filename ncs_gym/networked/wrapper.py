@@ -168,12 +168,13 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         own = dict(options or {})
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
-        observation, info = self.env.reset(seed=seed, options=own or None)
-        require_no_network(info)
         if seed is not None:
             self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NETWORK_STREAM,)))
-        rng = self.np_random
-        for links, given in zip((*self._uplinks, self._downlinks), (*sources, downlink), strict=True):
+        rng, every = self.np_random, (*self._uplinks, self._downlinks)
+        read = [links.drawn(each, rng) for links, each in zip(every, (*sources, downlink), strict=True)]
+        observation, info = self.env.reset(seed=seed, options=own or None)
+        require_no_network(info)
+        for links, given in zip(every, read, strict=True):
             links.give(given)
             links.begin(rng)
         self._network = network_infos(self._keys, self._uplinks, self._downlinks)

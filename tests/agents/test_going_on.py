@@ -152,3 +152,5 @@ def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
     turned = gym.wrappers.TransformAction(shield(), lambda action: -0.5 * action, shield().action_space)
     with pytest.raises(ValueError, match="a wrapper outside the shield changes actions"):
         learn(turned)
+    with pytest.raises(ValueError, match="takes several steps of the environment"):
+        learn(gym.wrappers.RepeatAction(shield(), 2))

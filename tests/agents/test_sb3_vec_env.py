@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -215,17 +216,19 @@ def test_dictionary_observations_are_refused():
 
 
 def test_attributes():
-    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3))
+    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3), mode="switch")
     env = SB3VecEnv(RecordEpisodeStatistics(shield))
     assert env.get_attr("render_mode") == [None] * 3
     assert env.get_attr("plant", [0, 2]) == [shield.unwrapped.plant] * 2
+    assert env.get_attr("mode") == ["switch"] * 3
+    assert env.get_attr("action_space") == [shield.single_action_space] * 3
     assert env.env_is_wrapped(Monitor) == [True] * 3
     assert env.env_is_wrapped(VectorSafetyShield, 1) == [True]
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * 3
     assert env.get_images() == [None] * 3
     for call in (
         lambda: env.get_attr("nothing"),
-        lambda: env.get_attr("steps"),
+        *(partial(env.get_attr, name) for name in ("steps", "state", "known")),
         lambda: env.set_attr("plant", 1),
         lambda: env.env_method("reset"),
     ):

@@ -258,6 +258,8 @@ ENVIRONMENTS = [
     (lambda: NCSVectorEnv(2, plant=PLANT).reset(options={"reset_mask": np.array([True, False])}), ResetNeeded, "reset"),
     (lambda: NCSEnv(PLANT, render_mode="rgb_array").render(), ResetNeeded, "reset"),
     (lambda: gym.make_vec(TRUCK, num_envs=3, render_mode="rgb_array").render(), ResetNeeded, "reset"),
+    (partial(gym.make_vec, TRUCK, num_envs=3, max_episode_steps=None), "leave it out for that of the id"),
+    *((partial(gym.make_vec, TRUCK, num_envs=3, horizon=each), "horizon must be") for each in (-1, 0, 1.5, "x", None)),
 ]
 REGISTERED = [
     (partial(register_plant, "Plants/Pole-v0", UNSTABLE, channel=Channel(loss=0.1)), UnstablePlantError, "max_consec"),

@@ -44,7 +44,7 @@ def test_vector_episodes_that_begin_anew_equal_scalar_ones(mode):
 
 
 def test_vector_equals_scalar_environment_of_an_unstable_plant():
-    settings = {"downlink": DOWNLINKS["overtaking"], "terminate_on_violation": False, "max_episode_steps": None}
+    settings = {"downlink": DOWNLINKS["overtaking"], "terminate_on_violation": False, "max_episode_steps": -1}
     compare(gym.make_vec("ncs_gym/CartPole-v0", num_envs=3, **settings).unwrapped, 100)
 
 

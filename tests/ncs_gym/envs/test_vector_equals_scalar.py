@@ -49,7 +49,7 @@ def make(name, count, **settings):
 
 
 ASKED = Channel(loss=0.6, delay=1, jitter=1, max_consecutive_losses=2, on_request=True)
-ENDLESS = {"max_episode_steps": None, "terminate_on_violation": False}
+ENDLESS = {"max_episode_steps": -1, "terminate_on_violation": False}
 TRUCK, SPEED = truck_trailer(mass=4000.0), SpeedTracking(change_probability=0.2)
 BETWEEN = truck_trailer(mass=4000.0, between_samples=8)
 FAMILY = LinearPlant.family([truck_trailer(mass=mass) for mass in (3000.0, 4000.0, 5000.0)])
@@ -139,7 +139,7 @@ def test_equals_scalar_environments_with_the_same_draws(name):
 def test_a_graph_that_forgets_changes_nothing(name, monkeypatch):
     monkeypatch.setattr(arrival_histories, "_shared", {})
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 40)
-    env = make(name, 3, channel=Channel(loss=0.3, max_consecutive_losses=2, jitter=2), max_episode_steps=None).unwrapped
+    env = make(name, 3, channel=Channel(loss=0.3, max_consecutive_losses=2, jitter=2), max_episode_steps=-1).unwrapped
     before = env._estimator.histories
     compare(env, 200)
     assert env._estimator.histories is not before

@@ -67,7 +67,7 @@ def test_gaussian_noise_is_that_of_the_covariances_and_truncated_noise_is_not(ma
 
 @pytest.mark.parametrize("name", IDS)
 def test_errors_of_registered_environments_leave_their_bounds(name):
-    many = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=64, noise="gaussian", max_episode_steps=None)
+    many = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=64, noise="gaussian", max_episode_steps=-1)
     escaped = False
     _, info = many.reset(seed=0)
     for _ in range(30):

@@ -128,10 +128,15 @@ def test_infos_without_cost_are_named():
         PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=8, batch_size=8).learn(8, callback=SafetyCallback())
 
 
-def test_rounding_too_coarse_for_any_update_is_named_once():
-    with pytest.warns(UnusedPacketsWarning, match="no packet is of use: with a quantization step of 9") as caught:
-        NCSEnv(PLANT, Channel(quantization_step=9.0))
+@pytest.mark.parametrize("step", [0.15, 0.5, 9.0])  # packets of the first have gains, but make no error bound smaller
+def test_rounding_too_coarse_for_any_update_is_named_once(step):
+    with pytest.warns(
+        UnusedPacketsWarning, match=f"no packet is of use: with a quantization step of {step:g}"
+    ) as caught:
+        env = gym.make("ncs_gym/TruckTrailer-v0", channel=Channel(quantization_step=step))
     assert len(caught) == 1
+    env.reset(seed=0)
+    assert [env.step(np.zeros(1))[4]["measurement_age"] for _ in range(50)] == [*range(1, 51)]
 
 
 @pytest.mark.filterwarnings("error")
