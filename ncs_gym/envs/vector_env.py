@@ -212,6 +212,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         fixed = self._process.read_parameters((options or {}).get("parameters"))
         if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"give one seed, or {self.num_envs} of them, got {len(seeds)}")
             seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
         super().reset(seed=seed)
         if seed is not None:

@@ -258,6 +258,7 @@ ENVIRONMENTS = [
     (lambda: NCSVectorEnv(2, plant=PLANT).reset(options={"reset_mask": np.array([True, False])}), ResetNeeded, "reset"),
     (lambda: NCSEnv(PLANT, render_mode="rgb_array").render(), ResetNeeded, "reset"),
     (lambda: gym.make_vec(TRUCK, num_envs=3, render_mode="rgb_array").render(), ResetNeeded, "reset"),
+    (lambda: gym.make_vec(TRUCK, num_envs=3).reset(seed=[1, 2]), "give one seed, or 3 of them, got 2"),
     (partial(gym.make_vec, TRUCK, num_envs=3, max_episode_steps=None), "leave it out for that of the id"),
     *((partial(gym.make_vec, TRUCK, num_envs=3, horizon=each), "horizon must be") for each in (-1, 0, 1.5, "x", None)),
 ]
