@@ -121,9 +121,7 @@ def actions_of(
         read: What `read_action` returned, if that was decided: the action may be the one that is asked for.
     """
     if read is not None and inputs.committed is inputs.applied is read[1] and read[0].dtype.char == "f":
-        action = read[0]
-        if max(map(abs, action.tolist())) <= 1.0:
-            return action, action.copy()
+        return read[0], read[0].copy()
     applied = nearest_action(inputs.applied.T, plant)
     if inputs.committed is inputs.applied:  # as without a downlink
         return applied, applied.copy()
