@@ -245,7 +245,11 @@ def require_same_spaces(model: SavedModel, observations: gym.Space, actions: gym
     low, high = model.observations
     if low.shape != observations.shape:
         entries, own = low.size, int(np.prod(observations.shape))
-        more = ": perhaps with observe=(...)" if low.ndim == 1 and entries > own else ""
+        more = (
+            ": perhaps with observe=(...), for which register_plant makes an id"
+            if low.ndim == 1 and entries > own
+            else ""
+        )
         more += f", or of {entries // own} stacked frames" if more and entries % own == 0 else ""
         raise ValueError(f"it saw observations of shape {low.shape}{more}, and those here are {observations.shape}")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
