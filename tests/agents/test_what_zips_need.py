@@ -340,9 +340,7 @@ NEEDING = {
     "OwnPolicy": lambda: PPO(OwnPolicy, env()),
     "actions of another kind.*Discrete": lambda: PPO("MlpPolicy", Switch(THREE)),
     "of 4 stacked frames": lambda: PPO("MlpPolicy", VecFrameStack(env(), 4)),
-    r"\(4,\): perhaps with observe=\(...\), for which register_plant makes an id, .* and those here": lambda: PPO(
-        "MlpPolicy", env(observe=("age",))
-    ),
+    r"\(4,\): perhaps with observe=.* makes an id, and those here": lambda: PPO("MlpPolicy", env(observe=("age",))),
     "NormalizeObservation": lambda: of_wrapped(NormalizeObservation),
     "a wrapper that rescales them": lambda: of_wrapped(RescaleAction, min_action=-2.0, max_action=2.0),
 }
