@@ -245,11 +245,8 @@ def require_same_spaces(model: SavedModel, observations: gym.Space, actions: gym
     low, high = model.observations
     if low.shape != observations.shape:
         entries, own = low.size, int(np.prod(observations.shape))
-        more = (
-            ": perhaps with observe=(...), for which register_plant makes an id"
-            if low.ndim == 1 and entries > own
-            else ""
-        )
+        is_longer = low.ndim == 1 and entries > own
+        more = ": perhaps with observe=(...), for which register_plant makes an id" if is_longer else ""
         more += f", or of {entries // own} stacked frames" if more and entries % own == 0 else ""
         raise ValueError(f"it saw observations of shape {low.shape}{more}, and those here are {observations.shape}")
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
