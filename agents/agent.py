@@ -56,6 +56,7 @@ class Agent:
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
         least_safe_steps: Steps for which that shield sought to keep the box whatever the network does.
+        is_filtered: Whether it was trained behind another filter (`LoopConfig.filter`), which files do not keep.
         kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
 
@@ -69,6 +70,7 @@ class Agent:
     shield_mode: str | None = None
     horizon: int | None = None
     least_safe_steps: int = 0
+    is_filtered: bool = False
     kwargs: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -153,6 +155,8 @@ class Agent:
         }
         if self.base_policy is not None:
             content["base_policy"] = {name: each.tolist() for name, each in vars(self.base_policy).items()}
+        if self.is_filtered:
+            content["filtered"] = True
         if self.kwargs:
             content["kwargs"] = self.kwargs
         return {"model.zip": buffer.getvalue(), "agent.json": document_of(content)}
@@ -261,7 +265,10 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     parameters, envs = parameters_of(weights), SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
+    is_filtered = content.get("filtered", False) is not False
     if mean.ndim == 1 and mean.shape != envs.observation_space.shape:
+        if is_filtered:
+            raise AgentError("the agent was trained behind a filter that changed its observations: no file keeps it")
         raise AgentError(
             f"the agent saw observations of {len(mean)} entries, those of {env_id} have the shape "
             f"{envs.observation_space.shape} now: it is registered with another task or observe="
@@ -287,6 +294,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         shield_mode=shield_mode,
         horizon=horizon,
         least_safe_steps=least_safe_steps,
+        is_filtered=is_filtered,
         kwargs=kwargs,
     )
 
@@ -376,7 +384,7 @@ def _normalization_for(
 # What an agent.json has: what else it says might be a part of the policy.
 _ENTRIES = {
     *("algorithm", "hyperparams", "env", "kwargs", "channel", "plant", "shield", "normalization", "base_policy"),
-    "sha256_of_model",
+    *("filtered", "sha256_of_model"),
 }
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {
@@ -411,6 +419,7 @@ def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | 
         "channel": f"`{channel}`" + ("" if agent.channel else ", that of the id"),
         "other settings": ", ".join(f"{name}={value!r}" for name, value in agent.kwargs.items()) or "those of the id",
         "shield": _shield_text(shield),
+        "filter": "one that these files do not keep" if agent.is_filtered else "",
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),
         "residual": _residual_text(agent),
         "SHA-256 of the weights": f"`{agent.checksum}`",

@@ -44,17 +44,20 @@ def evaluate(
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
-        ValueError: If there is no episode to play, or the id is registered with SAME_STEP autoreset.
+        ValueError: If there is no episode to play, episodes have no limit of steps, or the id is registered with
+            SAME_STEP autoreset.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if loop.episode_steps is None:
+        raise ValueError(f"{loop.env} has no max_episode_steps, without which an evaluation may not end: give some")
     finished: list[Episode] = []
     trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
         alone = loop.without_penalties.with_kwargs(autoreset_mode=None)
-        played, infos = _played(alone, policy, indices, seed, level_matrix, on_progress)
-        trajectory = trajectory or _first_trajectory(infos)
+        played, path = _played(alone, policy, indices, seed, level_matrix, on_progress)
+        trajectory = trajectory or path
         finished += played
     return Evaluation(finished, trajectory)  # type: ignore[arg-type]
 
@@ -66,8 +69,8 @@ def _played(
     seed: int,
     level_matrix: np.ndarray | Polytope | None,
     on_progress: Callable[[int], None] | None,
-) -> tuple[list[Episode], list[dict[str, Any]]]:
-    """Returns episodes played side by side, and the infos of episode 0, of its reset and its steps."""
+) -> tuple[list[Episode], Trajectory | None]:
+    """Returns episodes played side by side, and the trajectory of episode 0, None if it is not among them."""
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
     if envs.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
@@ -98,7 +101,7 @@ def _played(
         happened = {
             "steps": ~nothing,
             "violation_steps": info["cost"] > 0.0,
-            "estimate_violation_steps": plant.constraint_values(info["estimate"].T).max(axis=0) > 0.0,
+            "estimate_violation_steps": plant.constraint_values(_estimates(info).T).max(axis=0) > 0.0,
             "interventions": info.get("shield_intervened", nothing).astype(np.bool_),
             "planned": info.get("shield_plan_length", nothing) > 0,
             "proved": info.get("shield_guaranteed", nothing).astype(np.bool_),
@@ -122,7 +125,7 @@ def _played(
         )
         for e, index in enumerate(indices)
     ]
-    return episodes, infos
+    return episodes, _first_trajectory(infos, single.downlink_protocol.input_delay) if indices[0] == 0 else None
 
 
 def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
@@ -130,14 +133,25 @@ def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
     return of.gauge(states) ** 2 if isinstance(of, Polytope) else np.einsum("ei,ij,ej->e", states, of, states)
 
 
-def _first_trajectory(infos: list[dict[str, np.ndarray]]) -> Trajectory:
+def _estimates(info: dict[str, np.ndarray]) -> np.ndarray:
+    """Returns the estimates of the present states, shape (N, n); `estimate` is that of when the next action acts."""
+    return info["state"] + info["estimation_error"]
+
+
+def _first_trajectory(infos: list[dict[str, np.ndarray]], input_delay: int) -> Trajectory:
+    """Returns the trajectory of the first environment, whose inputs are applied some steps after they are decided."""
     steps = infos[1:]
     not_shielded = np.zeros(1, np.bool_)
+    inputs = np.array([info["input"][0] for info in steps])
+    proposed, intervened = inputs.copy(), np.zeros(len(steps), np.bool_)
+    for step, info in enumerate(steps[: max(len(steps) - input_delay, 0)], input_delay):
+        proposed[step] = info.get("input_proposed", info["input_committed"])[0]
+        intervened[step] = info.get("shield_intervened", not_shielded)[0]
     return Trajectory(
         states=np.array([info["state"][0] for info in infos]),
-        estimates=np.array([info["estimate"][0] for info in infos]),
-        inputs=np.array([info["input"][0] for info in steps]),
-        proposed=np.array([info.get("input_proposed", info["input"])[0] for info in steps]),
-        intervened=np.array([info.get("shield_intervened", not_shielded)[0] for info in steps], dtype=np.bool_),
+        estimates=np.array([_estimates(info)[0] for info in infos]),
+        inputs=inputs,
+        proposed=proposed,
+        intervened=intervened,
         arrivals=np.array([info["packet_arrived"][0] for info in steps], dtype=np.bool_),
     )

@@ -102,6 +102,14 @@ class BasePolicy(ReadOnlyArrays):
         object.__setattr__(self, "offset", offset)
         self._make_arrays_read_only()
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, BasePolicy):
+            return NotImplemented
+        return np.array_equal(self.gain, other.gain) and np.array_equal(self.offset, other.offset)
+
+    def __hash__(self) -> int:
+        return hash((self.gain.tobytes(), self.offset.tobytes()))
+
     @classmethod
     def of(cls, fallback: Fallback, plant: LinearPlant) -> BasePolicy:
         """Returns the input of a certificate's gain as normalized actions of its plant."""
@@ -194,7 +202,10 @@ class LoopConfig:
         return replace(self, shield=shield, violation_penalty=0.0, lagrangian=None, base_policy=None)
 
     def single(self, **settings: Any) -> gym.Env:
-        """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
+        """Returns one environment, with the shield; penalties of violations, filter and base policy are for vectors.
+
+        `settings` are passed to `gym.make`.
+        """
         env = gym.make(self.env, **{**self.kwargs, **settings})
         return env if self.shield is None else SafetyShield(env, **vars(self.shield))
 

@@ -92,14 +92,15 @@ class Episode(_Totals):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One episode of T steps, step by step.
+    """One episode of T steps, step by step; behind a downlink what is decided for a step belongs to it, not to before.
 
     Attributes:
         states: True states, shape (T + 1, n).
-        estimates: Estimates of the states, shape (T + 1, n).
+        estimates: Estimates of these states, shape (T + 1, n).
         inputs: Applied inputs, shape (T, m).
-        proposed: Inputs that the agent proposed, shape (T, m); equal to `inputs` without a shield.
-        intervened: Whether the shield intervened, or would have in mode "monitor", shape (T,).
+        proposed: Inputs that the agent proposed for these steps, shape (T, m); behind a downlink those applied in the
+            first steps, for which there is no proposal.
+        intervened: Whether the shield intervened, or would have in mode "monitor", when they were decided, shape (T,).
         arrivals: Whether a packet arrived after each step, shape (T,).
     """
 

@@ -185,6 +185,11 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
         raise ValueError(
             f"the agent to go on from is {start.algorithm} of {start.env}, this is {algorithm} of {loop.env}"
         )
+    if start.base_policy != loop.base_policy:
+        raise ValueError(
+            "the agent to go on from adds its actions to another base policy, or to none: make the loop with "
+            "base_policy=agent.base_policy"
+        )
     try:
         parameters: Any = deepcopy(start.model.get_parameters())  # optimizers go on using the tensors they load
         model.set_parameters(parameters, exact_match=True, device="cpu")
@@ -210,6 +215,7 @@ def _agent(
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
         least_safe_steps=0 if loop.shield is None else loop.shield.least_safe_steps,
+        is_filtered=loop.filter is not None,
         kwargs=_settings(loop),
     )
 

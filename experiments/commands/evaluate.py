@@ -48,6 +48,8 @@ def evaluate(settings: EvaluateSettings) -> None:
 
     if settings.shield == "as-trained" and is_sb3_zip(folder):
         say(f"{folder.name} does not say whether the agent was trained behind a shield: none is used; give --shield")
+    elif settings.shield == "as-trained" and agent.is_filtered:
+        say("the agent was trained behind a filter that is no shield, which its files do not keep: none is used here")
     require_horizon(settings, mode)
     least, horizon = settings.least_safe_steps, settings.horizon
     if settings.shield == "as-trained" and mode == "lookahead" and not least and horizon is None:

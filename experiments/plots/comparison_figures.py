@@ -258,7 +258,7 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
         color, edges = ArmStyle.of(name).color, plant.dt * np.arange(len(path.inputs) + 1)
         axis.stairs(path.inputs[:, i], edges, baseline=None, color=color, lw=width)
-        changed = (path.inputs != path.proposed).any(axis=1)
+        changed = path.intervened & (path.inputs != path.proposed).any(axis=1)
         if changed.any():
             middle, proposed = edges[:-1][changed] + 0.5 * plant.dt, path.proposed[changed, i]
             axis.vlines(middle, path.inputs[changed, i], proposed, color=color, lw=0.7, alpha=0.6)

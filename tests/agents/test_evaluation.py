@@ -8,6 +8,7 @@ from gymnasium.vector import VectorWrapper
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from ncs_gym import Channel
+from ncs_gym.envs.env import ncs_env
 from shields import certificate_for
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
@@ -64,7 +65,7 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
         assert record.largest_level == pytest.approx(max(x @ certificate.M @ x for x in states[:, e]))
         assert not record.guaranteed
     np.testing.assert_array_equal(played.trajectory.states, states[:, 0])
-    np.testing.assert_array_equal(played.trajectory.estimates, estimates[:, 0])
+    np.testing.assert_allclose(played.trajectory.estimates, estimates[:, 0], rtol=0.0, atol=1e-12)
     assert played.trajectory.arrivals.any()
     assert not played.trajectory.arrivals.all()
 
@@ -177,3 +178,25 @@ def test_last_steps_of_episodes_count_whatever_the_autoreset(mode):
     assert sum(each.violation_steps for each in usual.episodes) > 3
     assert usual.episodes == others.episodes
     np.testing.assert_array_equal(usual.trajectory.states, others.trajectory.states)
+
+
+def test_trajectory_behind_a_downlink_has_what_is_of_a_step_at_that_step():
+    env_id = "ncs_gym/CartPoleTwoWay-v0"
+    env = ncs_env(gym.make(env_id))
+    shield = ShieldSettings(certificate_for(env.plant, env.certificate_contract))
+    loop = LoopConfig(env=env_id, shield=shield)
+    rng = np.random.default_rng(0)
+    result = evaluate(loop, lambda seen, _: rng.uniform(-1.0, 1.0, (len(seen), 1)).astype(np.float32), 1, 0)
+    path, delay = result.trajectory, env.downlink_protocol.input_delay
+    assert path.intervened.any()
+    np.testing.assert_array_equal((path.inputs != path.proposed).any(axis=1), path.intervened)
+    assert not path.inputs[:delay].any()
+    assert path.inputs[delay:].all()
+    late = np.abs(path.estimates[:-delay] - path.states[delay:]).max()
+    assert np.abs(path.estimates - path.states).max() < 0.1 * late
+
+
+def test_episodes_without_an_end_are_not_evaluated():
+    loop = LoopConfig(env="ncs_gym/TruckTrailer-v0", kwargs={"max_episode_steps": -1})
+    with pytest.raises(ValueError, match="no max_episode_steps, without which an evaluation may not end"):
+        evaluate(loop, lambda seen, _: np.zeros((len(seen), 1), np.float32), 1, 0)
