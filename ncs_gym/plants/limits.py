@@ -354,6 +354,15 @@ def _residual_of_equilibrium(
     )
 
 
+def require_given_once(arguments: dict[str, Any]) -> None:
+    """Raises ValueError if ends are given beside published limits that they follow from."""
+    for ends, others in (("box_ends", ("state_limits",)), ("input_ends", ("u_max", "input_limits"))):
+        if arguments.get(ends) is not None:
+            for other in others:
+                if arguments.get(other) is not None:
+                    raise ValueError(f"{ends} follow from {other}: give these alone")
+
+
 def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     """Returns the fields of `LinearPlant` for the arguments of its constructor: limits become rows with two ends.
 

@@ -84,6 +84,11 @@ def with_limits_as_published(kind: Kind) -> Kind:
         if not (input_delay is None and du_max is None):  # a plant of more states
             larger = with_past_inputs(kind(**arguments), input_delay, du_max)
             arguments = {each.name: getattr(larger, each.name) for each in fields(larger)}
+        if all(each.name in arguments for each in fields(kind)):  # of `dataclasses.replace`
+            if np.ndim(arguments["box"]) == 1:  # new half-widths, and not the rows that are kept
+                arguments["box_ends"] = None
+        else:
+            limits.require_given_once(arguments)
         construct(self, **limits.fields_of(arguments))
 
     of_fields = dict(inspect.signature(construct).parameters)

@@ -77,7 +77,8 @@ def linear_model(
         samples: Number of steps that are sampled.
         safety_factor: Of a sampled bound, >= 1.
         seed: Seed of the samples.
-        settings: Other arguments of `LinearPlant`. A and B, given together, are taken in place of fitted ones; a
+        settings: Other arguments of `LinearPlant`, but for limits with two ends of states or inputs: count deviations
+            from the middle of these. A and B, given together, are taken in place of fitted ones; a
             disturbance is declared beside the remainder.
 
     Warns:
@@ -90,6 +91,11 @@ def linear_model(
     """
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
+    if others := sorted(settings.keys() & {"state_limits", "input_limits", "box_ends", "input_ends"}):
+        raise ValueError(
+            f"the remainder is bounded over |x_i| <= box_i and |u_i| <= u_max_i alone: leave out {others[0]}, and "
+            "count deviations from an operating point in the middle of the limits"
+        )
     moving = process if isinstance(process, Process) else FunctionProcess(process)
     widths, limits = as_vector(box, None, "box"), np.atleast_1d(np.asarray(u_max, dtype=np.float64))
     common = {"box": widths, "u_max": limits, "dt": dt}

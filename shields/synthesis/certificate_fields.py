@@ -105,10 +105,17 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
 
 
 def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
-    """Returns the volume of an ellipsoid in units of the largest one in the safe box; NaN where that is unbounded."""
-    if np.linalg.matrix_rank(plant.box) < plant.n:
+    """Returns the volume of an ellipsoid in units of the largest one in the safe box; NaN where that is not known.
+
+    It is where the box has a center, a point in the middle between all of its pairs of ends.
+    """
+    middle, half = 0.5 * (plant.box_low + plant.box_high), 0.5 * (plant.box_high - plant.box_low)
+    if not np.isfinite(half).all() or np.linalg.matrix_rank(plant.box) < plant.n:
         return math.nan
-    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box), L)) ** 0.5)
+    center = np.linalg.lstsq(plant.box, middle, rcond=None)[0]
+    if (np.abs(plant.box @ center - middle) > 1e-9 * half).any():
+        return math.nan
+    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box / half[:, None]), L)) ** 0.5)
 
 
 def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:

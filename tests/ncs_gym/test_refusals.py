@@ -377,6 +377,12 @@ PLANTS = [
     ),
     (partial(cart_pole, delta=None), r"delta must be a number >= 1e-12 and <= 0\.999"),
     (partial(LinearPlant, **GOOD, sensor_bonud=0.1), TypeError, "unexpected keyword argument 'sensor_bonud'"),
+    (partial(LinearPlant, **GOOD, input_ends=[[-0.5], [0.5]]), "input_ends follow from u_max"),
+    (partial(LinearPlant, **ROOM, box_ends=[[-1.0], [1.0]]), "box_ends follow from state_limits"),
+    *(
+        (partial(linear_model, np.add, [0.7], 1.0, 1.0, **{name: [[-1.0], [3.0]]}), f"leave out {name}")
+        for name in ("box_ends", "input_ends", "state_limits", "input_limits")
+    ),
     (partial(truck_trailer, wheels=18), TypeError, "unexpected keyword argument 'wheels'"),
     (
         partial(LinearPlant, A=A, B=B, dt=0.1),

@@ -446,3 +446,22 @@ def test_offset_and_a_disturbance_with_two_ends_may_both_be_given():
             warnings.simplefilter("ignore", MovedOperatingPointWarning)
             plant = LinearPlant(**settings, **limits, disturbance_bound=([[1.0]], [low], [0.1]))
         assert plant.disturbance.shape_matrix[0, 0] >= (0.5 * (0.1 - low)) ** 2
+
+
+def test_share_of_the_largest_ellipsoid_is_said_of_boxes_with_a_center_alone():
+    quiet = {"u_max": 1.0, "dt": 1.0, "disturbance_bound": 0.001, "sensor_bound": 0.002, "initial_bound": 0.005}
+    one, two = {"A": [[0.9]], "B": [[0.1]]} | quiet, {"A": np.diag([0.9, 0.8]), "B": 0.2 * np.eye(2)} | quiet
+    for plant in (
+        LinearPlant(**one, state_limits=(-0.7, np.inf)),
+        LinearPlant(**two, state_limits=(-1.0, 1.0), output_limits=[([1.0, 1.0], -1.9, 0.1)]),
+    ):
+        assert "volume_of_box_ellipsoid" not in synthesize(plant).provenance
+    aside = synthesize(LinearPlant(**one, state_limits=(-0.7, 2.1)))
+    half = np.sqrt(aside.L[0, 0])  # of the largest ellipsoid, an interval, 1.4
+    assert aside.provenance["volume_of_box_ellipsoid"] == pytest.approx(half / 1.4, rel=1e-3)
+
+
+def test_other_half_widths_of_a_plant_with_two_ends_are_symmetric():
+    plant = LinearPlant(A=[[0.9]], B=[[0.1]], state_limits=(-0.7, 2.1), u_max=1.0, dt=1.0, disturbance_bound=0.01)
+    assert replace(plant, gamma=0.0).box_ends.tolist() == plant.box_ends.tolist()
+    assert (replace(plant, box=[1.0]).box_low, replace(plant, box=[1.0]).box_high) == (-1.0, 1.0)
