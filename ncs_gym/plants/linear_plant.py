@@ -39,6 +39,7 @@ from ncs_gym.validation import (
     as_matrix,
     as_names,
     as_number,
+    as_setting,
     own_error_state,
     read_only,
     reason_of,
@@ -85,7 +86,8 @@ def with_limits_as_published(kind: Kind) -> Kind:
             larger = with_past_inputs(kind(**arguments), input_delay, du_max)
             arguments = {each.name: getattr(larger, each.name) for each in fields(larger)}
         if all(each.name in arguments for each in fields(kind)):  # of `dataclasses.replace`
-            if np.ndim(arguments["box"]) == 1:  # new half-widths, and not the rows that are kept
+            box = as_setting(arguments["box"])
+            if box is not None and box.ndim == 1:  # new half-widths, and not the rows that are kept
                 arguments["box_ends"] = None
         else:
             limits.require_given_once(arguments)
