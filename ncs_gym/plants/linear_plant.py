@@ -86,8 +86,9 @@ def with_limits_as_published(kind: Kind) -> Kind:
             larger = with_past_inputs(kind(**arguments), input_delay, du_max)
             arguments = {each.name: getattr(larger, each.name) for each in fields(larger)}
         if all(each.name in arguments for each in fields(kind)):  # of `dataclasses.replace`
-            box = as_setting(arguments["box"])
-            if box is not None and box.ndim == 1:  # new half-widths, and not the rows that are kept
+            box, ends = as_setting(arguments["box"]), arguments["box_ends"]
+            are_kept = isinstance(ends, np.ndarray) and not ends.flags.writeable
+            if box is not None and box.ndim == 1 and are_kept:  # new half-widths, and ends of the rows before
                 arguments["box_ends"] = None
         else:
             limits.require_given_once(arguments)

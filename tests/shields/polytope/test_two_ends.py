@@ -465,3 +465,5 @@ def test_other_half_widths_of_a_plant_with_two_ends_are_symmetric():
     plant = LinearPlant(A=[[0.9]], B=[[0.1]], state_limits=(-0.7, 2.1), u_max=1.0, dt=1.0, disturbance_bound=0.01)
     assert replace(plant, gamma=0.0).box_ends.tolist() == plant.box_ends.tolist()
     assert (replace(plant, box=[1.0]).box_low, replace(plant, box=[1.0]).box_high) == (-1.0, 1.0)
+    aside = replace(plant, box=[1.0], box_ends=[[-0.5], [1.5]])  # given together
+    assert (aside.box_low, aside.box_high) == (-0.5, 1.5)
