@@ -33,7 +33,7 @@ from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.plant_step import PlantSimulation
-from ncs_gym.processes.process import LinearProcess, Process, own_process
+from ncs_gym.processes.process import LinearProcess, Process, as_process, own_process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
@@ -210,7 +210,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
         self._initial_set = starting_set(initial_set, plant)
         require_suitable(self._task, plant)
-        self._process_given = own_process(plant) if process is None else expect(process, Process, "process")
+        self._process_given = own_process(plant) if process is None else as_process(process)
         if plant.between_samples is not None and not isinstance(self._process_given, LinearProcess):
             raise ValueError(
                 "between_samples is about the plant's own equations: beside another process= give a plant with "

@@ -14,7 +14,17 @@ from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, counted, own_error_state, shown, warn_caller
+from ncs_gym.validation import (
+    as_count,
+    as_matrix,
+    as_number,
+    as_setting,
+    as_vector,
+    counted,
+    own_error_state,
+    shown,
+    warn_caller,
+)
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
 HELD_OUT = 0.25
@@ -39,6 +49,37 @@ NEARLY_AT_REST = 0.01
 DIGITS = 9
 
 
+# Arguments of `LinearPlant` that say where states and inputs may be.
+_OF_FRAME = (
+    *("state_limits", "input_limits", "output_limits", "box_ends", "input_ends", "operating_state", "operating_input"),
+)
+
+
+class _Region(NamedTuple):
+    """Where the remainder is bounded: low <= (x, u) <= high in deviations, middle +- half, shape (n + m,) each."""
+
+    low: np.ndarray
+    high: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+
+    @classmethod
+    def of(cls, frame: LinearPlant) -> _Region:
+        """Returns the smallest one that holds the box and the input limits of a plant.
+
+        Raises:
+            ValueError: If a state lacks an end.
+        """
+        low, high = np.concatenate([frame.own_limits, frame.input_ends], axis=1)
+        if not np.isfinite(low + high).all():
+            first = int(np.argmin(np.isfinite(low + high))) + 1
+            raise ValueError(
+                f"the remainder is bounded over limits of every state, and state {first} has no two finite ones: give "
+                "it generous limits"
+            )
+        return cls(low, high, 0.5 * (low + high), 0.5 * (high - low))
+
+
 class _Steps(NamedTuple):
     """Steps of a process: states (n, N) in the box, inputs (m, N) within their limits, next states (n, N)."""
 
@@ -50,9 +91,9 @@ class _Steps(NamedTuple):
 @own_error_state
 def linear_model(
     process: Process | Callable[[np.ndarray, np.ndarray], np.ndarray],
-    box: Any,
-    u_max: Any,
-    dt: float,
+    box: Any = None,
+    u_max: Any = None,
+    dt: float | None = None,
     *,
     jacobian_bounds: tuple[Any, Any] | None = None,
     samples: int = 20_000,
@@ -60,25 +101,25 @@ def linear_model(
     seed: int = 0,
     **settings: Any,
 ) -> LinearPlant:
-    """Returns x+ = A x + B u + r + d as a plant, r in a bound on what A x + B u leaves out over box x limits.
+    """Returns x+ = A x + B u + r + d as a plant, r in a bound on what A x + B u leaves out within the limits.
 
     `plant.remainder` says how the bound is known. By sampling, A and B make the largest remainder of the samples small,
     and the smallest ellipsoid around these remainders, `safety_factor` times as large, is an *assumption*. From bounds
     on the Jacobian it is *proved* by the mean value theorem: A and B are the middle of the interval, and
-    |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij) (half-width of z_j), z = (x, u). Fresh samples confirm either.
+    |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij) (largest |z_j|), z = (x, u). Fresh samples confirm either.
 
     Args:
         process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
             f(0, 0) = 0.
-        box: Half-widths of the safe box, shape (n,).
-        u_max: Input limits, a number for one input or shape (m,).
+        box: Half-widths of the safe box, shape (n,), or other limits of states as of `LinearPlant`: then give
+            `state_limits` (absolute, around `operating_state`). Every state needs two finite ends.
+        u_max: Input limits, a number for one input or shape (m,); or give `input_limits`.
         dt: Duration of a step [s].
-        jacobian_bounds: Smallest and largest values of [df/dx, df/du] over box x limits, two arrays (n, n + m).
+        jacobian_bounds: Smallest and largest values of [df/dx, df/du] within the limits, two arrays (n, n + m).
         samples: Number of steps that are sampled.
         safety_factor: Of a sampled bound, >= 1.
         seed: Seed of the samples.
-        settings: Other arguments of `LinearPlant`, but for limits with two ends of states or inputs: count deviations
-            from the middle of these. A and B, given together, are taken in place of fitted ones; a
+        settings: Other arguments of `LinearPlant`. A and B, given together, are taken in place of fitted ones; a
             disturbance is declared beside the remainder.
 
     Warns:
@@ -86,32 +127,31 @@ def linear_model(
             function is at rest at `operating_state`, as if it were one of absolute values.
 
     Raises:
-        ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
-            cannot be put into a state, is no function of it although a proof is asked for, or an argument is wrong.
+        ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, a state lacks
+            a limit, a disturbance moves the operating point, the process cannot be put into a state, is no function of
+            it although a proof is asked for, or an argument is wrong.
     """
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
-    if others := sorted(settings.keys() & {"state_limits", "input_limits", "box_ends", "input_ends"}):
-        raise ValueError(
-            f"the remainder is bounded over |x_i| <= box_i and |u_i| <= u_max_i alone: leave out {others[0]}, and "
-            "count deviations from an operating point in the middle of the limits"
-        )
     moving = process if isinstance(process, Process) else FunctionProcess(process)
-    widths, limits = as_vector(box, None, "box"), np.atleast_1d(np.asarray(u_max, dtype=np.float64))
-    common = {"box": widths, "u_max": limits, "dt": dt}
-    shapes = {"A": (len(widths), len(widths)), "B": (len(widths), len(limits))}
-    given = {name: as_matrix(settings.pop(name), shape, name) for name, shape in shapes.items() if name in settings}
+    limits = {"box": None if box is None else as_vector(box, None, "box"), "u_max": u_max, "dt": dt}
+    frame = _frame(limits | {name: settings[name] for name in _OF_FRAME if name in settings})
+    region = _Region.of(frame)
+    given = {
+        name: as_matrix(settings.pop(name), getattr(frame, name).shape, name) for name in ("A", "B") if name in settings
+    }
     if len(given) == 1 or (given and jacobian_bounds is not None):
         raise ValueError("give A and B together, or jacobian_bounds, whose middle they are, or neither")
     rng = np.random.default_rng(as_count(seed, "seed", low=0))
-    drawn, fresh, origin, spread = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
+    drawn, fresh, origin, spread = _steps_of(moving, frame, region, as_count(samples, "samples", low=100), rng)
+    widths = region.half[: frame.n]
     if jacobian_bounds is not None:
         if spread > ROUNDING:
             raise ValueError(
                 f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
                 "or memory beyond the state, of which bounds on a Jacobian prove nothing"
             )
-        A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
+        A, B, bound = _from_jacobians(jacobian_bounds, region, origin)
         basis = "from bounds on its Jacobian"
     else:
         A, B = (given["A"], given["B"]) if given else fitted_matrices(*drawn, widths)
@@ -121,7 +161,7 @@ def linear_model(
     largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
     basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
     if (off := float((np.abs(origin) / widths).max())) > max(NO_EQUILIBRIUM, spread):
-        warn_caller(_moving_origin(off, origin, (A, B), common), NoEquilibriumWarning)
+        warn_caller(_moving_origin(off, origin, (A, B), region), NoEquilibriumWarning)
     reached = np.sqrt(np.diag(bound.shape_matrix)) / widths
     if reached.max() >= 1.0:
         raise ValueError(
@@ -129,8 +169,13 @@ def linear_model(
             "half-widths of the box in one step: shrink the box, the input limits or dt"
         )
     remainder = Remainder(bound, jacobian_bounds is not None, basis)
-    plant = LinearPlant(A=A, B=B, remainder=remainder, **common, **settings)
-    if isinstance(moving, FunctionProcess) and _rests_at_operating_point(moving, plant, drawn):
+    plant = LinearPlant(**limits | {"A": A, "B": B, "remainder": remainder} | settings)
+    if not np.array_equal(plant.operating_state[: frame.n], frame.operating_state):
+        raise ValueError(
+            "the remainder was bounded around the operating point that was given, from which the middle of "
+            "disturbance_bound moves: give symmetric ends, and let the process hold the middle"
+        )
+    if isinstance(moving, FunctionProcess) and _rests_at_operating_point(moving, frame, region, drawn):
         warn_caller(
             "the function is nearly at rest at operating_state with operating_input, as one of absolute values, and "
             "not what it is near zero: if it takes absolute values, give lambda x, u: f(x0 + x, u0 + u) - x0, one of "
@@ -144,7 +189,26 @@ class NoEquilibriumWarning(UserWarning):
     """The point that deviations are counted from does not stay where it is, or is not where they seem to be counted."""
 
 
-def _rests_at_operating_point(process: FunctionProcess, plant: LinearPlant, steps: _Steps) -> bool:
+def _frame(limits: dict[str, Any]) -> LinearPlant:
+    """Returns a plant with these limits, A = 0 and B = 0, of which nothing else is declared.
+
+    Args:
+        limits: Of `LinearPlant`, with None for those that are not given.
+    """
+    n = _size_of(limits["box"], limits.get("operating_state"), limits.get("state_limits"))
+    m = _size_of(limits["u_max"], limits.get("operating_input"), limits.get("input_limits"))
+    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
+    return LinearPlant(A=np.zeros((n, n)), B=np.zeros((n, m)), **limits, **quiet)
+
+
+def _size_of(vector: Any, point: Any, pair: Any) -> int:
+    """Returns how many entries limits and an operating point have, some of which may be numbers."""
+    ends = list(pair) if isinstance(pair, (tuple, list, np.ndarray)) else []
+    numbers = [as_setting(each) for each in (vector, point, *ends) if each is not None]
+    return max((each.size for each in numbers if each is not None), default=1)
+
+
+def _rests_at_operating_point(process: FunctionProcess, plant: LinearPlant, region: _Region, steps: _Steps) -> bool:
     """Returns whether a function that should be one of deviations is at rest where an absolute one is.
 
     That says nothing of one which does the same there, as a linear one.
@@ -160,14 +224,15 @@ def _rests_at_operating_point(process: FunctionProcess, plant: LinearPlant, step
         ]
     except Exception:  # whatever a function of deviations does so far away
         return False
-    off = np.abs(np.array([moved, *(np.array(near) - steps.moved.T[:REPEATED])])) / plant.half_widths
-    little = NEARLY_AT_REST * float((np.abs(steps.moved - steps.states).T / plant.half_widths).max())
+    widths = region.half[: plant.n]
+    off = np.abs(np.array([moved, *(np.array(near) - steps.moved.T[:REPEATED])])) / widths
+    little = NEARLY_AT_REST * float((np.abs(steps.moved - steps.states).T / widths).max())
     return bool(off[0].max() <= little < off[1:].max())
 
 
-def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.ndarray], common: Any) -> str:
+def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.ndarray], region: _Region) -> str:
     """Returns the sentence about f(0, 0), shape (n,), that is `off` half-widths long at its largest entry."""
-    (A, B), widths, limits = model, common["box"], common["u_max"]
+    (A, B), (widths, limits) = model, np.split(region.half, [len(origin)])
     balance = np.hstack([(np.eye(len(A)) - A) * widths, -B * limits]) / widths[:, None]
     point = np.linalg.lstsq(balance, origin / widths)[0]
     state, applied = widths * point[: len(A)], limits * point[len(A) :]
@@ -184,28 +249,26 @@ def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.n
 
 
 def _steps_of(
-    process: Process, common: dict[str, Any], count: int, rng: np.random.Generator
+    process: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator
 ) -> tuple[_Steps, _Steps, np.ndarray, float]:
     """Returns sampled steps, fewer fresh ones, f(0, 0), shape (n,), and by how many half-widths repeated steps differ.
 
     Args:
         process: What moves.
-        common: Box, input limits and step of the plant.
+        frame: Plant with the limits.
+        region: Where the remainder is bounded.
         count: Number of steps.
         rng: Source of randomness.
     """
-    n, m = len(common["box"]), len(common["u_max"])
-    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
-    frame = LinearPlant(A=np.zeros((n, n)), B=np.zeros((n, m)), **common, **quiet)
     moving = process.opened(frame, None)
     try:
         if not moving.is_written:
             raise ValueError("a linear model needs steps from chosen states: give GymProcess write_state")
         origin = _first_step(moving, frame)
-        drawn = _sampled(moving, frame, count, rng)
-        fresh = _sampled(moving, frame, max(int(HELD_OUT * count), 100), rng)
+        drawn = _sampled(moving, frame, region, count, rng)
+        fresh = _sampled(moving, frame, region, max(int(HELD_OUT * count), 100), rng)
         again = _moved(moving, frame, drawn.states[:, :REPEATED], drawn.inputs[:, :REPEATED], rng)
-        spread = float(np.max(np.abs(again - drawn.moved[:, :REPEATED]) / frame.half_widths[:, None]))
+        spread = float(np.max(np.abs(again - drawn.moved[:, :REPEATED]) / region.half[: frame.n, None]))
         return drawn, fresh, origin, spread
     finally:
         moving.close()
@@ -223,12 +286,12 @@ def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
         ) from error
 
 
-def _sampled(moving: Process, frame: LinearPlant, count: int, rng: np.random.Generator) -> _Steps:
-    """Returns steps from random points of box x limits; half of them have coordinates on the boundary."""
-    widths = np.concatenate([frame.half_widths, frame.u_max])[:, None]
-    points = rng.uniform(-1.0, 1.0, (len(widths), count))
+def _sampled(moving: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator) -> _Steps:
+    """Returns steps from random points of the region; half of them have coordinates on its boundary."""
+    low, high, middle, half = (side[:, None] for side in region)
+    points = rng.uniform(-1.0, 1.0, (len(half), count))
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
-    points = widths * np.where(at_end, np.sign(points), points)
+    points = np.where(at_end, np.where(points < 0.0, low, high), np.clip(middle + half * points, low, high))
     states, inputs = points[: frame.n], points[frame.n :]
     return _Steps(states, inputs, _moved(moving, frame, states, inputs, rng))
 
@@ -252,17 +315,18 @@ def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
 
 
 def _from_jacobians(
-    bounds: tuple[Any, Any], widths: np.ndarray, limits: np.ndarray, origin: np.ndarray
+    bounds: tuple[Any, Any], region: _Region, origin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Ellipsoid]:
     """Returns A, B and the proved bound."""
-    n, size = len(widths), len(widths) + len(limits)
+    n, size = len(origin), len(region.low)
     if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
         raise ValueError(f"jacobian_bounds must be two arrays of shape ({n}, {size}), got {shown(bounds)}")
     low, high = (as_matrix(bound, (n, size), "jacobian_bounds") for bound in bounds)
     if (low > high).any():
         raise ValueError("jacobian_bounds must be the smallest values, then the largest")
     middle = 0.5 * (low + high)
-    sizes = np.abs(origin) + exact.product(np.maximum(high - middle, middle - low), np.concatenate([widths, limits]))
+    farthest = np.maximum(-region.low, region.high)
+    sizes = np.abs(origin) + exact.product(np.maximum(high - middle, middle - low), farthest)
     sizes = np.where(sizes > 0.0, sizes * (1.0 + ROUNDING), 0.0)
     return middle[:, :n], middle[:, n:], as_bound(sizes, n, "the remainder")
 

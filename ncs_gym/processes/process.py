@@ -187,6 +187,18 @@ def own_process(plant: LinearPlant) -> Process:
     return LinearProcess() if plant.members is None else FamilyProcess()
 
 
+def as_process(value: Any) -> Process:
+    """Returns a process that somebody gave.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if isinstance(value, Process):
+        return value
+    hint = ": give ncs_gym.FunctionProcess of a function (x, u) -> x+" if callable(value) else ""
+    raise ValueError(f"process must be of type Process, got {type(value).__name__}{hint}")
+
+
 @dataclass(frozen=True)
 class FunctionProcess(Process):
     """x+ = f(x, u) + d for a function f; the plant's declared disturbances without its remainder act on top.

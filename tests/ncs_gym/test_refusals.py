@@ -238,6 +238,7 @@ ENVIRONMENTS = [
         ),
         ({"channel": Channel(on_request=True), "downlink": Channel(on_request=True)}, "for the channel of the samples"),
         ({"process": "swing"}, "process must be of type Process, got str"),
+        ({"process": np.add}, "got ufunc: give ncs_gym.FunctionProcess of a function"),
     ),
     (partial(NCSEnv, PLANT, render_mode="ansi"), RenderModeError, "render_mode must be None or one of"),
     (partial(NCSEnv, PLANT, render_mode="ansi"), "render_mode must be None or one of"),
@@ -380,9 +381,12 @@ PLANTS = [
     (partial(LinearPlant, **GOOD, input_ends=[[-0.5], [0.5]]), "input_ends follow from u_max"),
     (partial(LinearPlant, **ROOM, box_ends=[[-1.0], [1.0]]), "box_ends follow from state_limits"),
     *(
-        (partial(linear_model, np.add, [0.7], 1.0, 1.0, **{name: [[-1.0], [3.0]]}), f"leave out {name}")
-        for name in ("box_ends", "input_ends", "state_limits", "input_limits")
+        (partial(linear_model, np.add, [0.7], 1.0, 1.0, **{name: [[-1.0], [3.0]]}), f"follows? from {given}")
+        for name, given in (("input_ends", "u_max"), ("state_limits", ""), ("input_limits", ""))
     ),
+    (partial(linear_model, np.add, u_max=1.0, dt=1.0, state_limits=(-1.0, np.inf)), "state 1 has no two finite ones"),
+    (partial(linear_model, np.add, dt=1.0), TypeError, "needs limits: give box or state_limits, and u_max"),
+    (partial(linear_model, np.add, [0.7], 1.0), "dt must be a number"),
     (partial(truck_trailer, wheels=18), TypeError, "unexpected keyword argument 'wheels'"),
     (
         partial(LinearPlant, A=A, B=B, dt=0.1),

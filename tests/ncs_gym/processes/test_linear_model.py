@@ -7,9 +7,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, NoEquilibriumWarning, linear_model
+from ncs_gym import (
+    Channel,
+    Ellipsoid,
+    FunctionProcess,
+    MovedOperatingPointWarning,
+    NoEquilibriumWarning,
+    linear_model,
+)
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import surrounding_shape
+from shields import SafetyShield
 
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05
@@ -87,6 +95,91 @@ def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
     plant = linear_model(kinked, [0.5], [1.0], 0.1, jacobian_bounds=bounds, samples=200, **QUIET)
     assert plant.remainder.proved
     np.testing.assert_allclose(np.sqrt(plant.remainder.bound.shape_matrix), [[0.05 + abs(offset)]], rtol=1e-6)
+
+
+def test_proved_bound_reaches_to_the_farther_end():
+    """The same kink between -0.5 and 2, with an input between -1 and 3: attained at the far ends."""
+
+    def kinked(state, u):
+        return 0.5 * state + 0.3 * u + 0.1 * np.abs(state) + 0.05 * np.abs(u)
+
+    limits = {"state_limits": (4.5, 7.0), "operating_state": 5.0, "input_limits": (-2.0, 2.0), "operating_input": -1.0}
+    bounds = [[0.4, 0.25]], [[0.6, 0.35]]
+    plant = linear_model(kinked, dt=0.1, jacobian_bounds=bounds, samples=200, **limits, **QUIET)
+    reach = np.sqrt(plant.remainder.bound.shape_matrix.item())
+    np.testing.assert_allclose(reach, 0.1 * 2.0 + 0.05 * 3.0, rtol=1e-6)
+    np.testing.assert_allclose(reach, kinked(2.0, 3.0) - plant.A.item() * 2.0 - plant.B.item() * 3.0, rtol=1e-6)
+
+
+LEVEL, FLOW = 0.6, 0.5 * np.sqrt(0.6)
+TANK = {
+    "state_limits": (0.2, 2.0),
+    "input_limits": (0.0, 1.0),
+    "operating_state": LEVEL,
+    "operating_input": FLOW,
+    "dt": 0.2,
+    "samples": 2_000,
+    "disturbance_bound": 0.005,
+    "sensor_bound": 0.01,
+    "initial_bound": 0.01,
+}
+
+
+def tank(level, inflow):
+    """A tank that runs out as the root of its level, in deviations from where LEVEL rests with FLOW."""
+    return level + 0.2 * (FLOW + inflow - 0.5 * np.sqrt(np.maximum(LEVEL + level, 0.0)))
+
+
+def test_bound_holds_between_two_different_ends_and_no_further():
+    plant = linear_model(tank, **TANK)
+    low, high = plant.own_limits[:, 0]
+    np.testing.assert_allclose([low, high], [-0.4, 1.4])
+
+    def sizes(levels):
+        inflow = np.linspace(-FLOW, 1.0 - FLOW, 11)[:, None]
+        left_out = tank(levels, inflow) - plant.A.item() * levels - plant.B.item() * inflow
+        return plant.remainder.bound.gauge(left_out.reshape(-1, 1))
+
+    assert 0.75 < sizes(np.linspace(low, high, 401)).max() <= 1.0
+    assert sizes(np.array([high + 1.0])).max() > 1.0
+    halved = linear_model(tank, **TANK | {"state_limits": (0.2, 1.0)})
+    assert halved.remainder.bound.shape_matrix.item() < 0.25 * plant.remainder.bound.shape_matrix.item()
+
+
+def test_loop_shifted_to_the_middle_of_its_limits_is_modeled_as_symmetric():
+    """The same process counted from the middle of its limits: half-widths and two ends say the same."""
+    short = model(samples=500)
+    long = model(
+        box=None,
+        samples=500,
+        state_limits=([-0.25, 0.5], [0.25, 3.5]),
+        operating_state=[0.0, 2.0],
+    )
+    np.testing.assert_allclose(long.A, short.A, atol=1e-8)
+    np.testing.assert_allclose(long.remainder.bound.shape_matrix, short.remainder.bound.shape_matrix, atol=1e-12)
+
+
+def test_shielded_tank_stays_between_its_ends_whatever_disturbs_it():
+    """The tank's own equations with a disturbance, in absolute levels, driven to both ends."""
+    plant = linear_model(tank, **TANK)
+    process, channel = FunctionProcess(tank), Channel(loss=0.3, max_consecutive_losses=2)
+    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=process, channel=channel))
+    reached = []
+    for seed in range(4):
+        env.reset(seed=seed)
+        for step in range(200):
+            *_, info = env.step(np.array([1.0 if (step // 50 + seed) % 2 else -1.0], np.float32))
+            reached.append(LEVEL + info["state"].item())
+            assert info["shield_guaranteed"]
+    assert 0.2 <= min(reached) < 0.35
+    assert 1.3 < max(reached) <= 2.0
+
+
+def test_disturbance_that_moves_the_operating_point_is_refused():
+    """The remainder was bounded around another point, and the function counts from it."""
+    disturbed = TANK | {"disturbance_bound": ([[1.0]], [0.0], [0.004])}
+    with pytest.warns(MovedOperatingPointWarning), pytest.raises(ValueError, match="give symmetric ends"):
+        linear_model(tank, **disturbed)
 
 
 def test_inner_environment_is_modeled_like_its_equations():
