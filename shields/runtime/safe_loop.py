@@ -50,6 +50,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 NOT_STARTED = "no episode is under way: call start"
+# Steps, for every state, whose samples are searched for a state that is not known, beside those of the longest delay.
+STEPS_PER_STATE = 4
 
 
 class _Phase(Enum):
@@ -166,6 +168,7 @@ class SafeLoop(CopiedWhole):
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
         self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
+        self._oldest_sought = STEPS_PER_STATE * plant.n + self._estimator.buffer
         self._discarded, self._told_of = DiscardedPackets(), frozenset[str]()
         self._phase = _Phase.STOPPED
 
@@ -282,7 +285,7 @@ class SafeLoop(CopiedWhole):
             self._monitored.advance(told, True, self._report(), decided)
             if self._unknown is not None:
                 samples, inputs = self._unknown
-                self._unknown = samples, (taken, *inputs[: self._filter.plant.n + self._estimator.buffer])
+                self._unknown = samples, (taken, *inputs[: self._oldest_sought])
                 if told is None:  # samples of before tell nothing of a state that an unknown input moved
                     self._unknown = {}, ()
         self._applied.compare(heard, self.steps, self.episode)

@@ -11,6 +11,7 @@ from ncs_gym import (
     ChannelContract,
     Command,
     Ellipsoid,
+    LinearPlant,
     Packet,
     cart_pole,
     certified_error_set,
@@ -243,6 +244,32 @@ def test_too_few_or_too_coarse_samples_are_no_first_estimate():
     local = nonlinear_cart_pole()
     ages = certified_error_set(local, contract)
     assert first_estimate(local, ages, {0: np.zeros(4)}, [], local.sensor_error.shape_matrix) is None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+@pytest.mark.parametrize("delay", [0, 1, 4])
+def test_state_that_many_samples_tell_is_found_on_a_channel_of_any_delay(delay, loss):
+    """Two tanks of which the lower one alone is measured, coarsely: six samples in a row prove where the state is."""
+    model = [[-0.05, 0.0], [0.05, -0.04]], [[0.12], [0.0]], [[0.0, 1.0]], [[0.0]]
+    limits = {"state_limits": ([0.2, 0.3], [2.0, 2.2]), "input_limits": (0.0, 1.0)}
+    bounds = {"disturbance_bound": [0.01, 0.002], "sensor_bound": 0.02, "initial_bound": 0.02}
+    point = {"operating_state": [1.2, 1.5], "operating_input": 0.5}
+    plant = LinearPlant.from_statespace(model, dt=1.0, **limits, **bounds, **point)
+    loop = SafeLoop(certificate_of(plant, safe_set="polytope"), plant, Channel(delay=delay), on_unproved="ignore")
+    rng, x, arrived, proved = np.random.default_rng(delay), np.array([0.3, -0.2]), [], []
+    loop.start(np.zeros(2), known=False)
+    for step in range(30):
+        loop.receive(arrived)
+        proved.append(loop.guaranteed)
+        if loop.guaranteed:
+            e = loop.estimate - x
+            assert e @ np.linalg.solve(loop.error_shape, e) <= 1.0
+        u = loop.decide(np.zeros(1)).input
+        sample = plant.H @ x + rng.uniform(-0.02, 0.02)
+        arrived = [Packet(step, sample, loop.episode)] if rng.random() >= loss else []
+        x = plant.A @ x + plant.B @ u + rng.uniform(-1.0, 1.0, 2) * [0.01, 0.002]
+    assert not proved[0]
+    assert any(proved)
 
 
 def test_samples_of_before_an_unknown_input_tell_nothing_of_where_the_state_is():
