@@ -30,6 +30,7 @@ from experiments.plots.figure_style import (
 from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.training_run import RunResult
 from ncs_gym import LinearPlant
+from ncs_gym.plants.description import input_labels, state_labels
 from shields import Certificate
 
 _INK = "#222222"
@@ -268,7 +269,7 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
     for end in plant.input_ends[:, i]:
         axis.axhline(end, **_LIMIT)
     axis.set_ylim(middle - 1.15 * half, middle + 1.15 * half)
-    label(axis, "", with_unit(plant.input_names[i] + "\n" * bool(unit), unit))
+    label(axis, "", with_unit(input_labels(plant)[i] + "\n" * bool(unit), unit))
     return handles
 
 
@@ -310,7 +311,7 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
         )
     if (furthest > _VIEW * extent).any():
         caption += " Some trajectories leave the view."
-    x, y = (with_unit(plant.state_names[i], plant.state_units[i]) for i in plane)
+    x, y = (with_unit(state_labels(plant)[i], plant.state_units[i]) for i in plane)
     rows = -(-len(arms) // _COLUMNS)
     columns = -(-len(arms) // rows)
     with matplotlib.rc_context(STYLE):

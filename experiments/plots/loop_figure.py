@@ -12,6 +12,7 @@ import pandas as pd
 from experiments.network_loop.log import rows_of
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, with_unit
 from ncs_gym import LinearPlant
+from ncs_gym.plants.description import input_labels, state_labels
 
 
 def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFigure:
@@ -30,13 +31,14 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
             raise ValueError(f"the logs in {folder} are of another plant, without {', '.join(missing)}: give its --env")
     logs = {name: log[log["episode"] == log["episode"].iloc[-1]] for name, log in logs.items()}
     names, units = [*plant.state_names, *plant.input_names], [*plant.state_units, *plant.input_units]
+    labels = *state_labels(plant), *input_labels(plant)
     ends = np.hstack([plant.own_limits, plant.input_ends]).T.tolist()
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure(
             (11.0, 1.0 + 1.4 * len(names)), f"{folder.name}: the dashed lines are the box and the input limits."
         )
         axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for i, (axis, name, unit, limits) in enumerate(zip(axes, names, units, ends, strict=True)):
+        for i, (axis, name, text, unit, limits) in enumerate(zip(axes, names, labels, units, ends, strict=True)):
             for log, rows in logs.items():
                 column = columns[log] + name if i < plant.n else f"u_{name}"
                 style = {"plant": "-", "controller": ":"}[log]
@@ -47,7 +49,7 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
                 unproved = logs["controller"][logs["controller"]["guaranteed"] == "0"]["step"].astype(int)
                 height = {"transform": axis.get_xaxis_transform(), "label": "not proved"}
                 axis.vlines(unproved, 0.0, 1.0, color="#cc3311", alpha=0.2, **height)
-            label(axis, "", with_unit(name, unit).replace(" [", "\n["))
+            label(axis, "", with_unit(text, unit).replace(" [", "\n["))
         axes[-1].set_xlabel("step")
         axes[0].set_title("what the controller estimates and decides at a step is about that at which it takes effect")
         axes[0].legend(loc="upper right", ncols=3)

@@ -46,7 +46,7 @@ class CartPoleDrawing:
             x = self._x(fraction * self._limit)
             color, height = (theme.DANGER, 22) if abs(fraction) == 1.0 else (theme.FAINT, 0)
             canvas.line([(x, _TRACK - height), (x, _TRACK + 5)], color, 2.0)
-            label = theme.tick_label(fraction * self._limit) + (" m" if fraction else "")
+            label = theme.tick_label(fraction * self._limit, self._limit) + (" m" if fraction else "")
             canvas.text(label, (x, _TRACK + 14), theme.MUTED, align=0.5)
 
     def draw(self, canvas: Canvas, frame: FrameRecord) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ncs_gym.plants.description import state_labels
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
@@ -114,7 +115,7 @@ def _constraint(plant: LinearPlant, index: int) -> _Constraint:
         return _Constraint(f"limit {index + 1}", "", 1.0, low, high, lambda state: float(row @ state))
     i = int(np.flatnonzero(row)[0])
     half, (low, high) = 1.0 / abs(row[i]), (low, high) if row[i] > 0.0 else (-high, -low)
-    name, unit = plant.state_names[i], plant.state_units[i]
+    name, unit = state_labels(plant)[i], plant.state_units[i]
     return _Constraint(name, unit, half, low, high, lambda state: float(state[i]) / half)
 
 

@@ -6,6 +6,7 @@ from math import ceil, log10
 
 import numpy as np
 
+from ncs_gym.plants.description import input_labels
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord
@@ -143,7 +144,7 @@ def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> Non
     value = 0.0 if frame.input is None else float(frame.input[index])
     color = theme.SHIELD if frame.intervened else theme.STEEL
     text = theme.value_label(value, limit, plant.input_units[index])
-    bar = _draw_row(canvas, y, plant.input_names[index], text, color)
+    bar = _draw_row(canvas, y, input_labels(plant)[index], text, color)
     middle, half = float(plant.input_middle[index]), float(plant.input_half[index])
 
     def x_of(u: float) -> float:

@@ -35,7 +35,7 @@ class Rect(NamedTuple):
 WIDTH, HEIGHT = 640, 480
 HEADER = Rect(0, 0, WIDTH, 40)
 PLANT_VIEW = Rect(0, 40, WIDTH, 176)
-PLANE = Rect(64, 228, 236, 196)
+PLANE = Rect(72, 228, 232, 196)
 PANEL = Rect(330, 228, 294, 244)
 # Height of the line on which packets travel; every drawing of a plant leaves it free.
 PACKET_LINE = PLANT_VIEW.y + 32
@@ -79,9 +79,12 @@ def load_color(fraction: float) -> Color:
     return blend(STEEL, DANGER, (abs(fraction) - 0.6) / 0.35)
 
 
-def tick_label(value: float) -> str:
-    """Returns a number for an axis: three digits and a true minus sign."""
+def tick_label(value: float, half: float) -> str:
+    """Returns a number for an axis of this half range: three digits of the longest one and a true minus sign."""
     text = f"{value:.3g}" if abs(value) >= 1e-12 else "0"
+    if 1e-4 <= half < 1e5:
+        text = f"{value:.{max(2 - int(np.floor(np.log10(half))), 1)}f}".rstrip("0").rstrip(".")
+        text = "0" if text in ("-0", "") else text
     return text.replace("-", "\N{MINUS SIGN}")
 
 

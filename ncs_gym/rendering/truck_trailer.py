@@ -43,7 +43,7 @@ class TruckTrailerDrawing:
         canvas.line([(0, _ROAD), (theme.WIDTH, _ROAD)], theme.FAINT, 1.5)
         for fraction in (-1.0, 0.0, 1.0):
             x = self._hitch(fraction * self._limit)
-            label = theme.tick_label(fraction * self._limit) + (" m" if fraction else "")
+            label = theme.tick_label(fraction * self._limit, self._limit) + (" m" if fraction else "")
             canvas.text(label, (x, _ROAD + 13), theme.MUTED, align=0.5)
             if fraction:
                 canvas.dashed([(x, _ROAD - 72), (x, _ROAD + 5)], theme.DANGER, 1.5, dash=4.0)

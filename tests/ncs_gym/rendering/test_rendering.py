@@ -22,6 +22,7 @@ from agents import SB3VecEnv
 from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
+from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.phase_plane import PhasePlane
 from shields import SafetyShield, VectorSafetyShield
@@ -129,6 +130,32 @@ def test_oblique_limits_are_drawn_as_they_are():
     points = np.array([(0.85, 0.1), (-0.1, -0.85), (0.6, 0.6), (-0.6, 0.55)])  # inside, inside, outside, outside
     colors = [tuple(frame[round(y), round(x)]) for x, y in plane.pixels_of(points)]
     assert colors == [theme.PAPER, theme.PAPER, theme.DANGER_FILL, theme.DANGER_FILL]
+
+
+def test_around_an_operating_point_names_say_that_deviations_are_drawn(monkeypatch):
+    common = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "gamma": 1e-4}
+    limits = {"state_limits": ([0.2, -3.0], [2.0, 1.0]), "operating_state": [1.1587, -0.5]}
+    limits |= {"input_limits": (0.0, 1.0), "operating_input": [0.25]}
+    names = {"state_names": ("level", "heat"), "state_units": ("m", ""), "input_names": ("pump",)}
+    env = make("ncs_gym/LinearNCS-v0", plant=LinearPlant(**common, **limits, **names))
+    written, text = [], Canvas.text
+    monkeypatch.setattr(
+        Canvas, "text", lambda self, words, *rest, **kw: written.append(words) or text(self, words, *rest, **kw)
+    )
+    env.reset(seed=0)
+    env.render()
+    assert {"level - 1.159", "heat + 0.5", "level - 1.159 [m]", "pump - 0.25"} <= set(written)
+    assert not {"level", "heat", "level [m]", "pump"} & set(written)
+    assert {"\N{MINUS SIGN}0.959", "0.841"} <= set(written)  # 0.2 and 2 m
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "text"),
+    [(-1.1547, 0.95, "-1.155"), (-0.0587, 0.9, "-0.059"), (12.5, 12.5, "12.5"), (350, 350, "350"), (1e-17, 2, "0")]
+    + [(1e6, 1e6, "1e+06"), (5e-6, 5e-6, "5e-06"), (-1e-5, 0.3, "0"), (-20, 40, "-20"), (-2, 2, "-2")],
+)
+def test_numbers_of_an_axis_have_the_digits_of_its_longest_one(value, half, text):
+    assert theme.tick_label(value, half) == text.replace("-", "\N{MINUS SIGN}")
 
 
 def test_truck_stretches_its_coupling_which_turns_red_near_its_limit_and_its_estimate_is_dashed():
