@@ -138,10 +138,13 @@ def test_around_an_operating_point_names_say_that_deviations_are_drawn(monkeypat
     limits |= {"input_limits": (0.0, 1.0), "operating_input": [0.25]}
     names = {"state_names": ("level", "heat"), "state_units": ("m", ""), "input_names": ("pump",)}
     env = make("ncs_gym/LinearNCS-v0", plant=LinearPlant(**common, **limits, **names))
-    written, text = [], Canvas.text
-    monkeypatch.setattr(
-        Canvas, "text", lambda self, words, *rest, **kw: written.append(words) or text(self, words, *rest, **kw)
-    )
+    written, draw = [], Canvas.text
+
+    def text(canvas, words, *place, **style):
+        written.append(words)
+        return draw(canvas, words, *place, **style)
+
+    monkeypatch.setattr(Canvas, "text", text)
     env.reset(seed=0)
     env.render()
     assert {"level - 1.159", "heat + 0.5", "level - 1.159 [m]", "pump - 0.25"} <= set(written)
@@ -151,8 +154,10 @@ def test_around_an_operating_point_names_say_that_deviations_are_drawn(monkeypat
 
 @pytest.mark.parametrize(
     ("value", "half", "text"),
-    [(-1.1547, 0.95, "-1.155"), (-0.0587, 0.9, "-0.059"), (12.5, 12.5, "12.5"), (350, 350, "350"), (1e-17, 2, "0")]
-    + [(1e6, 1e6, "1e+06"), (5e-6, 5e-6, "5e-06"), (-1e-5, 0.3, "0"), (-20, 40, "-20"), (-2, 2, "-2")],
+    [
+        *((-1.1547, 0.95, "-1.155"), (-0.0587, 0.9, "-0.059"), (12.5, 12.5, "12.5"), (350, 350, "350")),
+        *((1e6, 1e6, "1e+06"), (5e-6, 5e-6, "5e-06"), (-1e-5, 0.3, "0"), (-20, 40, "-20"), (1e-17, 2, "0")),
+    ],
 )
 def test_numbers_of_an_axis_have_the_digits_of_its_longest_one(value, half, text):
     assert theme.tick_label(value, half) == text.replace("-", "\N{MINUS SIGN}")
