@@ -15,7 +15,9 @@ from agents.training import train
 from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant
 from shields import SafetyShield, VectorSafetyShield, synthesize
 
-CHANNEL = Channel(GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4), 0.05, 2, 1, 2)
+CHANNEL = Channel(
+    GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4), quantization_step=0.05, send_period=2, delay=1, jitter=2
+)
 IDS = ("TruckTrailer-v0", "TruckTrailerCruise-v0", "CartPole-v0")
 
 

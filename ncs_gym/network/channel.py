@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from functools import cached_property
 from math import inf, isclose
 from typing import Any, NamedTuple
@@ -86,6 +86,7 @@ class Channel:
     """
 
     loss: float | GilbertElliott = 0.0
+    _: KW_ONLY  # so that Channel(0.3, 2) is not one that rounds to multiples of 2
     quantization_step: float = 0.0
     send_period: int = 1
     delay: int = 0
@@ -234,7 +235,7 @@ def _bursts(loss: dict[str, Any]) -> GilbertElliott:
         ) from None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TraceChannel(Channel):
     """A channel that replays what happened to the samples of a record, from a random one on and around again.
 

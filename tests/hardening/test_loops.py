@@ -14,6 +14,7 @@ from tests.fuzz import NOTHING_USABLE, examples
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 # Inside a safe set, and outside of any.
+CHANNEL = Channel(0.3, quantization_step=0.05, send_period=2, delay=1, jitter=1)
 STARTS = [[0.0, 0.0], [0.3, -0.1], [5.0, 5.0]]
 BAD_ACTIONS = [*NOTHING_USABLE, np.nan, [np.nan], [np.inf], [0.0, 0.0], [[0.0]], None, 0.5, np.zeros(0), {"u": 1.0}]
 BAD_OPTIONS = [{"state": [np.nan, 0.0]}, {"state": [1.0]}, {"start": [0.0, 0.0]}, 3]
@@ -57,7 +58,11 @@ def played(env, moves, count=None):
 
 def pair(kind, certificate, loaded):
     """Two equal loops of a kind, and how many environments each has."""
-    settings = {"plant": loaded, "channel": Channel(0.3, 0.05, 2, 1, 1), "disturbance": "sphere"}
+    settings = {
+        "plant": loaded,
+        "channel": CHANNEL,
+        "disturbance": "sphere",
+    }
     if kind == "scalar":
         return [NCSEnv(**settings) for _ in range(2)], None
     if kind == "shield":
@@ -137,7 +142,7 @@ def stacked(env, names):
 )
 @examples(40)
 def test_a_stack_is_refused_or_its_proof_is_right(certificate, loaded, inside, outside, mode, start, seed):
-    env = stacked(NCSEnv(loaded, Channel(0.5, 0.05, 1, 1), disturbance="adversarial"), inside)
+    env = stacked(NCSEnv(loaded, Channel(0.5, quantization_step=0.05, delay=1), disturbance="adversarial"), inside)
     changed = sorted(set(inside) & set(CHANGING))
     if changed:
         with pytest.raises(ValueError, match=r"changes (or repeats actions|the action space)"):

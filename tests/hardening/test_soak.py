@@ -15,7 +15,7 @@ from tests.shields.attacks.adversary import Traffic
 EPISODE = 300
 # Columns of a vector whose last episodes are computed again; the first one is also that of a single estimator.
 WATCHED = range(0, 16, 3)
-CHANNEL = Channel(0.3, 0.05, 2, 1, 1)
+CHANNEL = Channel(0.3, quantization_step=0.05, send_period=2, delay=1, jitter=1)
 # What a process may gain after it has warmed up [MB].
 MOST_GROWTH = 6.0
 

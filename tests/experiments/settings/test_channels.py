@@ -84,9 +84,9 @@ def test_grid_is_the_product_of_its_sides():
     assert len(points) == len({name_of(point) for point in points}) == 8
     lossless, *_, last = points
     own = replace(settings, channel={"jitter": 1})
-    assert loop_at(own, lossless).channel == Channel(0.0, 0.1, send_period=2, delay=1, jitter=1)
+    assert loop_at(own, lossless).channel == Channel(0.0, quantization_step=0.1, send_period=2, delay=1, jitter=1)
     bursts = changed_channel(OWN, {"loss": 0.5, "burst_length": 3.0}).loss
-    assert loop_at(settings, last).channel == Channel(bursts, 0.2, send_period=2, delay=1)
+    assert loop_at(settings, last).channel == Channel(bursts, quantization_step=0.2, send_period=2, delay=1)
 
 
 def test_masses_are_a_side_of_the_grid():

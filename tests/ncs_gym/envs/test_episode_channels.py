@@ -172,7 +172,8 @@ def test_other_environments_go_on_when_a_longer_delay_joins_in_the_middle_of_the
 def test_errors_stay_in_their_ellipsoids_whatever_channels_are_drawn():
     def draw(rng):
         loss = [0.0, 0.5, BURSTS][rng.integers(3)]
-        return Channel(loss, 0.05 * rng.random(), int(rng.integers(1, 4)), int(rng.integers(6)), int(rng.integers(4)))
+        loop = {"quantization_step": 0.05 * rng.random(), "send_period": int(rng.integers(1, 4))}
+        return Channel(loss, delay=int(rng.integers(6)), jitter=int(rng.integers(4)), **loop)
 
     coarse = Channel(quantization_step=0.05)
     env = VectorRandomChannel(NCSVectorEnv(32, plant=PLANT, channel=coarse, max_episode_steps=13), draw)

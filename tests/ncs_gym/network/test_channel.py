@@ -47,6 +47,14 @@ def test_jitter_delays_within_its_range_and_lets_packets_overtake():
     assert len(order) == len(set(order))
 
 
+def test_loss_alone_may_be_given_without_its_name():
+    """So that loss and delay are not read as loss and step of the quantizer."""
+    assert Channel(0.3) == Channel(loss=0.3)
+    for positional in ((0.3, 2), (0.3, 0.05, 2)):
+        with pytest.raises(TypeError, match="positional argument"):
+            Channel(*positional)
+
+
 def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     loss = GilbertElliott(p_good_to_bad=0.05, p_bad_to_good=0.2)
     arrivals = transmit(Channel(loss=loss), 60_000)

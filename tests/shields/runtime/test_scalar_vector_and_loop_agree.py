@@ -99,7 +99,9 @@ FEATURES = {
         safe_set="polytope",
     ),
     "some outputs": Feature(
-        RANDOM["n=3 m=2 p=1"], {"channel": Channel(0.3, 0.01, delay=1, jitter=2)}, ("project", "switch", "boundary")
+        RANDOM["n=3 m=2 p=1"],
+        {"channel": Channel(0.3, quantization_step=0.01, delay=1, jitter=2)},
+        ("project", "switch", "boundary"),
     ),
     "a polytope": Feature(random_plant(0, 4, 2), {"channel": Channel(loss=0.3)}, safe_set="polytope"),
     "bursts": Feature(TRUCK, {"channel": Channel(BURSTS, jitter=2)}, ("switch",)),

@@ -37,7 +37,10 @@ def test_every_possible_network_has_a_certificate_that_verifies(found):
             network = point.network
             assert verify(point.certificate, with_radii(servo(), disturbance=1.0, noise=network.noise)).valid
             channel = Channel(
-                0.5, network.quantization_step, network.send_period, max_consecutive_losses=network.losses
+                0.5,
+                quantization_step=network.quantization_step,
+                send_period=network.send_period,
+                max_consecutive_losses=network.losses,
             )
             assert point.certificate.contract is not None
             assert point.certificate.contract.is_kept_by(channel)
