@@ -14,6 +14,8 @@ from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 
+# What to do with environments that are no loops.
+OTHERS = 'agents.train is for environments with "cost" in their infos: train others by stable-baselines3 itself'
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
 # The policy is evaluated about this often.
@@ -225,6 +227,8 @@ def _counted(callback: BaseCallback) -> dict[str, Any]:
         return env.batch_info
     infos = callback.locals["infos"]
     if not infos or not all("cost" in info for info in infos):
-        raise ValueError('SafetyCallback counts "cost" of every info, which the infos of these environments have not')
+        raise ValueError(
+            f'SafetyCallback counts "cost" of every info, which the infos of these environments have not; {OTHERS}'
+        )
     known = {key: [info[key] for info in infos if key in info] for key in _COUNTED}  # some may be without a shield
     return {key: values for key, values in known.items() if values}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
 from typing import Any
 
 import gymnasium as gym
@@ -164,7 +165,11 @@ class LoopConfig:
             gym.spec(self.env)
         except (gym.error.Error, ImportError, AttributeError) as error:
             module, _, alone = self.env.rpartition(":") if isinstance(self.env, str) else ("", "", "")
-            way = f"import {module}, and give {alone!r}" if module else "import the module that registers it"
+            near = [
+                id_ for meant in (alone, f"ncs_gym/{alone}") for id_ in get_close_matches(meant, gym.registry, 1, 0.9)
+            ]
+            way = f"did you mean {near[0]!r}?" if near else "import the module that registers it"
+            way = f"import {module}, and give {alone!r}" if module else way
             raise ValueError(f"{shown(self.env)} is no registered environment: {way}") from error
         penalty = as_number(self.violation_penalty, "violation_penalty", low=0.0)
         object.__setattr__(self, "violation_penalty", penalty)

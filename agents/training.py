@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
 from agents.algorithms import build_model, normalized_env
-from agents.callbacks import DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
+from agents.callbacks import OTHERS, DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
@@ -166,7 +166,11 @@ def _trainable(
     envs = loop.vector(hyperparams["n_envs"])
     if hyperparams.get("stored_action") == "applied" and loop.base_policy is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
-    env = normalized_env(algorithm, SB3VecEnv(envs), hyperparams)
+    try:
+        seen = SB3VecEnv(envs)
+    except ValueError as error:
+        raise ValueError(f"{loop.env}: {error}; {OTHERS}") from error
+    env = normalized_env(algorithm, seen, hyperparams)
     model = build_model(algorithm, env, hyperparams, seed, before + steps)
     model.num_timesteps = before
     if algorithm not in ON_POLICY:

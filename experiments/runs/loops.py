@@ -43,10 +43,11 @@ def registered_env(env_id: str) -> NCSEnv:
         if name not in gym.registry:
             raise ValueError(f"module {module!r} registers no environment {name!r}")
     elif name not in registered_ids() and name not in needing_extras():
-        whole = f"ncs_gym/{name.removeprefix('ncs_gym/')}"
+        known = {each.lower(): each for each in registered_ids()}
+        whole = f"ncs_gym/{name.lower().removeprefix('ncs_gym/')}"
         for meant in (f"{whole}-v0", whole):
-            if near := get_close_matches(meant, registered_ids(), 1, 0.95):
-                raise ValueError(f"unknown environment {env_id!r}; did you mean {near[0]!r}?")
+            if near := get_close_matches(meant, known, 1, 0.95):
+                raise ValueError(f"unknown environment {env_id!r}; did you mean {known[near[0]]!r}?")
         if name in gym.registry and gym.spec(name).namespace == "ncs_gym":
             raise ValueError(f"{env_id} has no plant of its own: give the file of one by --plant, or register_plant it")
         raise ValueError(

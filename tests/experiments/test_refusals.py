@@ -145,6 +145,8 @@ ONE_SENTENCE = [
     ("compare --env CartPole-v1", "unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"),
     ("compare --env ncs_gym/LinearNCS-v0", "has no plant of its own"),
     ("compare --env ncs_gym/CartPol-v0", "'ncs_gym/CartPol-v0'; did you mean 'ncs_gym/CartPole-v0'?"),
+    ("compare --env cstr", "'cstr'; did you mean 'ncs_gym/CSTR-v0'?"),
+    ("channel nofile.csv", "cannot read packets from nofile.csv: No such file or directory"),
     ("compare --arms shieled", "unknown arm 'shieled' (did you mean 'shielded'?)"),
     ("compare --env CSTR-v0", "unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"),
     ("compare --env ncs_gym/CartPole", "unknown environment 'ncs_gym/CartPole'; did you mean 'ncs_gym/CartPole-v0'?"),

@@ -188,6 +188,8 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Environments.
     (lambda: gym.make(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
     (lambda: gym.make_vec(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
+    (lambda: LoopConfig(env="ncs_gym/CartPol-v0"), ValueError, "environment: did you mean 'ncs_gym/CartPole-v0'"),
+    (lambda: LoopConfig(env="CSTR-v0"), ValueError, "environment: did you mean 'ncs_gym/CSTR-v0'"),
     (lambda: LoopConfig(env="ncs_gym/Nothing-v0"), ValueError, "'ncs_gym/Nothing-v0' is no registered environment"),
     # Filters.
     (lambda: SafetyFilter(replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), CertificateError, r"\(S\)"),
