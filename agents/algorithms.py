@@ -187,7 +187,7 @@ class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
     Hand it to SAC, TD3 and their kind as `replay_buffer_class`. `train` does so with the hyperparameter
-    `stored_action="applied"`.
+    `stored_action="applied"`. It is for returns of one step (`n_steps=1`).
     """
 
     _steps: np.ndarray | None = None  # of the episodes, when the last transition was added

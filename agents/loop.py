@@ -165,9 +165,8 @@ class LoopConfig:
             gym.spec(self.env)
         except (gym.error.Error, ImportError, AttributeError) as error:
             module, _, alone = self.env.rpartition(":") if isinstance(self.env, str) else ("", "", "")
-            near = [
-                id_ for meant in (alone, f"ncs_gym/{alone}") for id_ in get_close_matches(meant, gym.registry, 1, 0.9)
-            ]
+            known = list(gym.registry)
+            near = get_close_matches(alone, known, 1, 0.9) or get_close_matches(f"ncs_gym/{alone}", known, 1, 0.9)
             way = f"did you mean {near[0]!r}?" if near else "import the module that registers it"
             way = f"import {module}, and give {alone!r}" if module else way
             raise ValueError(f"{shown(self.env)} is no registered environment: {way}") from error

@@ -109,7 +109,7 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
     """Returns the settings with the full names of arms, each of which is listed once."""
     arms, baselines = (full_names(names, settings.mode) for names in (settings.arms, settings.baselines))
     if len(set(arms)) != len(arms) or not arms:
-        raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
+        raise ValueError(f"--arms must be arms that differ, at least one, got {' '.join(settings.arms) or 'none'}")
     baselines = tuple(name for name in dict.fromkeys(baselines) if name not in arms)
     return replace(settings, arms=arms, baselines=baselines)
 

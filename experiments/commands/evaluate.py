@@ -47,7 +47,10 @@ def evaluate(settings: EvaluateSettings) -> None:
     from agents.agent import is_sb3_zip  # imports torch
 
     if settings.shield == "as-trained" and is_sb3_zip(folder):
-        say(f"{folder.name} does not say whether the agent was trained behind a shield: none is used; give --shield")
+        say(
+            f"{folder.name} does not say behind which shield and on which channel the agent was trained: no shield and "
+            "the channel of the id are used; give --shield and --channel"
+        )
     elif settings.shield == "as-trained" and agent.is_filtered:
         say("the agent was trained behind a filter that is no shield, which its files do not keep: none is used here")
     require_horizon(settings, mode)

@@ -35,7 +35,7 @@ class SynthesizeSettings:
             for the plant of a file.
         quantization_step: Coarsest quantization that the channel contract allows; by default the environment's, none
             for the plant of a file.
-        seed: Accepted by every command; the synthesis is deterministic and does not use it.
+        seed: Not used, since the synthesis is deterministic; every command takes it.
     """
 
     env: str | None = None
@@ -62,7 +62,7 @@ class VerifySettings:
             certificate's fingerprint.
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         out: File for the verdicts (JSON).
-        seed: Accepted by every command; the verification is deterministic and does not use it.
+        seed: Not used, since the verification is deterministic; every command takes it.
     """
 
     file: tyro.conf.Positional[Path]
@@ -181,7 +181,7 @@ class AuditSettings:
     Attributes:
         json: Print JSON instead of the table.
         out: File for the rows (JSON).
-        seed: Accepted by every command; the audit is deterministic and does not use it.
+        seed: Not used, since the audit is deterministic; every command takes it.
     """
 
     json: bool = False
@@ -244,7 +244,7 @@ class RequirementsSettings(BackendSettings):
             certificates allow.
         ignore: Names of columns of --log that are not looked at.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
-        seed: Accepted by every command; the search is deterministic and does not use it.
+        seed: Not used, since the search is deterministic; every command takes it.
     """
 
     env: str | None = None

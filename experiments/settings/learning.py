@@ -210,8 +210,8 @@ class CompareSettings(LearningSettings):
             without a bound).
         tuned_arms: Whether arms that were tuned by themselves (`benchmarks.learning`) are trained with what was
             found: hyperparameters of PPO, the price of a violation, settings of PPO-Lagrangian.
-        noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
-            episodes that left the safe set the bound on their probability.
+        noise: "gaussian" draws noise that may exceed the certificate's bounds, and prints the bound on the probability
+            of leaving the safe set beside the episodes that left it.
     """
 
     out: Path = Path("runs/compare")
@@ -267,7 +267,8 @@ class EvaluateSettings:
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
         between_samples: Times per step at which the safe box counts, 1 for the sampling instants; by default the
             plant's own.
-        channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
+        channel: Changes of the channel that the agent was trained with (of an agent in a ZIP file, of that of the id),
+            by the names that `ncs compare` lists.
         smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
     """
@@ -408,7 +409,7 @@ class StudySettings(BackendSettings):
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
         if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):
-            raise ValueError(f"--envs must be different ones, at least one, got {' '.join(self.envs) or 'none'}")
+            raise ValueError(f"--envs must be ids that differ, at least one, got {' '.join(self.envs) or 'none'}")
 
 
 def short_name(env_id: str) -> str:

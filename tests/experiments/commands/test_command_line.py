@@ -250,7 +250,7 @@ def test_one_agent_is_trained(tmp_path, without_workers):
     alone = ("--env", "ncs_gym/TruckTrailerCruise-v0", "--vec-normalize", "none", "--episodes", "2")
     bare = succeeded("evaluate", tmp_path / "alone.zip", *alone)
     assert "shield: none" in bare.stdout
-    assert "none is used; give --shield" in bare.stderr
+    assert "the channel of the id are used; give --shield" in bare.stderr
 
 
 @pytest.mark.slow
