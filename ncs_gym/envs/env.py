@@ -79,9 +79,9 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     The task's; see `Regulation`, `SpeedTracking` and `SetpointTracking`.
 
     ## Starting state
-    Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
-    (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`. Other options of
-    `reset` give the episode another channel, or another member of the plant's family.
+    Uniform in `initial_set`, or `options={"state": x0}`, in deviations from the operating point. The first estimate is
+    off by Gaussian noise (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`.
+    Other options of `reset` give the episode another channel, or another member of the plant's family.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the
