@@ -139,6 +139,31 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
     )
 
 
+def without_past_inputs(plant: LinearPlant) -> tuple[LinearPlant, bool]:
+    """Returns the model of the own states alone, of which nothing uncertain is declared, and whether inputs are late.
+
+    Its input is the oldest one under way if inputs take effect later, and else the one of the step.
+    """
+    from ncs_gym.plants.linear_plant import LinearPlant
+
+    m, n = plant.m, plant.n - inputs_under_way(plant)
+    is_late = not plant.B[:n].any()
+    rows = ~plant.box[:, n:].any(axis=1)
+    own = LinearPlant(
+        A=plant.A[:n, :n],
+        B=plant.A[:n, n : n + m] if is_late else plant.B[:n],
+        H=plant.H[:, :n],
+        dt=plant.dt,
+        box=plant.box[rows, :n],
+        box_ends=plant.box_ends[:, rows],
+        input_ends=plant.input_ends,
+        operating_state=plant.operating_state[:n],
+        operating_input=plant.operating_input,
+        **dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0),
+    )
+    return own, is_late
+
+
 def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:
     """Returns a bound of the same entries and of some more that are zero."""
     return None if bound is None else Ellipsoid(np.pad(bound.shape_matrix, (0, zeros)))

@@ -16,6 +16,9 @@ from ncs_gym.validation import as_flag, as_setting, shown
 class Process:
     """What really moves; the plant is the certified model of it (docs/beyond_linear.md).
 
+    Where states of the plant are past inputs (`input_delay`, `du_max`), the environment keeps these: a process moves
+    the others, with the input that acts, and gets a plant of them alone.
+
     A process is a setting: one object may serve any number of environments. What keeps something at run time returns
     another process from `opened`, which belongs to a single environment, or to a vector of them.
 

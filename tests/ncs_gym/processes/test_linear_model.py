@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -173,6 +174,48 @@ def test_shielded_tank_stays_between_its_ends_whatever_disturbs_it():
             assert info["shield_guaranteed"]
     assert 0.2 <= min(reached) < 0.35
     assert 1.3 < max(reached) <= 2.0
+
+
+@pytest.mark.parametrize("past", [{"du_max": 0.3}, {"input_delay": 2}, {"du_max": 0.3, "input_delay": 1}])
+def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
+    """What is left of a step of the tank, with the input that acts, is the declared disturbance."""
+    plant = linear_model(tank, **TANK | past)
+    channel = Channel(loss=0.3, max_consecutive_losses=2)
+    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=FunctionProcess(tank), channel=channel))
+    rng, off, actions = np.random.default_rng(0), [], []
+    _, info = env.reset(seed=0, options={"state": np.zeros(plant.n)})
+    for step in range(150):
+        before = info["state"]
+        actions.append(np.clip(rng.normal(np.sign(step % 50 - 25), 0.5, 1), -1.0, 1.0).astype(np.float32))
+        *_, info = env.step(actions[-1])
+        assert info["shield_guaranteed"]
+        assert not info["cost"]
+        acting = before[1:2] if "input_delay" in past else info["input"]
+        off.append(info["state"][0] - tank(before[:1], acting).item())
+        np.testing.assert_array_equal(info["state"][1:], [*before[2:], *info["input"]])
+    assert 0.004 < np.abs(off).max() <= 0.005
+    quiet = {"plant": replace(plant, disturbance_bound=0.0), "process": FunctionProcess(tank, vectorized=True)}
+    loops = gym.make("ncs_gym/LinearNCS-v0", **quiet), gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, **quiet)
+    for each in loops:
+        each.reset(seed=0, options={"state": np.zeros(plant.n)})
+    for action in actions[:20]:
+        one, many = (each.step(np.broadcast_to(action, each.action_space.shape))[4]["state"] for each in loops)
+        np.testing.assert_allclose(many, np.broadcast_to(one, many.shape), atol=1e-12)
+
+
+def test_another_environment_moves_the_states_that_are_no_past_inputs():
+    """`Pendulum-v1` with a limit of how fast its torque changes, beside the equations of its documentation."""
+    bounds = {"disturbance_bound": 0.0, "sensor_bound": [0.002, 0.01], "initial_bound": [0.005, 0.03]}
+    plant = linear_model(PendulumProcess(), BOX, TORQUE, STEP, samples=2_000, du_max=1.5, **bounds)
+    assert plant.n == 3
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=PendulumProcess())
+    _, info = env.reset(seed=0, options={"state": [0.1, -0.2, 0.4]})
+    for action in ([0.5], [-0.25], [0.125]):
+        before = info["state"]
+        *_, info = env.step(np.array(action, np.float32))
+        np.testing.assert_allclose(info["state"][:2], swing(before[:2], TORQUE * np.array(action)), atol=1e-7)
+        assert info["state"][2] == TORQUE * action[0]
+    env.close()
 
 
 def test_disturbance_that_moves_the_operating_point_is_refused():
