@@ -176,11 +176,12 @@ class Observer:
                 f"{bounds}: it must return the largest absolute value of each"
             )
         within = np.minimum(np.maximum(entries, self._low), self._high)
-        if not self._has_warned and len(own):
-            first, last = len(known.estimate), len(known.estimate) + len(own)
-            if np.count_nonzero(beyond := within[first:last] != entries[first:last]):
+        if not self._has_warned and within.tobytes() != entries.tobytes():  # the quickest way to look
+            own_entries = slice(len(known.estimate), len(known.estimate) + len(own))
+            beyond = np.argwhere(within[own_entries] != entries[own_entries])
+            if len(beyond):
                 self._has_warned = True
-                self._warn(first, int(np.argwhere(beyond)[0][0]))
+                self._warn(len(known.estimate), int(beyond[0][0]))
         return within.astype(np.float32)
 
     def _observed(self, known: Known, name: str) -> np.ndarray:
