@@ -340,8 +340,7 @@ class _Change:
             return f"{value:.3g} times {self.what} or more{self.note}"
         if self.given is not None:
             return f"{self.name} = {value:.3g} or less (given: {self.given:g})"
-        shrink = " (shrink the box or the input limits)" if self.name == "remainder" else ""
-        return f"{value:.3g} times the given {self.name} or less{shrink}"
+        return f"{value:.3g} times the given {self.name} or less{self.note}"
 
 
 def _shrinkings(plant: LinearPlant) -> list[_Change]:
@@ -350,11 +349,13 @@ def _shrinkings(plant: LinearPlant) -> list[_Change]:
     def scaled(name: str) -> Callable[[LinearPlant, float], LinearPlant]:
         return lambda plant, factor: _with_scaled(plant, name, factor)
 
-    return [
+    changes = [
         _Change(name, f"a smaller {name}", scaled(name), rises=False, given=plant.gamma if name == "gamma" else None)
         for name in _BOUNDS
         if _is_declared(plant, name)
     ]
+    of_remainder = "the box or the input limits" if plant.members is None else "the ranges of the parameters"
+    return [replace(each, note=f" (shrink {of_remainder})") if each.name == "remainder" else each for each in changes]
 
 
 def _widenings(plant: LinearPlant) -> list[_Change]:

@@ -119,3 +119,12 @@ def test_remainder_that_the_box_cannot_bear_is_named():
     )
     with pytest.raises(Infeasible, match=r"times the given remainder or less \(shrink the box"):
         synthesize(plant, contract=ChannelContract(0))
+
+
+def test_family_that_the_box_cannot_bear_is_named_by_the_ranges_of_its_parameters():
+    def furnace(loss):
+        bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.02, "initial_bound": 0.02}
+        return LinearPlant(A=[[1.0 - 0.1 * loss]], B=[[0.05]], dt=0.1, box=[1.0], u_max=2.0, **bounds)
+
+    with pytest.raises(Infeasible, match=r"remainder or less \(shrink the ranges of the parameters\)"):
+        synthesize(LinearPlant.family(furnace, {"loss": (-6.0, 8.0)}, monotone=True))
