@@ -142,13 +142,15 @@ class Canvas:
             align: 0 puts the left end at `place`, 0.5 the middle, 1 the right end.
             bold: Whether to use the bold font.
             upright: Whether to turn the line by 90 degrees; `place` is its middle then.
-            max_width: Longer lines are cut to this width [pixels].
+            max_width: Of longer lines the middle is left out [pixels].
 
         Returns:
             Width of the line [pixels].
         """
-        while max_width is not None and len(text) > 1 and self.text_width(text, size, bold=bold) > max_width:
-            text = text[:-2] + "\N{HORIZONTAL ELLIPSIS}"
+        whole, kept = text, len(text)
+        while max_width is not None and kept > 1 and self.text_width(text, size, bold=bold) > max_width:
+            kept -= 1
+            text = f"{whole[: kept // 2]}\N{HORIZONTAL ELLIPSIS}{whole[-(kept - kept // 2) :]}"
         image = self._text(text, size, bold, color, upright)
         width, height = image.get_size()
         anchor = 0.5 if upright else align

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.plants.description import state_labels
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
@@ -21,7 +20,7 @@ _SPACING = 28.0
 # The bars reach this far from the middle of the limits, in units of half their range.
 _BAR_REACH = 1.3
 # Widths of the names and numbers beside the bars, with one column and with two [pixels].
-_TEXT_WIDTH, _NARROW_TEXT_WIDTH = 150.0, 96.0
+_TEXT_WIDTH, _NARROW_TEXT_WIDTH = 150.0, 92.0
 _OUTSIDE = theme.blend(theme.DANGER_FILL, theme.DANGER, 0.15)
 
 
@@ -32,6 +31,7 @@ class _Constraint(NamedTuple):
         name: Name of the state it limits; a number for a row about several states.
         unit: Unit of that state.
         half: Half the range of that state, in its unit.
+        center: Its operating point, in its unit.
         low, high: The limits in units of half the range; infinite where there is none.
         load: Maps a state, shape (n,), to what is limited, in these units.
     """
@@ -39,6 +39,7 @@ class _Constraint(NamedTuple):
     name: str
     unit: str
     half: float
+    center: float
     low: float
     high: float
     load: Callable[[np.ndarray], float]
@@ -95,7 +96,7 @@ class ConstraintBarsDrawing:
             canvas.line([(zero, bar.y - 1), (zero, bar.bottom + 1)], theme.MUTED, 1.0)
             estimated = _x(bar, constraint, constraint.load(frame.estimate))
             canvas.dashed([(estimated, bar.y - 4), (estimated, bar.bottom + 4)], theme.ESTIMATE, 2.0, dash=3.0)
-            text = theme.value_label(value * constraint.half, constraint.half, constraint.unit)
+            text = theme.value_label(constraint.center + value * constraint.half, constraint.half, constraint.unit)
             place, violated = (bar.right + 10, bar.y + 7), used > 1.0
             text_color = theme.DANGER if violated else theme.INK
             canvas.text(text, place, text_color, bold=violated, max_width=self._text_width)
@@ -106,17 +107,18 @@ class ConstraintBarsDrawing:
         y = _TOP + _SPACING * (index % _COLUMN) + 0.5 * _SPACING * (_COLUMN - min(count, _COLUMN))
         if count <= _COLUMN:
             return theme.Rect(170, y, 340, 14)
-        return theme.Rect(110 if index < _COLUMN else 420, y, 130, 14)
+        return theme.Rect(118 if index < _COLUMN else 432, y, 100, 14)
 
 
 def _constraint(plant: LinearPlant, index: int) -> _Constraint:
     row, low, high = plant.box[index], float(plant.box_low[index]), float(plant.box_high[index])
     if np.count_nonzero(row) != 1:
-        return _Constraint(f"limit {index + 1}", "", 1.0, low, high, lambda state: float(row @ state))
+        center = float(row @ plant.operating_state)
+        return _Constraint(f"limit {index + 1}", "", 1.0, center, low, high, lambda state: float(row @ state))
     i = int(np.flatnonzero(row)[0])
     half, (low, high) = 1.0 / abs(row[i]), (low, high) if row[i] > 0.0 else (-high, -low)
-    name, unit = state_labels(plant)[i], plant.state_units[i]
-    return _Constraint(name, unit, half, low, high, lambda state: float(state[i]) / half)
+    name, unit, center = plant.state_names[i], plant.state_units[i], float(plant.operating_state[i])
+    return _Constraint(name, unit, half, center, low, high, lambda state: float(state[i]) / half)
 
 
 def _x(bar: theme.Rect, constraint: _Constraint, load: float) -> float:

@@ -6,7 +6,6 @@ from math import ceil, log10
 
 import numpy as np
 
-from ncs_gym.plants.description import input_labels
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord
@@ -49,6 +48,9 @@ def draw_panel(canvas: Canvas, frame: FrameRecord) -> None:
         _draw_tracked_output(canvas, frame, y)
         y += spacing
     _draw_packets(canvas, frame, y)
+    if hidden := frame.plant.m - inputs:
+        place = theme.PANEL.right, y + 18 + _BAR_HEIGHT + 11
+        canvas.text(f"and {counted(hidden, 'more input')}", place, theme.MUTED, align=1.0)
 
 
 def draw_legend(canvas: Canvas, *, shielded: bool, plans: bool) -> None:
@@ -143,8 +145,8 @@ def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> Non
     limit = float(plant.largest_input[index])
     value = 0.0 if frame.input is None else float(frame.input[index])
     color = theme.SHIELD if frame.intervened else theme.STEEL
-    text = theme.value_label(value, limit, plant.input_units[index])
-    bar = _draw_row(canvas, y, input_labels(plant)[index], text, color)
+    text = theme.value_label(value + float(plant.operating_input[index]), limit, plant.input_units[index])
+    bar = _draw_row(canvas, y, plant.input_names[index], text, color)
     middle, half = float(plant.input_middle[index]), float(plant.input_half[index])
 
     def x_of(u: float) -> float:

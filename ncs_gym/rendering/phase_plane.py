@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.plants.description import state_labels
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
@@ -148,13 +147,14 @@ class PhasePlane:
         for fraction in (-1.0, 0.0, 1.0):
             value = self._middle + fraction * self._half
             x, y = self.pixels_of(value)
+            value = value + plant.operating_state[[i, j]]
             canvas.text(theme.tick_label(value[0], self._half[0]), (x, rect.bottom + 11), theme.MUTED, align=0.5)
             canvas.text(theme.tick_label(value[1], self._half[1]), (rect.x - 6, y), theme.MUTED, align=1.0)
         _draw_titles(
             canvas,
             rect,
-            _axis_title(state_labels(plant)[i], plant.state_units[i]),
-            _axis_title(state_labels(plant)[j], plant.state_units[j]),
+            _axis_title(plant.state_names[i], plant.state_units[i]),
+            _axis_title(plant.state_names[j], plant.state_units[j]),
         )
 
 
@@ -182,7 +182,8 @@ class TimePlot:
         for fraction in (-1.0, 0.0, 1.0):
             value = self._range.middle + fraction * self._range.half
             y = self._y(value)
-            canvas.text(theme.tick_label(value, self._range.half), (rect.x - 6, y), theme.MUTED, align=1.0)
+            text = theme.tick_label(float(self._plant.operating_state[0]) + value, self._range.half)
+            canvas.text(text, (rect.x - 6, y), theme.MUTED, align=1.0)
             ends = [(rect.x, y), (rect.right, y)]
             if fraction:
                 canvas.dashed(ends, theme.DANGER, 1.5)
@@ -191,7 +192,7 @@ class TimePlot:
         canvas.rect(rect, theme.FAINT, width=0.5)
         for age in (0, RECENT_STEPS // 2, RECENT_STEPS):
             canvas.text(theme.tick_label(-age, RECENT_STEPS), (self._x(age), rect.bottom + 11), theme.MUTED, align=0.5)
-        title = _axis_title(state_labels(self._plant)[0], self._plant.state_units[0])
+        title = _axis_title(self._plant.state_names[0], self._plant.state_units[0])
         _draw_titles(canvas, rect, "time [steps]", title)
 
     def draw(self, canvas: Canvas, frame: FrameRecord) -> None:

@@ -132,7 +132,7 @@ def test_oblique_limits_are_drawn_as_they_are():
     assert colors == [theme.PAPER, theme.PAPER, theme.DANGER_FILL, theme.DANGER_FILL]
 
 
-def test_around_an_operating_point_names_say_that_deviations_are_drawn(monkeypatch):
+def test_numbers_around_an_operating_point_are_absolute(monkeypatch):
     common = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "gamma": 1e-4}
     limits = {"state_limits": ([0.2, -3.0], [2.0, 1.0]), "operating_state": [1.1587, -0.5]}
     limits |= {"input_limits": (0.0, 1.0), "operating_input": [0.25]}
@@ -145,11 +145,10 @@ def test_around_an_operating_point_names_say_that_deviations_are_drawn(monkeypat
         return draw(canvas, words, *place, **style)
 
     monkeypatch.setattr(Canvas, "text", text)
-    env.reset(seed=0)
+    env.reset(seed=0, options={"state": [0.1, 0.25]})
     env.render()
-    assert {"level - 1.159", "heat + 0.5", "level - 1.159 [m]", "pump - 0.25"} <= set(written)
-    assert not {"level", "heat", "level [m]", "pump"} & set(written)
-    assert {"\N{MINUS SIGN}0.959", "0.841"} <= set(written)  # 0.2 and 2 m
+    assert {"level", "+1.259 m", "heat", "\N{MINUS SIGN}0.25", "pump", "+0.250"} <= set(written)
+    assert {"level [m]", "0.2", "1.1", "2", "heat", "\N{MINUS SIGN}3", "\N{MINUS SIGN}1", "1"} <= set(written)
 
 
 @pytest.mark.parametrize(
