@@ -35,9 +35,12 @@ def read_record(path: str | os.PathLike[str], period: float | None, step: float,
     """
     try:
         text = _decoded(read_file(path, LARGEST_LOG))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ValueError(f"cannot read packets from {shown(path)}: {reason}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"cannot read packets from {shown(path)}: it is no text; export a capture as CSV, a row for each packet"
+        ) from error
+    except OSError as error:
+        raise ValueError(f"cannot read packets from {shown(path)}: {error.strerror or error}") from error
     if text.count("\n") > MOST_LINES:
         raise ValueError(f"{shown(path)} has more than {MOST_LINES:,} lines, a log of packets has at most so many")
     try:

@@ -549,7 +549,7 @@ def test_span_and_number_of_packets_that_disagree_are_named(written):
         ('{"pings": []}', "JSON with 'pings'"),
         ('{"round_trips": [{}]}', "round trip 0 of irtt"),
         ("{", "no JSON"),
-        (b"\x1f\x8b\x08", "cannot read packets"),
+        (b"\x1f\x8b\x08", "it is no text; export a capture as CSV"),
         ("sent,received\n0,1\n" + 70 * "1" + ",2\n", "line 3"),
         (f"{LINUX}{2000 * 'x'} icmp_seq=1\n", "line 2 is longer"),
         *((text, "at least two packets") for text in ("", "\n\n", "sent,received\n0.0,0.1\n")),
