@@ -177,9 +177,9 @@ def linear_model(
         )
     if isinstance(moving, FunctionProcess) and _rests_at_operating_point(moving, frame, region, drawn):
         warn_caller(
-            "the function is nearly at rest at operating_state with operating_input, as one of absolute values, and "
-            "not what it is near zero: if it takes absolute values, give lambda x, u: f(x0 + x, u0 + u) - x0, one of "
-            "deviations",
+            "the function seems to take absolute values: it is nearly at rest at operating_state with operating_input, "
+            "and does something else there than near zero. It has to take deviations: if it takes absolute values, "
+            "give lambda x, u: f(x0 + x, u0 + u) - x0",
             NoEquilibriumWarning,
         )
     return plant

@@ -446,8 +446,8 @@ class SafeLoop(CopiedWhole):
         """Warns once of every reason for which packets were discarded in this call."""
         oldest = self._estimator.channel.longest_delay
         texts = {
-            "too_late": f"it came later than the {counted(oldest, 'step')} that the channel of this loop delays "
-            "any; give SafeLoop the channel with its longest delay",
+            "too_late": f"it came later than {counted(oldest, 'step')}, the longest delay of the channel of this "
+            "loop; give SafeLoop the channel with its longest delay",
             "ahead": f"its stamp is ahead of the loop, which is at step {self.steps}; stamp samples with the number of "
             "their control step, counted from 0 at start (loop.steps), by one clock for both",
             "other_episode": f"its episode is not that of the loop, {self.episode}; send "
