@@ -3,7 +3,7 @@
 None of them comes with a proof under estimation errors, so none reports `shield_guaranteed`.
 """
 
-from experiments.baselines.controllers import CONTROLLERS, REGULATORS, RegulatorWeights, controller
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, RegulatorWeights, controller, why_aimless
 from experiments.baselines.filters import FILTERS, MARGINS, EstimateFilter, EstimateFilterSettings
 from experiments.baselines.tuned import tuned_training, tuned_weights
 
@@ -18,4 +18,5 @@ __all__ = [
     "controller",
     "tuned_training",
     "tuned_weights",
+    "why_aimless",
 ]

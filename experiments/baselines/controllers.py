@@ -19,8 +19,9 @@ from scipy.sparse import bmat, csc_matrix
 
 from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
-from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
+from ncs_gym import LinearPlant, NCSEnv, Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.plants.lqr import lqr_gain
+from ncs_gym.validation import warn_caller
 from shields.certificate import Fallback
 from shields.runtime.rows_within_step import closed, rows_within_step
 
@@ -351,6 +352,23 @@ CONTROLLERS: dict[str, Callable[[NCSEnv, Fallback, int], Inputs]] = {
 """The policies by name, made from an environment, the certificate's fallback and a seed."""
 
 
+# Those that pursue what the task asks for, as far as they know it; the others ask for nothing.
+PURSUING = ("greedy", "proportional", *REGULATORS)
+
+
+def why_aimless(name: str, task: Task) -> str:
+    """Returns why a controller cannot pursue what a task asks for, an empty string if it can.
+
+    What a task of your own asks for nobody but its reward knows.
+    """
+    if name not in PURSUING or isinstance(task, Regulation | SpeedTracking | SetpointTracking):
+        return ""
+    return (
+        f"{name} does not know what a {type(task).__name__} asks for: it pursues Regulation, SpeedTracking and "
+        "SetpointTracking"
+    )
+
+
 def controller(
     name: str, env: NCSEnv, fallback: Fallback, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS
 ) -> Policy:
@@ -362,7 +380,17 @@ def controller(
         fallback: A certificate's: u = u_c + K (x_hat - x_c), K x_hat around the operating point.
         seed: Seed of the random policy.
         weights: Weights of the regulators.
+
+    Warns:
+        UserWarning: If "greedy" brings states to rest, since it does not know what the task asks for.
+
+    Raises:
+        ValueError: If another controller does not know it.
     """
+    if problem := why_aimless(name, env.task):
+        if name != "greedy":
+            raise ValueError(problem)
+        warn_caller(f"{problem}; here it brings the state to the operating point", UserWarning)
     make, plant = REGULATORS.get(name), env.plant
     inputs = CONTROLLERS[name](env, fallback, seed) if make is None else make(env, weights)
 

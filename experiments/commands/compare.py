@@ -21,19 +21,20 @@ from experiments.analysis.episodes import (
 )
 from experiments.analysis.statistics import gaussian_sentences, gaussian_summary
 from experiments.backends.execution import results_of
+from experiments.baselines import why_aimless
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, run_of_arm
-from experiments.runs.loops import certificate_of, loop_config
+from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import experiment_provenance
 from experiments.runs.training_run import TrainingRun, require_trainable
 from experiments.settings import CompareSettings
 from experiments.settings.arguments import id_alone
-from experiments.terminal import wrapped
+from experiments.terminal import say, wrapped
 from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
@@ -106,8 +107,17 @@ def shortened(settings: CompareSettings) -> CompareSettings:
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
-    """Returns the settings with the full names of arms, each of which is listed once."""
+    """Returns the settings with the full names of arms, each of which is listed once.
+
+    Of the usual baselines those that do not know what the task asks for are left out.
+    """
     arms, baselines = (full_names(names, settings.mode) for names in (settings.arms, settings.baselines))
+    if settings.baselines == type(settings).baselines:
+        task = registered_env(settings.env).task
+        reasons = {name: why_aimless(Arm.of(name, settings.mode).policy, task) for name in baselines}
+        baselines = tuple(name for name, reason in reasons.items() if not reason)
+        if aimless := [name for name, reason in reasons.items() if reason]:
+            say(f"without {', '.join(aimless)}: {reasons[aimless[0]]}")
     if len(set(arms)) != len(arms) or not arms:
         raise ValueError(f"--arms must be arms that differ, at least one, got {' '.join(settings.arms) or 'none'}")
     baselines = tuple(name for name in dict.fromkeys(baselines) if name not in arms)

@@ -10,8 +10,15 @@ from functools import cache
 from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import with_changes
 from agents.loop import BasePolicy, LoopConfig, ShieldSettings
-from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS, EstimateFilterSettings, tuned_training
-from experiments.runs.loops import other_scenarios, under
+from experiments.baselines import (
+    CONTROLLERS,
+    FILTERS,
+    REGULATORS,
+    EstimateFilterSettings,
+    tuned_training,
+    why_aimless,
+)
+from experiments.runs.loops import other_scenarios, registered_env, under
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.training_run import RunResult, TrainingRun, require_trainable
 from experiments.settings import LearningSettings
@@ -222,6 +229,8 @@ def run_of_arm(
         agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
     training_loop, loop = arm.loops(loop, certificate, settings)
     if index == 0:  # what cannot be made is refused before anything is trained
+        if problem := why_aimless(arm.policy, registered_env(loop.env).task):
+            raise ValueError(f"arm {arm.name}: {problem}")
         if arm.is_trained:
             require_trainable(settings, training_loop)
         if arm.mode in FILTERS:

@@ -9,7 +9,7 @@ import pytest
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
 from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
-from ncs_gym import Channel, LinearPlant, NCSEnv, SetpointTracking
+from ncs_gym import Channel, LinearPlant, NCSEnv, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
 
@@ -28,6 +28,30 @@ def settled(env, name, K, target, steps=600):
         u = env.plant.u_max * policy(observation, {"estimate": x[None]})[0]
         x = env.plant.A @ x + env.plant.B @ u
     return x, u
+
+
+class Own(Regulation):
+    """A task of the library, which its controllers know."""
+
+
+class Other(Task):
+    """Pays for going far, which nobody but its reward knows."""
+
+    def reward(self, plant, task_state, state, u):
+        return float(abs(state[0]))
+
+
+def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for():
+    own, other = (NCSEnv(plant=env_of("ncs_gym/CartPole-v0").plant, task=task) for task in (Own(), Other()))
+    rests = Fallback.of_gain(np.zeros((1, 4)))
+    for name in ("lqr", "governor", "mpc", "governor:10", "proportional"):
+        controller(name, own, rests, 0)
+        with pytest.raises(ValueError, match=f"{name} does not know what a Other asks for"):
+            controller(name, other, rests, 0)
+    with pytest.warns(UserWarning, match="a Other asks for.* brings the state to the operating point"):
+        controller("greedy", other, rests, 0)
+    for name in ("zero input", "K x_hat", "random"):
+        controller(name, other, rests, 0)
 
 
 @pytest.mark.parametrize("env_id", SETPOINTS)

@@ -41,11 +41,25 @@ register_plant("Plants/Tank-v0", plant, channel=channel, contract=contract_of(ch
 """
 
 
+TASK = """
+from ncs_gym import Channel, Task, register_plant, truck_trailer
+
+
+class Far(Task):
+    def reward(self, plant, task_state, state, u):
+        return float(abs(state[0]))
+
+
+register_plant("Plants/Far-v0", truck_trailer(mass=2000.0), channel=Channel(loss=0.2), task=Far(), max_episode_steps=20)
+"""
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with modules that register a plant each; neither they nor the ids outlive the test."""
     (tmp_path / "own_plants.py").write_text(MODULE)
     (tmp_path / "own_tank.py").write_text(TANK)
+    (tmp_path / "own_task.py").write_text(TASK)
     monkeypatch.setattr(sys, "path", list(sys.path))
     yield tmp_path
     for module, env_id in {"own_plants": "Plants/Truck-v0", "own_tank": "Plants/Tank-v0"}.items():
@@ -54,6 +68,17 @@ def folder(tmp_path, monkeypatch):
 
 
 ENV = ("--env", "own_plants:Plants/Truck-v0")
+
+
+def test_baselines_that_do_not_know_what_an_own_task_asks_for_are_left_out_or_refused(folder):
+    env = ("compare", "--env", "own_task:Plants/Far-v0", "--seeds", "1", "--episodes", "2")
+    run = succeeded(*env, "--arms", "random", cwd=folder)
+    rows = [line.split("  ")[0].strip() for line in run.stdout.splitlines()]
+    assert {"random", "K x_hat", "zero input", "untrained"} <= set(rows)
+    assert "proportional" not in run.stdout
+    assert "without proportional, proportional+trusting, proportional+shielded: " in " ".join(run.stderr.split())
+    refused = ncs(*env, "--arms", "lqr+shielded", "--baselines", "random", "--out", "refused", cwd=folder)
+    assert_one_sentence(refused, "arm lqr+shielded: lqr does not know what a Far asks for")
 
 
 def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
