@@ -23,6 +23,8 @@ _Other = tuple[float | None, float, float | None, int | None]
 # Name and values of an axis.
 _Side = tuple[str, Sequence[Any]]
 _SIDE_LABELS = {"delay": "delay [steps]", "downlink_loss": "loss of commands"}
+# Letters of a title above an inch of a panel.
+_LETTERS_PER_INCH = 11
 # Largest number of panels side by side.
 _COLUMNS, _COLUMNS_OF_NETWORKS = 4, 3
 # A color scale without a fixed start spans at least this fraction of the largest value: near ones look alike.
@@ -77,10 +79,11 @@ def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Q
     side = "delay" if all(cell.get("downlink_loss") is None for cell in cells) else "downlink_loss"
     losses, values = (sorted({cell[each] for cell in cells}) for each in ("loss", side))
     others = list(dict.fromkeys(_other(cell, side) for cell in cells))
+    varied = [len(set(values)) > 1 for values in zip(*others, strict=True)]
     panels = {}
     for other in others:
         for arm in arms:
-            panel = panels[_title(arm, other, len(others) > 1)] = np.full((len(values), len(losses)), np.nan)
+            panel = panels[_title(arm, other, varied)] = np.full((len(values), len(losses)), np.nan)
             for cell in cells:
                 if _other(cell, side) == other:
                     number = quantity.factor * cell["arms"][arm][quantity.key]
@@ -95,7 +98,7 @@ def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Q
     caption = f"{quantity.caption} {counted(runs, 'run')} per field."
     if quantity.of_shields and "monitor" in arms:
         caption += " The monitor's are what the shield would have overridden."
-    if len(others) == 1 and cells[0]["burst_length"]:
+    if not varied[1] and cells[0]["burst_length"]:
         caption += f" Losses come in bursts of {cells[0]['burst_length']:g} packets on average."
     caption = " ".join(filter(None, (caption, losses_text(cells))))
     across = -(-len(arms) // -(-len(arms) // _COLUMNS))
@@ -149,7 +152,12 @@ def _maps(
     """Returns a figure with a map per panel, `across` of them side by side, and its axes by title."""
     down = -(-len(panels) // across)
     width = 1.8 + max(0.66 * len(columns[1]) + 0.3, 1.9) * across
-    height = max(0.8 + max(0.46 * len(rows[1]) + 0.6, 1.3) * down, 2.8)
+    letters = int(_LETTERS_PER_INCH * (width - 1.8) / across)
+    titles = {
+        name: name if max(map(len, name.split("\n"))) <= letters else name.replace(", ", ",\n") for name in panels
+    }
+    further = max(0, max(title.count("\n") for title in titles.values()) - 1)  # lines of titles beyond two
+    height = max(0.8 + max(0.46 * len(rows[1]) + 0.6 + 0.2 * further, 1.3) * down, 2.8)
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         figure = CaptionedFigure((width, height), caption)
         axes = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
@@ -161,7 +169,7 @@ def _maps(
             lowest = at + across >= len(panels)
             axis.tick_params(length=0, labelbottom=lowest)
             axis.spines[:].set_visible(False)
-            label(axis, columns[0] if lowest else "", rows[0] if at % across == 0 else "", title)
+            label(axis, columns[0] if lowest else "", rows[0] if at % across == 0 else "", titles[title])
         for axis in axes.flat[len(panels) :]:
             axis.set_visible(False)
         figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=fill(quantity, 30), format=thousands)
@@ -193,14 +201,17 @@ def _other(cell: dict[str, Any], side: str) -> _Other:
     return cell["quantization_step"], cell["burst_length"], cell.get("mass_factor"), delay
 
 
-def _title(arm: str, other: _Other, several: bool) -> str:
+def _title(arm: str, other: _Other, varied: Sequence[bool]) -> str:
+    """Returns the name of an arm, and below it what differs between its panels."""
     quantization, burst, mass, delay = other
-    if not several:
-        return arm
-    losses = f"bursts of {burst:g}" if burst else "independent losses"
-    late = "" if delay is None else f"delay {delay}, "
-    factor = "" if mass is None else f", {mass:g} times the mass"
-    return f"{arm}\n{late}{'' if quantization is None else f'quantization {quantization:g}, '}{losses}{factor}"
+    own = "own" if quantization is None else f"{quantization:g}"
+    texts = (
+        f"quantization {own}",
+        f"bursts of {burst:g}" if burst else "independent losses",
+        "the own mass" if mass is None else f"{mass:g} times the mass",
+        f"delay {delay}",
+    )
+    return f"{arm}\n{', '.join(text for text, differs in zip(texts, varied, strict=True) if differs)}".strip()
 
 
 def _shown(value: Any) -> str:

@@ -82,7 +82,7 @@ def test_small_rates_have_another_digit():
 def test_quantization_steps_and_bursts_have_panels_of_their_own():
     grid = cells(["unshielded", "shielded"], roundings=(0.05, 0.1), bursts=(0.0, 3.0))
     shown = panels(sweep_map(grid, ["unshielded", "shielded"], QUANTITIES["return"]))
-    titles = [axis.get_title() for axis in shown]
+    titles = [axis.get_title().replace(",\n", ", ") for axis in shown]
     assert len(titles) == len(set(titles)) == 8
     assert "shielded\nquantization 0.1, bursts of 3" in titles
     assert "shielded\nquantization 0.1, independent losses" in titles
