@@ -213,7 +213,7 @@ class AppliedActionBuffer(ReplayBuffer):
         if applied.shape != action.shape:
             raise ValueError(
                 f'"{APPLIED}" has the shape {applied.shape}, actions have {action.shape}: a wrapper adds entries to '
-                "them, which the buffer cannot store"
+                "them or makes them discrete, which the buffer cannot store"
             )
         passed = np.array([not info.get("shield_intervened", False) for info in infos])
         if not np.allclose(applied[passed], action[passed].clip(-1.0, 1.0), atol=_SAME_ACTION):
