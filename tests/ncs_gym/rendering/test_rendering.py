@@ -1,6 +1,7 @@
 """Pictures: what they show is looked for in their pixels, drawn from the data of a frame."""
 
 import copy
+import itertools
 import pickle
 import subprocess
 import sys
@@ -160,6 +161,24 @@ def test_numbers_around_an_operating_point_are_absolute(monkeypatch):
 )
 def test_numbers_of_an_axis_have_the_digits_of_its_longest_one(value, half, text):
     assert theme.tick_label(value, half) == text.replace("-", "\N{MINUS SIGN}")
+
+
+def test_long_names_keep_the_ends_that_tell_them_apart_and_hidden_inputs_are_counted(monkeypatch):
+    common = {"A": 0.5 * np.eye(8), "B": np.eye(8)[:, :5], "dt": 1.0, "box": np.ones(8), "u_max": 1.0, "gamma": 1e-4}
+    names = [f"temperature of zone {zone}" for zone in range(8)]
+    written, draw = [], Canvas.text
+
+    def text(canvas, words, *place, **style):
+        written.append(words)
+        return draw(canvas, words, *place, **style)
+
+    monkeypatch.setattr(Canvas, "text", text)
+    env = make("ncs_gym/LinearNCS-v0", plant=LinearPlant(**common, state_names=names))
+    env.reset(seed=0)
+    pixels, spacing = env.render(), 28
+    rows = [part_of(pixels, theme.Rect(16, theme.PACKET_LINE + 22 + spacing * row, 95, 24)) for row in range(4)]
+    assert all((one != other).any() for one, other in itertools.pairwise(rows))
+    assert "and 2 more inputs" in written
 
 
 def test_truck_stretches_its_coupling_which_turns_red_near_its_limit_and_its_estimate_is_dashed():
