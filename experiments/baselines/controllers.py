@@ -352,6 +352,8 @@ CONTROLLERS: dict[str, Callable[[NCSEnv, Fallback, int], Inputs]] = {
 """The policies by name, made from an environment, the certificate's fallback and a seed."""
 
 
+# Tasks whose reward and observations controllers know.
+_PURSUED = Regulation, SpeedTracking, SetpointTracking
 # Those that pursue what the task asks for, as far as they know it; the others ask for nothing.
 PURSUING = ("greedy", "proportional", *REGULATORS)
 
@@ -359,9 +361,10 @@ PURSUING = ("greedy", "proportional", *REGULATORS)
 def why_aimless(name: str, task: Task) -> str:
     """Returns why a controller cannot pursue what a task asks for, an empty string if it can.
 
-    What a task of your own asks for nobody but its reward knows.
+    What another reward asks for nobody knows, nor what other observations are; a profile of targets may be your own.
     """
-    if name not in PURSUING or isinstance(task, Regulation | SpeedTracking | SetpointTracking):
+    own = type(task).reward, type(task).observe
+    if name not in PURSUING or any(own == (kind.reward, kind.observe) for kind in _PURSUED):
         return ""
     return (
         f"{name} does not know what a {type(task).__name__} asks for: it pursues Regulation, SpeedTracking and "

@@ -22,15 +22,16 @@ from experiments.plots.figure_style import (
     ArmStyle,
     CaptionedFigure,
     draw_estimate,
+    input_labels,
     label,
     legend_below,
+    state_labels,
     thousands,
     with_unit,
 )
 from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.training_run import RunResult
 from ncs_gym import LinearPlant
-from ncs_gym.plants.description import input_labels, state_labels
 from shields import Certificate
 
 _INK = "#222222"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.runs.arms import Arm
+from ncs_gym import LinearPlant
 
 # Keys of matplotlib's settings are a type of their own, which plain text is not.
 STYLE: dict[Any, Any] = {
@@ -62,6 +64,23 @@ class CaptionedFigure(Figure):
 def with_unit(name: str, unit: str) -> str:
     """Returns an axis label; some plants have no units."""
     return f"{name} [{unit}]".replace("^2", _SQUARED) if unit else name
+
+
+def state_labels(plant: LinearPlant) -> tuple[str, ...]:
+    """Returns what the entries of a state are, for axes: names, less the operating point, as "level - 1.16"."""
+    return _labels(plant.state_names, plant.operating_state)
+
+
+def input_labels(plant: LinearPlant) -> tuple[str, ...]:
+    """Returns what the entries of an input are, for axes: names, less the operating point."""
+    return _labels(plant.input_names, plant.operating_input)
+
+
+def _labels(names: Sequence[str], center: np.ndarray) -> tuple[str, ...]:
+    return tuple(
+        f"{name} {'+' if value < 0.0 else '-'} {abs(value):.4g}" if value else name
+        for name, value in zip(names, center.tolist(), strict=True)
+    )
 
 
 def label(axis: Axes, x: str, y: str, title: str = "") -> None:

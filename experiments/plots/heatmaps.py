@@ -204,11 +204,10 @@ def _other(cell: dict[str, Any], side: str) -> _Other:
 def _title(arm: str, other: _Other, varied: Sequence[bool]) -> str:
     """Returns the name of an arm, and below it what differs between its panels."""
     quantization, burst, mass, delay = other
-    own = "own" if quantization is None else f"{quantization:g}"
     texts = (
-        f"quantization {own}",
+        "own quantization" if quantization is None else f"quantization {quantization:g}",
         f"bursts of {burst:g}" if burst else "independent losses",
-        "the own mass" if mass is None else f"{mass:g} times the mass",
+        "own mass" if mass is None else f"{mass:g} times the mass",
         f"delay {delay}",
     )
     return f"{arm}\n{', '.join(text for text, differs in zip(texts, varied, strict=True) if differs)}".strip()

@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.network_loop.log import rows_of
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, with_unit
+from experiments.plots.figure_style import STYLE, CaptionedFigure, input_labels, label, state_labels, with_unit
 from ncs_gym import LinearPlant
-from ncs_gym.plants.description import input_labels, state_labels
 
 
 def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFigure:

@@ -176,7 +176,7 @@ class Observer:
                 f"{bounds}: it must return the largest absolute value of each"
             )
         within = np.minimum(np.maximum(entries, self._low), self._high)
-        if not self._has_warned and within.tobytes() != entries.tobytes():  # the quickest way to look
+        if not self._has_warned and np.count_nonzero(within != entries):
             own_entries = slice(len(known.estimate), len(known.estimate) + len(own))
             beyond = np.argwhere(within[own_entries] != entries[own_entries])
             if len(beyond):

@@ -133,23 +133,6 @@ def _deviation(plant: LinearPlant, i: int) -> str:
     return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
 
 
-def state_labels(plant: LinearPlant) -> tuple[str, ...]:
-    """Returns what the entries of a state are, for axes: names, less the operating point, as "level - 1.16"."""
-    return _labels(plant.state_names, plant.operating_state)
-
-
-def input_labels(plant: LinearPlant) -> tuple[str, ...]:
-    """Returns what the entries of an input are, for axes: names, less the operating point."""
-    return _labels(plant.input_names, plant.operating_input)
-
-
-def _labels(names: Sequence[str], center: np.ndarray) -> tuple[str, ...]:
-    return tuple(
-        f"{name} {'+' if value < 0.0 else '-'} {abs(value):.4g}" if value else name
-        for name, value in zip(names, center.tolist(), strict=True)
-    )
-
-
 def outputs_of(plant: LinearPlant) -> tuple[list[str], list[str]]:
     """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
     names, units = [], []

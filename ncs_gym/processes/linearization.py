@@ -49,19 +49,21 @@ NEARLY_AT_REST = 0.01
 DIGITS = 9
 
 
-# Arguments of `LinearPlant` that say where states and inputs may be.
-_OF_FRAME = (
-    *("state_limits", "input_limits", "output_limits", "box_ends", "input_ends", "operating_state", "operating_input"),
-)
+# Arguments of `LinearPlant` for the point that deviations are counted from, and for where states and inputs may be.
+_POINT = "operating_state", "operating_input"
+_OF_FRAME = "state_limits", "input_limits", "output_limits", "box_ends", "input_ends", *_POINT
 
 
 class _Region(NamedTuple):
-    """Where the remainder is bounded: low <= (x, u) <= high in deviations, middle +- half, shape (n + m,) each."""
+    """Where the remainder is bounded: low <= (x, u) <= high in deviations, shape (n + m,) each."""
 
     low: np.ndarray
     high: np.ndarray
-    middle: np.ndarray
-    half: np.ndarray
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half the range, shape (n + m,)."""
+        return 0.5 * (self.high - self.low)
 
     @classmethod
     def of(cls, frame: LinearPlant) -> _Region:
@@ -77,7 +79,7 @@ class _Region(NamedTuple):
                 f"the remainder is bounded over limits of every state, and state {first} has no two finite ones: give "
                 "it generous limits"
             )
-        return cls(low, high, 0.5 * (low + high), 0.5 * (high - low))
+        return cls(low, high)
 
 
 class _Steps(NamedTuple):
@@ -111,16 +113,16 @@ def linear_model(
     Args:
         process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
             f(0, 0) = 0.
-        box: Half-widths of the safe box, shape (n,), or other limits of states as of `LinearPlant`: then give
-            `state_limits` (absolute, around `operating_state`). Every state needs two finite ends.
-        u_max: Input limits, a number for one input or shape (m,); or give `input_limits`.
+        box: Half-widths of the safe box, shape (n,), where limits are symmetric; otherwise give `state_limits`. Every
+            state needs two finite ends.
+        u_max: Input limits, a number for one input or shape (m,), where they are symmetric; otherwise `input_limits`.
         dt: Duration of a step [s].
         jacobian_bounds: Smallest and largest values of [df/dx, df/du] within the limits, two arrays (n, n + m).
         samples: Number of steps that are sampled.
         safety_factor: Of a sampled bound, >= 1.
         seed: Seed of the samples.
-        settings: Other arguments of `LinearPlant`. A and B, given together, are taken in place of fitted ones; a
-            disturbance is declared beside the remainder.
+        settings: Other arguments of `LinearPlant`, limits around an operating point as well. A and B, given together,
+            are taken in place of fitted ones; a disturbance is declared beside the remainder.
 
     Warns:
         NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far and the nearest point that stays; or a
@@ -136,7 +138,7 @@ def linear_model(
     moving = process if isinstance(process, Process) else FunctionProcess(process)
     limits = {"box": None if box is None else as_vector(box, None, "box"), "u_max": u_max, "dt": dt}
     frame = _frame(limits | {name: settings[name] for name in _OF_FRAME if name in settings})
-    region = _Region.of(frame)
+    region, point = _Region.of(frame), {name: getattr(frame, name) for name in _POINT}
     given = {
         name: as_matrix(settings.pop(name), getattr(frame, name).shape, name) for name in ("A", "B") if name in settings
     }
@@ -170,7 +172,7 @@ def linear_model(
         )
     remainder = Remainder(bound, jacobian_bounds is not None, basis)
     plant = LinearPlant(**limits | {"A": A, "B": B, "remainder": remainder} | settings)
-    if not np.array_equal(plant.operating_state[: frame.n], frame.operating_state):
+    if any(not np.array_equal(getattr(plant, name)[: len(at)], at) for name, at in point.items()):
         raise ValueError(
             "the remainder was bounded around the operating point that was given, from which the middle of "
             "disturbance_bound moves: give symmetric ends, and let the process hold the middle"
@@ -288,10 +290,11 @@ def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
 
 def _sampled(moving: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator) -> _Steps:
     """Returns steps from random points of the region; half of them have coordinates on its boundary."""
-    low, high, middle, half = (side[:, None] for side in region)
-    points = rng.uniform(-1.0, 1.0, (len(half), count))
+    low, high = (side[:, None] for side in region)
+    points = rng.uniform(-1.0, 1.0, (len(low), count))
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
-    points = np.where(at_end, np.where(points < 0.0, low, high), np.clip(middle + half * points, low, high))
+    inside = np.clip(0.5 * (low + high) + 0.5 * (high - low) * points, low, high)
+    points = np.where(at_end, np.where(points < 0.0, low, high), inside)
     states, inputs = points[: frame.n], points[frame.n :]
     return _Steps(states, inputs, _moved(moving, frame, states, inputs, rng))
 

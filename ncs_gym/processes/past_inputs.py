@@ -8,16 +8,20 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.past_inputs import inputs_under_way, without_past_inputs
-from ncs_gym.processes.process import Process
+from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process
 
 
 def opened_for(process: Process, plant: LinearPlant, size: int | None) -> Process:
-    """Returns what moves in one environment (None) or in `size`: the past inputs of a plant are kept beside a process.
+    """Returns what moves in one environment (None) or in `size`, all states of the plant.
+
+    Its own equations do so by themselves; beside any other process its past inputs are kept.
 
     Raises:
         ValueError: If the process does not fit the plant.
     """
-    return _BesidePastInputs(process, plant, size) if inputs_under_way(plant) else process.opened(plant, size)
+    if isinstance(process, LinearProcess | FamilyProcess) or not inputs_under_way(plant):
+        return process.opened(plant, size)
+    return _BesidePastInputs(process, plant, size)
 
 
 class _BesidePastInputs(Process):

@@ -9,13 +9,11 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.past_inputs import opened_for
-from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
+from ncs_gym.processes.process import LinearProcess, Process, own_process
 from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import guarded, read_only
 
-# Processes that move all states of the plant: its own equations.
-OWN = LinearProcess, FamilyProcess
 # Noise is drawn for about this many environment steps at once, for this many steps of one environment at most.
 BLOCK_SIZE, LONGEST_BLOCK = 4096, 256
 
@@ -80,8 +78,7 @@ class PlantSimulation:
         process: Process | None = None,
     ) -> None:
         given = own_process(plant) if process is None else process
-        self._is_linear = isinstance(given, LinearProcess)
-        self.process = given.opened(plant, size) if isinstance(given, OWN) else opened_for(given, plant, size)
+        self.process, self._is_linear = opened_for(given, plant, size), isinstance(given, LinearProcess)
         self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
         self.disturbance, self.size = disturbance, size
         self._truncated, self._is_extreme = noise != "gaussian", noise == "extreme"

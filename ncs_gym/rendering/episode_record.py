@@ -11,7 +11,6 @@ import numpy as np
 
 from ncs_gym.network.channel import Packet
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.description import state_labels
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
@@ -270,7 +269,9 @@ def _tracked_output(task: Task, plant: LinearPlant, task_state: Any, state: np.n
     if isinstance(task, SetpointTracking):
         used, name, unit = np.flatnonzero(task.output), "output", ""
         if len(used) == 1:
-            name, unit = state_labels(plant)[int(used[0])], plant.state_units[int(used[0])]
-        value, target = float(task.output @ state), float(task.target(task_state))
-        return TrackedOutput(name=name, unit=unit, value=value, target=target, low=-task.reach, high=task.reach)
+            name, unit = plant.state_names[int(used[0])], plant.state_units[int(used[0])]
+        center = float(task.output @ plant.operating_state)
+        value, target = center + float(task.output @ state), center + float(task.target(task_state))
+        ends = {"low": center - task.reach, "high": center + task.reach}
+        return TrackedOutput(name=name, unit=unit, value=value, target=target, **ends)
     return None

@@ -175,9 +175,9 @@ def _draw_tracked_output(canvas: Canvas, frame: FrameRecord, y: float) -> None:
     assert tracked is not None
     low, high = tracked.low, tracked.high
     limit = max(abs(low), abs(high))
-    numbers = [
-        theme.value_label(value, limit) if low < 0.0 else f"{value:.1f}" for value in (tracked.value, tracked.target)
-    ]
+    numbers = [theme.value_label(value, limit) for value in (tracked.value, tracked.target)]
+    if low >= 0.0:
+        numbers = [number.removeprefix("+") for number in numbers]
     text = f"{numbers[0]} \N{RIGHTWARDS ARROW} {numbers[1]} {theme.unit_label(tracked.unit)}".strip()
     bar = _draw_row(canvas, y, f"{tracked.name}, target", text, theme.SAFE)
 

@@ -83,8 +83,7 @@ def tick_label(value: float, half: float) -> str:
     """Returns a number for an axis of this half range: three digits of the longest one and a true minus sign."""
     text = f"{value:.3g}" if abs(value) >= 1e-12 else "0"
     if 1e-4 <= half < 1e5:
-        text = f"{value:.{max(2 - int(np.floor(np.log10(half))), 1)}f}".rstrip("0").rstrip(".")
-        text = "0" if text in ("-0", "") else text
+        text = f"{value:z.{max(2 - int(np.floor(np.log10(half))), 1)}f}".rstrip("0").rstrip(".")
     return text.replace("-", "\N{MINUS SIGN}")
 
 

@@ -30,8 +30,11 @@ def settled(env, name, K, target, steps=600):
     return x, u
 
 
-class Own(Regulation):
-    """A task of the library, which its controllers know."""
+class Own(SetpointTracking):
+    """A profile of targets of one's own, for the reward that controllers know."""
+
+    def advance(self, rng, plant, task_state, u):
+        return -task_state
 
 
 class Other(Task):
@@ -41,13 +44,23 @@ class Other(Task):
         return float(abs(state[0]))
 
 
+class Refined(Regulation):
+    """Pays for something else than what it is derived from."""
+
+    def reward(self, plant, task_state, state, u):
+        return float(abs(state[0]))
+
+
 def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for():
-    own, other = (NCSEnv(plant=env_of("ncs_gym/CartPole-v0").plant, task=task) for task in (Own(), Other()))
+    plant, target = env_of("ncs_gym/CartPole-v0").plant, Own(output=np.eye(4)[0], reach=0.1, width=0.1)
+    own, other, refined = (NCSEnv(plant=plant, task=task) for task in (target, Other(), Refined()))
     rests = Fallback.of_gain(np.zeros((1, 4)))
     for name in ("lqr", "governor", "mpc", "governor:10", "proportional"):
         controller(name, own, rests, 0)
         with pytest.raises(ValueError, match=f"{name} does not know what a Other asks for"):
             controller(name, other, rests, 0)
+        with pytest.raises(ValueError, match=f"{name} does not know what a Refined asks for"):
+            controller(name, refined, rests, 0)
     with pytest.warns(UserWarning, match="a Other asks for.* brings the state to the operating point"):
         controller("greedy", other, rests, 0)
     for name in ("zero input", "K x_hat", "random"):

@@ -223,6 +223,11 @@ def test_disturbance_that_moves_the_operating_point_is_refused():
     disturbed = TANK | {"disturbance_bound": ([[1.0]], [0.0], [0.004])}
     with pytest.warns(MovedOperatingPointWarning), pytest.raises(ValueError, match="give symmetric ends"):
         linear_model(tank, **disturbed)
+    # Of a tank without an outflow of its own the input alone moves.
+    integrating = {"A": [[1.0]], "B": [[0.2]], "operating_input": 0.5} | disturbed | {"operating_input": 0.5}
+    with pytest.warns(MovedOperatingPointWarning) as told, pytest.raises(ValueError, match="give symmetric ends"):
+        linear_model(lambda x, u: x + 0.2 * u - 0.01 * x * u, **integrating)
+    assert f"the state {[LEVEL]} and the input [0.49]" in str(told[0].message)
 
 
 def test_inner_environment_is_modeled_like_its_equations():
