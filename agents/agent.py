@@ -223,7 +223,8 @@ def require_kept(kwargs: Mapping[str, Any], env_id: str) -> None:
     for name, value in kwargs.items():
         try:
             json.dumps(value, allow_nan=False)
-            is_kept = name in _KEPT
+            # A plant is kept whole: what was downloaded names no file to read.
+            is_kept = name in _KEPT and not (name == "plant" and isinstance(value, str))
         except (TypeError, ValueError):
             is_kept = False
         if not is_kept:
@@ -388,8 +389,9 @@ _ENTRIES = {
 }
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {
-    *("task", "disturbance", "noise", "initial_set", "terminate_on_violation", "allow_assumption_violation", "process"),
-    *("contract", "downlink", "downlink_contract", "observe", "horizon", "between_samples", "max_episode_steps"),
+    *("plant", "task", "disturbance", "noise", "initial_set", "terminate_on_violation", "allow_assumption_violation"),
+    *("process", "contract", "downlink", "downlink_contract", "observe", "horizon", "between_samples"),
+    "max_episode_steps",
 }
 _PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 _USE = """## Use
@@ -413,11 +415,13 @@ def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | 
     """Returns the card of an agent, in Markdown, as `Agent.save` explains."""
     env = gym.make(agent.env, **agent.kwargs).unwrapped
     plant, channel = getattr(env, "plant", None), agent.channel or getattr(env, "channel", None)
+    others = {name: value for name, value in agent.kwargs.items() if name != "plant"}
+    kept = ", in `agent.json`" if "plant" in agent.kwargs else ""
     rows = {
         "environment": f"`{agent.env}`",
-        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
+        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`{kept}",
         "channel": f"`{channel}`" + ("" if agent.channel else ", that of the id"),
-        "other settings": ", ".join(f"{name}={value!r}" for name, value in agent.kwargs.items()) or "those of the id",
+        "other settings": ", ".join(f"{name}={value!r}" for name, value in others.items()) or "those of the id",
         "shield": _shield_text(shield),
         "filter": "one that these files do not keep" if agent.is_filtered else "",
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),

@@ -23,7 +23,7 @@ from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
-from ncs_gym.envs.json_settings import to_json
+from ncs_gym.envs.json_settings import read_plant, to_json
 from ncs_gym.validation import counted, reason_of, warn_caller
 from shields.atomic_write import write_atomically
 
@@ -226,4 +226,7 @@ def _agent(
 
 def _settings(loop: LoopConfig) -> dict[str, Any]:
     """Returns the keyword arguments of an environment as files of agents keep them; the channel has its own place."""
-    return {name: to_json(value) for name, value in loop.kwargs.items() if name != "channel"}
+    kwargs = {name: value for name, value in loop.kwargs.items() if name != "channel"}
+    if "plant" in kwargs:
+        kwargs["plant"] = read_plant(kwargs["plant"])
+    return {name: to_json(value) for name, value in kwargs.items()}

@@ -36,8 +36,6 @@ def evaluate(settings: EvaluateSettings) -> None:
         registered_env(settings.env)
         env_id = id_alone(settings.env)
     agent, folder = agent_named(str(settings.model), env_id, settings.vec_normalize)
-    if env_id is None:
-        registered_env(agent.env)
     loop = LoopConfig(env=agent.env, kwargs=agent.env_kwargs)
     if settings.between_samples is not None:
         loop = loop.with_kwargs(between_samples=settings.between_samples)
@@ -74,7 +72,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     arms = {f"shield: {shield_name}": arm_summary(episodes_table([result]), mode, fixed_policy=True)}
     statistics = "" if settings.vec_normalize is None else f" with --vec-normalize {settings.vec_normalize}"
     others = {name: value for name, value in loop.kwargs.items() if name != "channel"}
-    made = "".join(f", {name}={value!r}" for name, value in others.items())
+    made = ", the plant of its files" if "plant" in others else ""
+    made += "".join(f", {name}={value!r}" for name, value in others.items() if name != "plant")
     what = f"{agent.algorithm} of {folder}{statistics} in {agent.env}{made}"
     print(wrapped(f"{what}, {counted(settings.episodes, 'episode')}"), end="\n\n")
     print(summary_text(arms, {}))

@@ -49,7 +49,10 @@ def registered_env(env_id: str) -> NCSEnv:
             if near := get_close_matches(meant, known, 1, 0.95):
                 raise ValueError(f"unknown environment {env_id!r}; did you mean {known[near[0]]!r}?")
         if name in gym.registry and gym.spec(name).namespace == "ncs_gym":
-            raise ValueError(f"{env_id} has no plant of its own: give the file of one by --plant, or register_plant it")
+            raise ValueError(
+                f"{env_id} has no plant of its own: register_plant makes an id of yours (--env module:id), and some "
+                "commands take the file of a plant (--plant)"
+            )
         raise ValueError(
             f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "
             "module that registers one of your own"

@@ -10,6 +10,7 @@ import numpy as np
 
 from agents.agent_file import AgentError, pretrained_folder
 from experiments.baselines import REGULATORS, controller, tuned_weights
+from experiments.terminal import say
 from ncs_gym import NCSEnv
 from shields.certificate import Fallback
 
@@ -49,6 +50,8 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize
         act = controller(_SHORT.get(name, name), env, nothing, seed, tuned_weights(env_id, name))
         return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
     agent, _ = agent_named(name, env_id, vec_normalize)
+    if name != PRETRAINED and agent.env_kwargs:
+        say(f"{name} was trained with its own {', '.join(agent.env_kwargs)}: here it acts in {env_id} as registered")
     return lambda observation, info: agent.act(observation[None])[0]
 
 

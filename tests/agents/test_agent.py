@@ -18,8 +18,10 @@ from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate
 from shields.json_documents import digest
 from tests.certificates import certificate_of
+from tests.command import succeeded
+from tests.plants import small
 
-CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+CRUISE, LINEAR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"
 OBSERVATIONS = np.random.default_rng(0).standard_normal((50, 3))
 SETTINGS = {
     "PPO": dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=2, policy_kwargs=dict(net_arch=[16, 16])),
@@ -128,6 +130,32 @@ def test_folder_keeps_how_the_environment_was_made(tmp_path):
     assert "least_safe_steps=2" in card
     with pytest.raises(ValueError, match="files of agents do not keep disturbance=<function"):
         replace(agent, kwargs={"disturbance": lambda *given: None}).save(tmp_path)
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_folder_keeps_a_plant_without_an_id(tmp_path, as_file):
+    plant, folder = small([[0.9, 0.1], [0.0, 0.8]], disturbance_bound=0.01), tmp_path / "agent"
+    plant.save(tmp_path / "plant.json")
+    loop = LoopConfig(env=LINEAR, kwargs={"plant": tmp_path / "plant.json" if as_file else plant})
+    shield = ShieldSettings(certificate_of(plant))
+    agent = train(replace(loop, shield=shield), 64, 0, hyperparams={"n_envs": 2, "n_steps": 32, "batch_size": 32}).agent
+    agent.save(folder, shield)
+    (tmp_path / "plant.json").unlink()  # the folder is all that is needed
+    again = Agent.load(folder)
+    env = gym.make(again.env, **again.env_kwargs)
+    assert env.unwrapped.plant.fingerprint == plant.fingerprint
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(again.act(observation), agent.act(observation))
+    assert f"`{plant.fingerprint}`, in `agent.json` |" in (folder / "README.md").read_text()
+    printed = succeeded("evaluate", folder, "--episodes", 1).stdout
+    assert f"PPO of {folder} in {LINEAR}, the plant of its files, 1 episode" in " ".join(printed.split())
+
+
+def test_a_foreign_agent_names_no_file_as_its_plant(folder, tmp_path):
+    small([[0.5, 0.0], [0.0, 0.5]]).save(tmp_path / "plant.json")
+    change(folder, env=LINEAR, kwargs={"plant": str(tmp_path / "plant.json")})
+    with pytest.raises(AgentError, match="files of agents do not keep plant='"):
+        Agent.load(folder)
 
 
 def test_training_whose_agent_cannot_be_saved_is_told_so_before_it(tmp_path):

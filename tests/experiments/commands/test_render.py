@@ -1,6 +1,7 @@
 """The command that draws an episode, and the policies it plays."""
 
 import importlib.util
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +13,7 @@ from agents.training import untrained
 from experiments.commands.render import render
 from experiments.runs.policies import policy_by_name
 from experiments.settings import RenderSettings
-from ncs_gym import truck_trailer
+from ncs_gym import Channel, truck_trailer
 from ncs_gym.rendering import theme
 from shields import SafetyShield, synthesize
 from tests.command import assert_one_sentence, ncs, succeeded
@@ -184,6 +185,16 @@ def test_saved_model_acts_as_it_did(model):
     observations = np.random.default_rng(0).standard_normal((5, 3)).astype(np.float32)
     policy = policy_by_name(str(folder), CRUISE, gym.make(CRUISE).unwrapped, 0)
     np.testing.assert_array_equal(policy(observations[0], {}), agent.act(observations[:1])[0])
+
+
+def test_settings_that_an_agent_was_trained_with_are_named(model, tmp_path, capsys):
+    env, (_, agent) = gym.make(CRUISE).unwrapped, model
+    policy_by_name(str(model[0]), CRUISE, env, 0)
+    assert capsys.readouterr().err == ""
+    replace(agent, channel=Channel(loss=0.5), kwargs={"horizon": 5}).save(tmp_path)
+    policy_by_name(str(tmp_path), CRUISE, env, 0)
+    expected = f"{tmp_path} was trained with its own horizon, channel: here it acts in {CRUISE} as registered\n"
+    assert capsys.readouterr().err == expected
 
 
 def test_model_of_another_environment_is_refused(model):
