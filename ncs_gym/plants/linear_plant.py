@@ -40,6 +40,7 @@ from ncs_gym.validation import (
     as_names,
     as_number,
     as_setting,
+    as_units,
     own_error_state,
     read_only,
     reason_of,
@@ -271,8 +272,8 @@ class LinearPlant(LimitValues, HardBounds):
             center = f"operating_{name}"
             self._set(center, limits.as_operating_point(getattr(self, center), size, center))
             names = tuple(f"{letter}{i + 1}" for i in range(size))
-            for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
-                self._set(field_name, as_names(getattr(self, field_name), default, field_name))
+            self._set(f"{name}_names", as_names(getattr(self, f"{name}_names"), names, f"{name}_names"))
+            self._set(f"{name}_units", as_units(getattr(self, f"{name}_units"), size, f"{name}_units"))
             if len(set(getattr(self, f"{name}_names"))) < size:
                 raise ValueError(f"{name}_names must differ, got {shown(getattr(self, f'{name}_names'))}")
         self._make_arrays_read_only()

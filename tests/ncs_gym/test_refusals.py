@@ -486,6 +486,21 @@ PLANTS = [
         r"state_limits must have the operating point \[0.0, 0.0\] strictly between",
     ),
     *changed(
+        partial(LinearPlant, A=A, B=B, dt=0.1, **QUIET),
+        (
+            {"state_limits": (0.0, 3.0), "input_limits": (-2.0, 3.0), "operating_state": [1.0, 1.0]},
+            r"input_limits are around the operating point: beside operating_state give operating_input, too \(0 if",
+        ),
+        (
+            {"state_limits": (-1.0, 3.0), "input_limits": (-2.0, 3.0), "operating_input": [1.0]},
+            "state_limits are around the operating point: beside operating_input give operating_state",
+        ),
+        (
+            {"box": 1.0, "u_max": 1.0, "mixed_limits": ([1.0, 0.0, 1.0], -1.0, 3.0), "operating_state": [1.0, 1.0]},
+            "mixed_limits are around the operating point: beside operating_state give operating_input",
+        ),
+    ),
+    *changed(
         partial(replace, PLANT, between_samples=8),
         ({"continuous_model": None}, "needs a plant that was sampled from a model in continuous time"),
         ({"A": 1.001 * PLANT.A}, "is another one"),

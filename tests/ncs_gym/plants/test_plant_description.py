@@ -41,6 +41,14 @@ PLANTS = {
 }
 
 
+def test_the_unit_1_is_no_unit():
+    valve = LinearPlant(**STABLE, box=1.0, input_limits=(0.0, 1.0), operating_input=[0.5], operating_state=[0.0, 0.0])
+    described = str(replace(valve, state_units=["1", "m"], input_units=("1",), input_names=("valve",)))
+    assert "0 <= valve <= 1 (operating point 0.5)" in described
+    assert "|x1| <= 1\n" in described
+    assert "|x2| <= 1 m\n" in described
+
+
 @pytest.mark.parametrize("name", PLANTS)
 def test_file_gives_back_the_same_plant(name, tmp_path):
     plant = PLANTS[name]
