@@ -8,8 +8,13 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Mapping
 
-_DESCRIPTION = "Safe learning control over imperfect networks. `ncs --version` prints the version."
+_USAGE = """usage: ncs COMMAND [OPTIONS]
+
+Safe learning control over imperfect networks. `ncs COMMAND --help` explains
+a command, `ncs --version` prints the version. The commands:
+"""
 _ERROR = 2
 _INTERRUPTED = 130
 # What to do about an error of the operating system.
@@ -86,21 +91,44 @@ def main() -> None:
 
 def parse(arguments: list[str]) -> object:
     """Returns the settings of the chosen command; those of a file given by `--config` replace the defaults."""
+    from difflib import get_close_matches
+
     import tyro
 
     from experiments import settings
     from experiments.settings.arguments import beside_those_of_file
+    from ncs_gym.validation import shown
 
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
     command, rest = "".join(arguments[:1]), arguments[1:]
+    if command in ("", "-h", "--help"):
+        print(_overview(kinds))
+        sys.exit(0 if command else _ERROR)
     if command not in kinds:
-        return tyro.extras.subcommand_cli_from_dict(kinds, prog="ncs", description=_DESCRIPTION, args=arguments)
+        near = get_close_matches(command, kinds, 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(kinds)}"
+        raise ValueError(f"unknown command {shown(command)}; {hint}")
     kind, default = kinds[command], {}
     if hasattr(kind, "config"):
         found, rest = settings.config_defaults(rest, command, kind)
         default = {} if found is None else {"default": found}
     given = tyro.cli(kind, prog=f"ncs {command}", args=rest, description=_description(kind), **default)
     return beside_those_of_file(given, found) if default else given
+
+
+def _overview(kinds: Mapping[str, type]) -> str:
+    """Returns the commands, each with the first sentence about it, in lines of the terminal's width."""
+    from experiments.terminal import wrapped
+
+    indent = max(map(len, kinds)) + 4
+    lines = [wrapped(_first_sentence(kind), label=f"  {name}", indent=indent) for name, kind in kinds.items()]
+    return "\n".join([_USAGE, *lines])
+
+
+def _first_sentence(settings: type) -> str:
+    from inspect import getdoc
+
+    return " ".join((getdoc(settings) or "").partition("\n\n")[0].split())
 
 
 def _description(settings: type) -> str:

@@ -25,7 +25,6 @@ from ncs_gym.validation import (
 
 # Arguments of the constructor of `LinearPlant` that become fields of other names.
 PUBLISHED = "state_limits", "input_limits", "output_limits", "mixed_limits", "u_max", "offset"
-_OF_STATES = "state_limits", "output_limits"
 # What to give where an operating point that was not given is outside absolute limits.
 _POINT_TO_GIVE = {
     f"{name}_limits": f": limits are absolute, so give operating_{name}=, around which the model was linearized"
@@ -383,7 +382,7 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     n, m = B.shape
     state = as_operating_point(fields.get("operating_state"), n, "operating_state")
     applied = as_operating_point(fields.get("operating_input"), m, "operating_input")
-    _require_whole_point(arguments, state, applied)
+    _require_operating_input(arguments, state)
     lacking = np.zeros(n)
     if given["offset"] is not None:
         lacking = _residual_of_equilibrium(A, B, as_vector(given["offset"], n, "offset"), state, applied)
@@ -410,18 +409,14 @@ def _require_limits(arguments: dict[str, Any]) -> None:
         raise TypeError(f"LinearPlant needs limits: give {wanted}{given}")
 
 
-def _require_whole_point(arguments: dict[str, Any], state: np.ndarray, applied: np.ndarray) -> None:
-    """Raises ValueError if half an operating point is given and the other half counts.
+def _require_operating_input(arguments: dict[str, Any], state: np.ndarray) -> None:
+    """Raises ValueError if limits of inputs with two ends are around an operating input that is not given.
 
-    Limits with two ends are around it; its other half would be zero, which is seldom where a plant rests.
+    It would be zero, which seldom keeps a plant at an operating state other than zero.
     """
-    halves = ("operating_state", state, "input", ("input_limits",)), ("operating_input", applied, "state", _OF_STATES)
-    for name, point, other, names in halves:
-        limits = [each for each in (*names, "mixed_limits") if arguments.get(each) is not None]
-        if point.any() and limits and arguments.get(f"operating_{other}") is None:
-            raise ValueError(
-                f"{limits[0]} are around the operating point: beside {name} give operating_{other}, too (0 if it is)"
-            )
+    absolute = [each for each in ("input_limits", "mixed_limits") if arguments.get(each) is not None]
+    if absolute and state.any() and arguments.get("operating_input") is None:
+        raise ValueError(f"{absolute[0]} are absolute: beside operating_state give operating_input, too (0 if it is)")
 
 
 def _input_fields(given: dict[str, Any], center: np.ndarray) -> dict[str, Any]:

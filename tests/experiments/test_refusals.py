@@ -101,8 +101,6 @@ CALLS = [
 
 # Most of these the library shows in a box that reads the command line.
 USAGE = [
-    ("", "Missing subcommand"),
-    ("fly", "fly"),
     ("verify", "Required"),
     ("compare --mode hope", "hope"),
     ("compare --steps many", "many"),
@@ -142,6 +140,8 @@ USAGE = [
 ]
 
 ONE_SENTENCE = [
+    ("fly", "unknown command 'fly'; there are compare, study, train, evaluate"),
+    ("compre --smoke", "unknown command 'compre'; did you mean compare?"),
     ("compare --env CartPole-v1", "unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"),
     ("compare --env ncs_gym/LinearNCS-v0", "has no plant of its own"),
     ("compare --env ncs_gym/CartPol-v0", "'ncs_gym/CartPol-v0'; did you mean 'ncs_gym/CartPole-v0'?"),

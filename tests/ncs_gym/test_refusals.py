@@ -489,15 +489,11 @@ PLANTS = [
         partial(LinearPlant, A=A, B=B, dt=0.1, **QUIET),
         (
             {"state_limits": (0.0, 3.0), "input_limits": (-2.0, 3.0), "operating_state": [1.0, 1.0]},
-            r"input_limits are around the operating point: beside operating_state give operating_input, too \(0 if",
-        ),
-        (
-            {"state_limits": (-1.0, 3.0), "input_limits": (-2.0, 3.0), "operating_input": [1.0]},
-            "state_limits are around the operating point: beside operating_input give operating_state",
+            r"input_limits are absolute: beside operating_state give operating_input, too \(0 if it is\)",
         ),
         (
             {"box": 1.0, "u_max": 1.0, "mixed_limits": ([1.0, 0.0, 1.0], -1.0, 3.0), "operating_state": [1.0, 1.0]},
-            "mixed_limits are around the operating point: beside operating_state give operating_input",
+            "mixed_limits are absolute: beside operating_state give operating_input",
         ),
     ),
     *changed(

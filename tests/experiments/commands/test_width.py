@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments import settings
 from experiments.__main__ import COMMANDS
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.safety_counts import counts_table, gaussian_table
@@ -19,7 +20,7 @@ from experiments.settings import LoopSettings
 from experiments.study.study import results_tables
 from experiments.study.tables import QUOTABLE
 from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
-from tests.command import ROOT, succeeded
+from tests.command import ROOT, ncs, succeeded
 from tests.experiments.results import LONG_CAMPAIGN, run, summary_of
 
 WIDTH = 80
@@ -163,6 +164,19 @@ def test_help_fits_into_80_columns_and_every_command_has_a_seed_and_a_place_for_
     assert [line for line in lines if len(line) > WIDTH] == []
     assert any("--out" in line for line in lines)
     assert any("--seed" in line for line in lines) or command == "channel"
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["--help"], 0), ([], 2)])
+def test_overview_has_a_sentence_for_every_command_in_80_columns(arguments, code):
+    run = ncs(*arguments, COLUMNS=str(WIDTH))
+    assert run.returncode == code
+    lines = run.stdout.splitlines()
+    assert [line for line in lines if len(line) > WIDTH] == []
+    assert len(lines) < 40
+    text = " ".join(run.stdout.split())
+    for command, (kind, *_) in COMMANDS.items():
+        first = " ".join(getattr(settings, kind).__doc__.partition("\n\n")[0].split())
+        assert f" {command} {first}" in text
 
 
 def test_rows_of_a_campaign_that_breaks_nothing_are_whole():
