@@ -5,13 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import platform
 import warnings
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from agents.agent_card import agent_card
 from agents.agent_file import (
     AGENT_FILES,
     AgentError,
@@ -37,7 +35,7 @@ from agents.sb3_vec_env import SB3VecEnv
 from agents.sb3_zip import parameters_of, read_model, require_same_spaces
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
-from ncs_gym.validation import counted, reason_of, shown
+from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
 
 
@@ -178,7 +176,7 @@ class Agent:
         folder = Path(folder)
         if shield is not None and not _is_for_plant_of(self.env, self.kwargs, shield.certificate.fingerprint):
             raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
-        files = self.files() | {"README.md": _card(self, shield, evaluation).encode()}
+        files = self.files() | {"README.md": agent_card(self, shield, evaluation).encode()}
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             write_atomically(folder / name, content)
@@ -393,91 +391,3 @@ _KEPT = {
     *("process", "contract", "downlink", "downlink_contract", "observe", "horizon", "between_samples"),
     "max_episode_steps",
 }
-_PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
-_USE = """## Use
-
-The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpickled. Checksums find damage, not
-forgery.
-
-```python
-from agents import Agent, LoopConfig{imports}
-
-agent = Agent.load(".")
-loop = LoopConfig(
-    env=agent.env,
-    kwargs=agent.env_kwargs,{shield}
-)
-```
-"""
-
-
-def _card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluation | None) -> str:
-    """Returns the card of an agent, in Markdown, as `Agent.save` explains."""
-    env = gym.make(agent.env, **agent.kwargs).unwrapped
-    plant, channel = getattr(env, "plant", None), agent.channel or getattr(env, "channel", None)
-    others = {name: value for name, value in agent.kwargs.items() if name != "plant"}
-    kept = ", in `agent.json`" if "plant" in agent.kwargs else ""
-    rows = {
-        "environment": f"`{agent.env}`",
-        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`{kept}",
-        "channel": f"`{channel}`" + ("" if agent.channel else ", that of the id"),
-        "other settings": ", ".join(f"{name}={value!r}" for name, value in others.items()) or "those of the id",
-        "shield": _shield_text(shield),
-        "filter": "one that these files do not keep" if agent.is_filtered else "",
-        "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),
-        "residual": _residual_text(agent),
-        "SHA-256 of the weights": f"`{agent.checksum}`",
-        "saved with": _versions(),
-    }
-    table = [f"| {name} | {value} |" for name, value in rows.items() if value]
-    parts = [f"# {agent.algorithm} in {agent.env}\n", "| | |", "|---|---|", *table, ""]
-    if shield is not None:
-        parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
-        parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `ncs verify certificate.json`", ""]
-    if evaluation is not None:
-        parts += ["## Evaluation", "", *_figures(evaluation), ""]
-    known = ""
-    if shield is not None:
-        horizon = "" if shield.horizon is None else f", horizon={shield.horizon}"
-        horizon += f", least_safe_steps={shield.least_safe_steps}" if shield.least_safe_steps else ""
-        known = f'\n    shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"{horizon}),'
-    imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
-    return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
-
-
-def _versions() -> str:
-    found = [f"Python {platform.python_version()}"]
-    for name in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            found.append(f"{name} {version(name)}")
-    return ", ".join(found)
-
-
-def _figures(evaluation: Evaluation) -> list[str]:
-    episodes = evaluation.episodes
-    steps = sum(episode.steps for episode in episodes)
-    violating = sum(episode.violation_steps > 0 for episode in episodes)
-    returns = [episode.episode_return for episode in episodes]
-    interventions = sum(episode.interventions for episode in episodes)
-    return [
-        f"- mean return: {np.mean(returns):.4g}, of {counted(len(episodes), 'episode')} and {counted(steps, 'step')}",
-        f"- episodes in which the true state violated the safe box: {violating} of {len(episodes)}",
-        f"- violating steps: {sum(episode.violation_steps for episode in episodes)} of {steps}",
-        f"- interventions of the shield: {interventions} of {counted(steps, 'step')}",
-        f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
-    ]
-
-
-def _residual_text(agent: Agent) -> str:
-    if (base := agent.base_policy) is None:
-        return ""
-    offset = f" + {base.offset.tolist()}" if base.offset.any() else ""
-    return f"`Agent` adds {base.gain.tolist()} x_hat{offset} [actions]; the weights alone are a part of the policy"
-
-
-def _shield_text(shield: ShieldSettings | None) -> str:
-    if shield is None:
-        return "none"
-    horizon = "" if shield.horizon is None else f", plans of at most {counted(shield.horizon, 'step')}"
-    horizon += f", {shield.least_safe_steps} safe steps sought" if shield.least_safe_steps else ""
-    return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

@@ -51,7 +51,7 @@ LAYERS = {
         {"hyperparams", "pickled_data", "results", "step_info"},
         {"loop", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
-        {"normalization", "sb3_zip"},
+        {"normalization", "sb3_zip", "agent_card"},
         {"agent"},
         {"training"},
     ),

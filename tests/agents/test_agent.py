@@ -1,5 +1,6 @@
 import json
 import pickle
+import re
 import zipfile
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import shields
 from agents.agent import Agent, Normalization
 from agents.agent_file import AgentError
 from agents.evaluation import evaluate
@@ -133,7 +135,7 @@ def test_folder_keeps_how_the_environment_was_made(tmp_path):
 
 
 @pytest.mark.parametrize("as_file", [False, True])
-def test_folder_keeps_a_plant_without_an_id(tmp_path, as_file):
+def test_folder_keeps_a_plant_without_an_id(tmp_path, monkeypatch, as_file):
     plant, folder = small([[0.9, 0.1], [0.0, 0.8]], disturbance_bound=0.01), tmp_path / "agent"
     plant.save(tmp_path / "plant.json")
     loop = LoopConfig(env=LINEAR, kwargs={"plant": tmp_path / "plant.json" if as_file else plant})
@@ -146,7 +148,12 @@ def test_folder_keeps_a_plant_without_an_id(tmp_path, as_file):
     assert env.unwrapped.plant.fingerprint == plant.fingerprint
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(again.act(observation), agent.act(observation))
-    assert f"`{plant.fingerprint}`, in `agent.json` |" in (folder / "README.md").read_text()
+    card = (folder / "README.md").read_text()
+    assert f"`{plant.fingerprint}`, in `agent.json` |" in card
+    monkeypatch.chdir(folder)
+    names = {"shields": shields}
+    exec(card.partition("```python\n")[2].partition("```")[0], names)
+    assert eval(re.search(r"`(shields\.verify\(.*)`", card)[1], names).valid
     printed = succeeded("evaluate", folder, "--episodes", 1).stdout
     assert f"PPO of {folder} in {LINEAR}, the plant of its files, 1 episode" in " ".join(printed.split())
 
