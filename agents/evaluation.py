@@ -12,6 +12,7 @@ from agents.loop import LoopConfig
 from agents.results import Episode, Evaluation, Trajectory
 from ncs_gym import NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.envs.spaces import read_actions
 from shields.polytope import Polytope
 
 # The largest number of episodes that are played side by side.
@@ -94,9 +95,11 @@ def _played(
         running &= ~ended
         if not running.any():
             break
-        observations, rewards, terminated, truncated, info = envs.step(policy(observations, info))
+        actions = policy(observations, info)
+        observations, rewards, terminated, truncated, info = envs.step(actions)
         if running[0] and indices[0] == 0:
-            infos.append(info)
+            # Filters of others need not report what was proposed to them.
+            infos.append({"input_proposed": read_actions(plant, actions, count)[1].T} | info)
         returns += np.where(running, rewards, 0.0)
         happened = {
             "steps": ~nothing,
@@ -145,7 +148,7 @@ def _first_trajectory(infos: list[dict[str, np.ndarray]], input_delay: int) -> T
     inputs = np.array([info["input"][0] for info in steps])
     proposed, intervened = inputs.copy(), np.zeros(len(steps), np.bool_)
     for step, info in enumerate(steps[: max(len(steps) - input_delay, 0)], input_delay):
-        proposed[step] = info.get("input_proposed", info["input_committed"])[0]
+        proposed[step] = info["input_proposed"][0]
         intervened[step] = info.get("shield_intervened", not_shielded)[0]
     return Trajectory(
         states=np.array([info["state"][0] for info in infos]),

@@ -241,7 +241,9 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         """
         inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
-            hint = f": call vec_env.vector_env.{method_name}" if hasattr(self.vector_env, method_name) else ""
+            homes = {"vector_env": self.vector_env, "vector_env.unwrapped": inner}
+            having = [home for home, each in homes.items() if hasattr(each, method_name)]
+            hint = f": call vec_env.{having[0]}.{method_name}" if having else ""
             raise AttributeError(
                 f"the environments of {type(inner).__name__} have no methods of their own to call{hint}"
             )

@@ -63,12 +63,20 @@ class RegulatorProblem:
         B: Shape (entries, m).
         E: Shape (costs, entries).
         D: Shape (costs, m).
+        target: What a target of 1 adds to z, shape (entries,); zeros for a task without targets.
     """
 
     A: np.ndarray
     B: np.ndarray
     E: np.ndarray
     D: np.ndarray
+    target: np.ndarray
+
+    @property
+    def A_of_constant_target(self) -> np.ndarray:
+        """A under which a target stays, shape (entries, entries): in A it may decay, or there would be no regulator."""
+        decay = self.target - self.A @ self.target
+        return self.A + np.outer(decay, self.target) / (self.target @ self.target)
 
     def entries(self, observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         """Returns z, shape (N, entries), for observations and estimates (N, n)."""
@@ -96,16 +104,17 @@ def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProble
     if isinstance(task, SetpointTracking):
         return _tracking_problem(plant, task, weights)
     states, effort = np.sqrt(weights.state) * plant.box, np.sqrt(weights.effort + _LEAST_WEIGHT)
-    A, B, E = plant.A, plant.B, states
+    A, B, E, target = plant.A, plant.B, states, np.zeros(plant.n)
     if isinstance(task, SpeedTracking):
         A = np.pad(A, (0, 1))
         A[-1, -1] = 1.0
         B = np.vstack([B, -plant.dt * np.eye(plant.m)[task.input_index]])
         E = np.pad(E, (0, 1))
         E[-1, -1] = 1.0 / 5.0  # the reward counts errors in units of 5 m/s
+        target = np.append(target, 1.0)
     D = np.vstack([np.zeros((len(E), plant.m)), effort * np.diag(1.0 / plant.input_half)])
     E = np.vstack([E, np.zeros((plant.m, len(A)))])
-    return RegulatorProblem(A, B, E, D)
+    return RegulatorProblem(A, B, E, D, target)
 
 
 def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: RegulatorWeights) -> RegulatorProblem:
@@ -134,7 +143,9 @@ def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: Regul
     wanted = np.vstack([np.sqrt(weights.effort) * last, np.sqrt(_LEAST_WEIGHT) * held])
     given = np.vstack([np.sqrt(each) * np.diag(1.0 / plant.input_half) for each in (weights.effort, _LEAST_WEIGHT)])
     free = np.zeros((1 + len(box), m))
-    return RegulatorProblem(A, B, np.vstack([error, box, -wanted]), np.vstack([free, given]))
+    of_target = np.zeros(size)
+    of_target[n : n + targets] = 1.0
+    return RegulatorProblem(A, B, np.vstack([error, box, -wanted]), np.vstack([free, given]), of_target)
 
 
 def regulator(env: NCSEnv, weights: RegulatorWeights) -> Inputs:
@@ -147,38 +158,31 @@ def regulator(env: NCSEnv, weights: RegulatorWeights) -> Inputs:
 def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inputs:
     """Returns the regulator with its targets clipped by a reference governor.
 
-    Targets are moved as little as possible so that the regulator's own loop, from the estimate taken for the state and
-    without disturbance, with a constant target keeps the limits of box and inputs less a margin for the next
-    `GOVERNED_STEPS` steps. Where no target does, the middle of what the limits ask for is used (Garone et al. 2017,
-    docs/bibliography.md). Tasks other than `SetpointTracking` are not governed. The margin is a fraction of the box.
+    Targets, of `SpeedTracking` the error of the speed, are moved as little as possible so that the regulator's own
+    loop, from the estimate taken for the state and without disturbance, with a constant target keeps the limits of box
+    and inputs less a margin for the next `GOVERNED_STEPS` steps. Where no target does, the middle of what the limits
+    ask for is used (Garone et al. 2017, docs/bibliography.md). The margin is a fraction of the box.
+
+    Raises:
+        ValueError: If the task has no targets.
     """
-    plant, task = env.plant, env.task
-    if not isinstance(task, SetpointTracking):
-        return regulator(env, weights)
-    n, known = plant.n, slice(plant.n, plant.n + 1 + task.preview)
-    problem = regulator_problem(env, weights)
-    gain = problem.gain()
-    own = np.delete(gain, np.arange(gain.shape[1])[known], axis=1)  # of x and the last input
-    of_target = gain[:, known].sum(axis=1, keepdims=True)
-    moved = np.eye(own.shape[1], own.shape[1])
-    moved[n:] = 0.0
-    moved[:n, :n] = plant.A
-    pushed = np.vstack([plant.B, np.eye(plant.m)[: own.shape[1] - n]])
-    loop, drive = moved + pushed @ own, pushed @ of_target
-    (k, grid), beyond = (len(plant.box), rows_within_step(plant)), ((0, 0), (0, own.shape[1] - n))
-    between = np.pad(grid.state, beyond) + grid.input @ own
-    limits = np.vstack([np.pad(plant.box, beyond), between, own / plant.input_half[:, None]])
-    direct = np.concatenate([np.zeros((k, 1)), grid.input @ of_target, of_target / plant.input_half[:, None]])
+    plant, problem = env.plant, regulator_problem(env, weights)
+    gain, target, known = problem.gain(), problem.target, problem.target != 0.0
+    if not known.any():
+        raise ValueError(f"a governor needs targets, and {type(env.task).__name__} has none")
+    loop, k = problem.A_of_constant_target + problem.B @ gain, len(plant.box)
+    grid, beyond = rows_within_step(plant), ((0, 0), (0, len(loop) - plant.n))
+    between = np.pad(grid.state, beyond) + grid.input @ gain
+    limits = np.vstack([np.pad(plant.box, beyond), between, gain / plant.input_half[:, None]])
     low, high = plant.input_ends / plant.input_half
     low = np.concatenate([plant.box_low + margin, grid.low + margin, low])
     high = np.concatenate([plant.box_high - margin, grid.high - margin, high])
-    rows, slopes = [limits[k:]], [direct[k:]]
-    power, response = loop, drive
+    rows, power = [limits[k:]], loop  # the box now holds or not whatever the target is
     for _ in range(GOVERNED_STEPS):
         rows.append(limits @ power)
-        slopes.append(limits @ response + direct)
-        power, response = loop @ power, loop @ response + drive
-    free, slope = np.vstack(rows), np.vstack(slopes)[:, 0]
+        power = loop @ power
+    free = np.vstack(rows)
+    slope = free @ target
     low, high = (np.concatenate([ends[k:], np.tile(ends, GOVERNED_STEPS)]) for ends in (low, high))
     felt = np.abs(slope) > _LEAST_WEIGHT * np.abs(slope).max()
     free, slope, low, high = free[felt], slope[felt], low[felt], high[felt]
@@ -187,7 +191,7 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         entries = problem.entries(observations, estimates)
-        middle = -np.delete(entries, np.arange(entries.shape[1])[known], axis=1) @ free.T / slope
+        middle = -(entries * ~known) @ free.T / slope
         low = (middle + below).max(axis=1, keepdims=True)
         high = (middle + above).min(axis=1, keepdims=True)
         center = 0.5 * (low + high)
@@ -363,8 +367,10 @@ def why_aimless(name: str, task: Task) -> str:
 
     What another reward asks for nobody knows, nor what other observations are; a profile of targets may be your own.
     """
-    own = type(task).reward, type(task).observe
-    if name not in PURSUING or any(own == (kind.reward, kind.observe) for kind in _PURSUED):
+    own, kind = (type(task).reward, type(task).observe), name.partition(":")[0]
+    if kind == "governor" and own == (Regulation.reward, Regulation.observe):
+        return f"{name} clips targets, and a {type(task).__name__} task has none: take lqr"
+    if name not in PURSUING or any(own == (each.reward, each.observe) for each in _PURSUED):
         return ""
     return (
         f"{name} does not know what a {type(task).__name__} asks for: it pursues Regulation, SpeedTracking and "

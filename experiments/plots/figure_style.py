@@ -129,6 +129,7 @@ _CONTROLLER_MARKERS = {
     "lqr": "H",
     "governor": "^",
     "mpc": "x",
+    "greedy": "D",
     "random": "8",
     "K x_hat": "1",
     "zero input": "2",

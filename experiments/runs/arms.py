@@ -158,7 +158,7 @@ def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
 
 @cache
 def _parsed(name: str, mode: str) -> Arm:
-    known, kind = _arms(mode), name.replace(" ", "-")
+    known, kind = _arms(mode), name.replace(" ", "-").replace("+residual+penalty", "+penalty+residual")
     if kind in known:
         return known[kind]
     kind, colon, weight = kind.removesuffix(_RESIDUAL).partition(":")

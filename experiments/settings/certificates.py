@@ -139,7 +139,7 @@ class AttackSettings(BackendSettings):
         force: Replace the finished results of another campaign in the output folder, which otherwise is refused.
         seed: Seed of the campaign, >= 0.
         smoke: Run a short version, to see that everything works: the registered environments behind their own channels,
-            unless others are asked for, and no random plants; if `--out` is not given, in runs/attack-smoke.
+            unless others are asked for, and no random plants; in runs/attack-smoke unless `--out` differs.
     """
 
     steps: float = 5e6
@@ -338,7 +338,7 @@ class RenderSettings:
         scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, sharp on dense screens, and
             1 for a .gif, whose file would be several times as large.
         width: Width of the animation [pixels]; by default as drawn.
-        smoke: Draw a few steps only, to see that everything works; if `--out` is not given, into episode-smoke.gif.
+        smoke: Draw a few steps only, to see that everything works; into episode-smoke.gif unless `--out` differs.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"

@@ -99,8 +99,8 @@ class LearningSettings(BackendSettings):
             (agents/tuned), or the default.
         conf_file: File of hyperparameters by environment, YAML or JSON, like those of rl-zoo3.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
-        smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
-            in a folder of its own, with -smoke at the end of its name.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; unless `--out`
+            names another folder than the usual one, in that with -smoke at the end of its name.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 
@@ -379,8 +379,8 @@ class StudySettings(BackendSettings):
         page: Also write the page of Markdown to this file, its figures into the folder images beside it, all tables
             and their numbers into the files with the endings .txt and .json.
         quote: Pages in which the marked tables are replaced by those of this study.
-        smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
-            in a folder of its own, with -smoke at the end of its name.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; unless `--out`
+            names another folder than the usual one, in that with -smoke at the end of its name.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 

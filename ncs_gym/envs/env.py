@@ -126,7 +126,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         task: The reward; `Regulation` by default.
         disturbance: "ball", "box", "sinusoid" (truncated process noise is added), "sphere", "adversarial" (in
             its place), a `Disturbance`, or a callable (rng, plant, nominal_next) -> d.
-        initial_set: Ellipsoid of starting states; by default a tenth of the safe box.
+        initial_set: Ellipsoid of starting states; by default a tenth of the safe box, where its ends are not symmetric
+            about the operating point of the largest box inside that is.
         terminate_on_violation: End the episode when the true state leaves the safe box.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
@@ -374,7 +375,9 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
 
     @property
     def outstanding(self) -> int:
-        """Number of samples requested that are newer than the newest one used (docs/requests.md).
+        """Number of samples requested that are newer than the newest one used (docs/requests.md, "The rule").
+
+        Under a contract lost ones count, too; without one those that cannot arrive any more do not.
 
         Raises:
             ValueError: If the channel does not take samples on request.

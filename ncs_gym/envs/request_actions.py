@@ -42,9 +42,10 @@ class RequestActions(_WithCost, AroundEnvironment, gym.Wrapper, RecordConstructo
     """Lets an agent decide when samples are taken, at a price (docs/requests.md).
 
     The action has one entry more, in [-1, 1]: a sample is asked for where it is positive. The observation has two
-    entries more: the age of the newest sample used, and how many samples are requested that are newer than it [steps,
-    samples], both clipped to what the contract allows. From the reward the cost of every packet sent is subtracted,
-    also of those that the contract forces. Wrap it around the shield, whose actions stay as they are.
+    entries more: the age of the newest sample used, and how many samples are requested that are newer than it
+    (`NCSEnv.outstanding`) [steps, samples], both clipped to what the contract allows. From the reward the cost of every
+    packet sent is subtracted, also of those that the contract forces. Wrap it around the shield, whose actions stay as
+    they are.
 
     Args:
         env: An `NCSEnv` whose channel takes samples on request, or another environment in such a `Networked`, possibly

@@ -72,7 +72,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         fill: What is seen where nothing new arrived: "last", the newest sample that did, or "zero". Or a function
             (last, age, actions) -> observation that predicts the present one wherever the newest sample is older: it
             is given that sample, its age and the last `pending` actions decided, oldest first, of which those of the
-            last `age` steps came after the sample.
+            last `age` steps came after the sample. What it returns is passed on as it is, also out of the space.
         late: "apply" lets the newest command that has arrived act. "drop" does not wait for commands that take longer
             than `downlink.delay`. "queue" lets all commands act in the order of their arrival, one in each step.
         idle: What acts where no command arrived: "hold", the one before, or "neutral".

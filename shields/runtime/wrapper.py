@@ -109,7 +109,9 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
         """
         layer = env
         while isinstance(layer, self._wrappers):
-            if isinstance(layer, (*self._refused, BaseShield)):
+            if isinstance(layer, BaseShield):
+                raise ValueError(f"the environment has a {type(layer).__name__} already: leave one out")
+            if isinstance(layer, self._refused):
                 raise ValueError(
                     f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the "
                     "shield around the environment first"

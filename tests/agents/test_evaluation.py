@@ -200,3 +200,23 @@ def test_episodes_without_an_end_are_not_evaluated():
     loop = LoopConfig(env="ncs_gym/TruckTrailer-v0", kwargs={"max_episode_steps": -1})
     with pytest.raises(ValueError, match="no max_episode_steps, without which an evaluation may not end"):
         evaluate(loop, lambda seen, _: np.zeros((len(seen), 1), np.float32), 1, 0)
+
+
+class Halving(VectorWrapper):
+    """A filter of one's own, which says whether it changed actions, and not what they were."""
+
+    def step(self, actions):
+        halved = (0.5 * actions).astype(np.float32)
+        observation, rewards, terminated, truncated, info = self.env.step(halved)
+        info["shield_intervened"] = (halved != actions).any(axis=1)
+        return observation, rewards, terminated, truncated, info
+
+
+@pytest.mark.parametrize("env_id", [CRUISE.env, "ncs_gym/TruckTrailerCruiseTwoWay-v0"])
+def test_trajectory_behind_a_filter_of_ones_own_has_what_was_proposed(env_id):
+    env = gym.make(env_id).unwrapped
+    delay, limit = env.downlink_protocol.input_delay, env.plant.u_max[0]
+    path = evaluate(LoopConfig(env=env_id, filter=Halving), throttle, episodes=1, seed=0).trajectory
+    np.testing.assert_array_equal(path.proposed[delay:], limit)
+    np.testing.assert_array_equal(path.inputs[delay:], 0.5 * limit)
+    assert path.intervened[delay:].all()

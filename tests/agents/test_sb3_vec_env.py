@@ -234,6 +234,8 @@ def test_attributes():
     ):
         with pytest.raises(AttributeError):
             call()
+    with pytest.raises(AttributeError, match="to call: call vec_env.vector_env.unwrapped.request$"):
+        env.env_method("request")
     sync = SB3VecEnv(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
     sync.set_attr("length", 0.7, indices=1)
     assert sync.get_attr("length") == [0.5, 0.7]

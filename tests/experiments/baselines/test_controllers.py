@@ -67,6 +67,31 @@ def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for(
         controller(name, other, rests, 0)
 
 
+def test_governor_is_refused_where_there_are_no_targets():
+    resting, rests = env_of("ncs_gym/TruckTrailer-v0"), Fallback.of_gain(np.zeros((1, 2)))
+    for name in ("governor", "governor:20"):
+        with pytest.raises(ValueError, match=f"{name} clips targets, and a Regulation task has none: take lqr"):
+            controller(name, resting, rests, 0)
+
+
+def test_governor_keeps_limits_and_margins_on_the_way_to_another_speed():
+    env, weights = env_of("ncs_gym/TruckTrailerCruise-v0"), RegulatorWeights(1e-3, 0.0)
+    plant, reached = env.plant, {}
+    for name in ("lqr", "governor", "governor:20"):
+        policy, errors = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), []
+        x, error, farthest = np.zeros(plant.n), 20.0, 0.0
+        for _ in range(400):
+            u = inputs_of(plant, policy(np.array([[*x, error]]), {"estimate": x[None]})[0])
+            x, error = plant.A @ x + plant.B @ u, error - plant.dt * u[0]
+            farthest = max(farthest, float(np.abs(plant.box_rows @ x).max()))
+            errors.append(error)
+        reached[name] = farthest
+        assert abs(errors[-1]) < 0.1  # and arrives
+    assert reached["lqr"] > 1.01
+    assert 0.95 < reached["governor"] <= 1.0 + 1e-6
+    assert 0.75 < reached["governor:20"] <= 0.8 + 1e-6
+
+
 @pytest.mark.parametrize("env_id", SETPOINTS)
 def test_equilibrium_is_one_and_has_the_output_asked_for(env_id):
     env = env_of(env_id)

@@ -25,7 +25,7 @@ from experiments.plots.comparison_figures import (
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
 from experiments.plots.loop_figure import loop_log_figure
-from experiments.settings.learning import REGULATED_ARMS
+from experiments.runs.arms import _arms
 from ncs_gym import Ellipsoid, LinearPlant
 from shields.polytope import Polytope
 from tests.command import without_pictures
@@ -71,7 +71,7 @@ BALL = keeping(np.eye(2))
 
 
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
-    assert all(ArmStyle.of(arm).marker for arm in REGULATED_ARMS)
+    assert all(ArmStyle.of(arm.name).marker for arm in _arms("project").values())
     looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)

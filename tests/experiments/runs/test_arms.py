@@ -57,6 +57,10 @@ def test_name_says_which_filter_and_which_policy(name, mode, policy):
     assert Arm.of(name.replace(" ", "-"), "boundary") == arm
 
 
+def test_penalty_and_residual_are_told_in_any_order():
+    assert Arm.of("shielded+residual+penalty", "boundary") == Arm.of("shielded+penalty+residual", "boundary")
+
+
 @pytest.mark.parametrize("env_id", NETWORK_ENVS)
 @pytest.mark.parametrize("arm", TRAINED_ARMS)
 def test_arm_of_the_study_is_trained_with_what_was_tuned_for_it(env_id, arm):

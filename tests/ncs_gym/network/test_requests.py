@@ -111,6 +111,16 @@ def test_outstanding_samples_are_those_requested_and_newer_than_the_newest():
         assert env.outstanding == sum(stamp > step - info["measurement_age"] for stamp in stamps)
 
 
+@pytest.mark.parametrize("delay", [0, 2])
+def test_outstanding_samples_without_a_contract_are_those_that_may_still_arrive(delay):
+    env = NCSEnv(plant=truck_trailer(), channel=Channel(loss=1.0, delay=delay, on_request=True))
+    env.reset(seed=0)
+    for step in range(1, 9):
+        env.request()
+        env.step(np.zeros(1, np.float32))
+        assert env.outstanding == min(step, delay)
+
+
 def test_stable_plant_without_a_contract_is_never_forced_to_a_sample():
     env = NCSVectorEnv(3, plant=truck_trailer(), channel=Channel(0.3, delay=2, on_request=True))
     env.reset(seed=0)

@@ -120,7 +120,6 @@ INNER = {
     "MaxAndSkipObservation": lambda env: MaxAndSkipObservation(env, 2),
     "TransformAction": lambda env: TransformAction(env, lambda a: -a, env.action_space),
     "Autoreset": Autoreset,
-    "SafetyShield": lambda env: SafetyShield(env, CERTIFICATE),
 }
 UNPROVED = r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"
 MISPLACED = r"delay is a setting of the channel: give channel=Channel\(delay=...\)"
@@ -140,6 +139,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         )
         for name, wrap in INNER.items()
     ],
+    (
+        lambda: SafetyShield(SafetyShield(SCALAR, CERTIFICATE), CERTIFICATE),
+        ValueError,
+        "the environment has a SafetyShield already: leave one out",
+    ),
     (lambda: SafetyShield(Wider(SCALAR), CERTIFICATE), ValueError, "changes the action space"),
     (lambda: SafetyShield(VECTOR, CERTIFICATE), ValueError, "use VectorSafetyShield"),
     (lambda: SafetyShield(SYNC, CERTIFICATE), ValueError, r"wrappers=\[SafetyShield\]"),
@@ -149,7 +153,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (
         lambda: VectorSafetyShield(VectorSafetyShield(VECTOR, CERTIFICATE)),
         ValueError,
-        "must be inside VectorSafetyShield",
+        "has a VectorSafetyShield already",
     ),
     (lambda: SafetyShield(gym.make("Pendulum-v1")), ValueError, NO_MODEL),
     # Shields: their settings.
