@@ -32,6 +32,7 @@ from experiments.plots.figure_style import (
 from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.training_run import RunResult
 from ncs_gym import LinearPlant
+from ncs_gym.plants.past_inputs import inputs_under_way
 from shields import Certificate
 
 _INK = "#222222"
@@ -61,7 +62,7 @@ def comparison_figures(
     if trained:
         figures["training"] = training_figure(trained)
     figures["episode"] = episode_figure(plant, arms)
-    if plant.n > 1:  # a single state has no phase plane
+    if plant.n - inputs_under_way(plant) > 1:  # a single state has no phase plane
         figures["phase"] = phase_figure(plant, certificate, arms)
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}
 
@@ -294,7 +295,7 @@ def _draw_events(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
 def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> CaptionedFigure:
     """Returns two states of the first evaluation episode of each run, a panel per arm, with safe box and safe set."""
     states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
-    plane = plane_of(certificate, states)
+    plane = plane_of(certificate, states, plant.n - inputs_under_way(plant))
     box = projected_box(plant.box, plant.box_ends, plane)
     outlines = {"safe set": (_outline(certificate, plane), "-"), "safe box": (box, "--")}
     prefix = "" if plant.n == 2 else "projection of the "
@@ -336,11 +337,17 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
         return figure
 
 
-def plane_of(certificate: Certificate, states: np.ndarray) -> tuple[int, int]:
-    """Returns the two states that are farthest from the middle of the safe set, in units of its extent; ascending."""
-    safe_set, axes = certificate.safe_set, np.eye(states.shape[1])
+def plane_of(certificate: Certificate, states: np.ndarray, own: int) -> tuple[int, int]:
+    """Returns the two states that are farthest from the middle of the safe set, in units of its extent; ascending.
+
+    Args:
+        certificate: Of the safe set.
+        states: Shape (k, n).
+        own: How many states count, the first ones; those behind are past inputs.
+    """
+    safe_set, axes = certificate.safe_set, np.eye(states.shape[1])[:own]
     high, low = safe_set.support(axes), -safe_set.support(-axes)
-    furthest = (np.abs(2.0 * states - high - low) / (high - low)).max(axis=0)
+    furthest = (np.abs(2.0 * states[:, :own] - high - low) / (high - low)).max(axis=0)
     first, second = sorted(np.argsort(-furthest, kind="stable")[:2].tolist())
     return first, second
 

@@ -12,6 +12,7 @@ import pandas as pd
 from experiments.network_loop.log import rows_of
 from experiments.plots.figure_style import STYLE, CaptionedFigure, input_labels, label, state_labels, with_unit
 from ncs_gym import LinearPlant
+from ncs_gym.plants.past_inputs import inputs_under_way
 
 
 def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFigure:
@@ -29,9 +30,13 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
         if missing := [each for each in plant.state_names if columns[name] + each not in log]:
             raise ValueError(f"the logs in {folder} are of another plant, without {', '.join(missing)}: give its --env")
     logs = {name: log[log["episode"] == log["episode"].iloc[-1]] for name, log in logs.items()}
-    names, units = [*plant.state_names, *plant.input_names], [*plant.state_units, *plant.input_units]
-    labels = *state_labels(plant), *input_labels(plant)
-    ends = np.hstack([plant.own_limits, plant.input_ends]).T.tolist()
+    own = plant.n - inputs_under_way(plant)  # past inputs are inputs of rows before
+    names, units = [*plant.state_names[:own], *plant.input_names], [*plant.state_units[:own], *plant.input_units]
+    unproved = np.empty(0)
+    if "controller" in logs:
+        unproved = logs["controller"][logs["controller"]["guaranteed"] == "0"]["step"].astype(int)
+    labels = *state_labels(plant)[:own], *input_labels(plant)
+    ends = np.hstack([plant.own_limits[:, :own], plant.input_ends]).T.tolist()
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure(
             (11.0, 1.0 + 1.4 * len(names)), f"{folder.name}: the dashed lines are the box and the input limits."
@@ -39,13 +44,12 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
         axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
         for i, (axis, name, text, unit, limits) in enumerate(zip(axes, names, labels, units, ends, strict=True)):
             for log, rows in logs.items():
-                column = columns[log] + name if i < plant.n else f"u_{name}"
+                column = columns[log] + name if i < own else f"u_{name}"
                 style = {"plant": "-", "controller": ":"}[log]
                 axis.plot(rows["step"].astype(int), rows[column].astype(float), style, lw=1.2, label=log)
             for end in filter(np.isfinite, limits):
                 axis.axhline(end, color="#222222", lw=1.0, ls=(0, (6.0, 3.0)))
-            if "controller" in logs:
-                unproved = logs["controller"][logs["controller"]["guaranteed"] == "0"]["step"].astype(int)
+            if len(unproved):
                 height = {"transform": axis.get_xaxis_transform(), "label": "not proved"}
                 axis.vlines(unproved, 0.0, 1.0, color="#cc3311", alpha=0.2, **height)
             label(axis, "", with_unit(text, unit).replace(" [", "\n["))

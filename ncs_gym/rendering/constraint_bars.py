@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.past_inputs import is_row_of_past_input
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import FrameRecord
@@ -51,7 +52,7 @@ class _Constraint(NamedTuple):
 
 
 class ConstraintBarsDrawing:
-    """Draws c_j x against its limits for each of the first rows of the safe box.
+    """Draws c_j x against its limits for each of the first rows of the safe box, but for those of past inputs.
 
     Args:
         plant: The plant, which names the states that the rows are about.
@@ -61,12 +62,13 @@ class ConstraintBarsDrawing:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        self._constraints = [_constraint(plant, j) for j in range(min(len(plant.box), _MAX_BARS))]
-        limited = [int(np.flatnonzero(row)[0]) for row in plant.box if np.count_nonzero(row) == 1]
+        rows = np.flatnonzero(~is_row_of_past_input(plant)).tolist()
+        self._constraints = [_constraint(plant, j) for j in rows[:_MAX_BARS]]
+        limited = [int(np.flatnonzero(plant.box[j])[0]) for j in rows if np.count_nonzero(plant.box[j]) == 1]
         order = list(dict.fromkeys([*limited, *range(plant.n)]))
         self.pair = (min(order[:2]), max(order[:2]))
         self._text_width = _TEXT_WIDTH if len(self._constraints) <= _COLUMN else _NARROW_TEXT_WIDTH
-        self._hidden = len(plant.box) - len(self._constraints)
+        self._hidden = len(rows) - len(self._constraints)
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws the names, the empty bars and the limits."""

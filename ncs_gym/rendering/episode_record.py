@@ -267,11 +267,12 @@ def _tracked_output(task: Task, plant: LinearPlant, task_state: Any, state: np.n
         value, target = task_state.tolist()
         return TrackedOutput(name="speed", unit="m/s", value=value, target=target, low=0.0, high=task.fastest)
     if isinstance(task, SetpointTracking):
-        used, name, unit = np.flatnonzero(task.output), "output", ""
-        if len(used) == 1:
-            name, unit = plant.state_names[int(used[0])], plant.state_units[int(used[0])]
+        used, name, unit, factor = np.flatnonzero(task.output), "output", "", 1.0
+        if len(used) == 1:  # a multiple of a state, which is shown itself
+            i = int(used[0])
+            name, unit, factor = plant.state_names[i], plant.state_units[i], float(task.output[i])
         center = float(task.output @ plant.operating_state)
         value, target = center + float(task.output @ state), center + float(task.target(task_state))
-        ends = {"low": center - task.reach, "high": center + task.reach}
-        return TrackedOutput(name=name, unit=unit, value=value, target=target, **ends)
+        low, high = sorted([(center - task.reach) / factor, (center + task.reach) / factor])
+        return TrackedOutput(name=name, unit=unit, value=value / factor, target=target / factor, low=low, high=high)
     return None

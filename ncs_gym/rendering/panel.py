@@ -20,9 +20,10 @@ _BAR_HEIGHT, _PADDING = 12.0, 11.0
 def draw_header(canvas: Canvas, frame: FrameRecord) -> None:
     """Draws step and time at the left, and the shield and the violations at the right."""
     y = theme.HEADER.h / 2
-    decimals = min(max(1, ceil(-log10(frame.plant.dt))), 6)
+    dt = frame.plant.dt
+    decimals = 0 if dt == int(dt) else min(max(1, ceil(-log10(dt))), 6)
     canvas.text(f"step {frame.step}", (16, y), theme.INK, theme.BODY, bold=True)
-    canvas.text(f"{frame.step * frame.plant.dt:.{decimals}f} s", (148, y), theme.MUTED, theme.BODY, align=1.0)
+    canvas.text(f"{frame.step * dt:.{decimals}f} s", (172, y), theme.MUTED, theme.BODY, align=1.0)
     count = frame.violations
     text = "no violation" if count == 0 else counted(count, "violation")
     color, fill = (theme.DANGER, theme.DANGER_FILL) if count else (theme.SAFE, theme.SAFE_FILL)

@@ -162,7 +162,7 @@ class TimePlot:
     """Draws the only state of a plant against time, in place of the phase plane.
 
     Args:
-        plant: A plant with one state.
+        plant: A plant with one state, perhaps beside past inputs.
         rect: Where the axes are in the frame.
     """
 
@@ -175,7 +175,8 @@ class TimePlot:
         canvas.rect(rect, theme.DANGER_FILL)
         self._fill_band(canvas, *self._range, theme.PAPER)
         if safe_set is not None:
-            high, low = (sign * float(np.ravel(safe_set.support(np.array([[sign]])))[0]) for sign in (1.0, -1.0))
+            axis = np.eye(self._plant.n)[:1]
+            high, low = (sign * float(np.ravel(safe_set.support(sign * axis))[0]) for sign in (1.0, -1.0))
             self._fill_band(canvas, low, high, theme.SAFE_FILL)
             for y in (self._y(high), self._y(low)):
                 canvas.line([(rect.x, y), (rect.right, y)], theme.SAFE, 2.0)

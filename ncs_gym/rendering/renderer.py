@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas, Window
 from ncs_gym.rendering.cart_pole import CartPoleDrawing
@@ -135,7 +136,8 @@ class _Picture:
         self._canvas = Canvas(theme.WIDTH, theme.HEIGHT, scale)
         self._drawing = _drawing_of(plant)
         rect = theme.PLANE
-        self._plane = PhasePlane(plant, self._drawing.pair, rect) if plant.n > 1 else TimePlot(plant, rect)
+        own = plant.n - inputs_under_way(plant)
+        self._plane = PhasePlane(plant, self._drawing.pair, rect) if own > 1 else TimePlot(plant, rect)
         self._backgrounds: dict[tuple[int, theme.Color, bool], tuple[Any, Any]] = {}
 
     def draw(self, frame: FrameRecord) -> Canvas:

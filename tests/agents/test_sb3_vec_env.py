@@ -234,7 +234,7 @@ def test_attributes():
     ):
         with pytest.raises(AttributeError):
             call()
-    with pytest.raises(AttributeError, match="to call: call vec_env.vector_env.unwrapped.request$"):
+    with pytest.raises(AttributeError, match=r"to call: call vec_env\.vector_env\.unwrapped\.request$"):
         env.env_method("request")
     sync = SB3VecEnv(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
     sync.set_attr("length", 0.7, indices=1)

@@ -207,7 +207,8 @@ def test_phase_plane_draws_the_set_that_the_shield_keeps_and_chooses_states_by_i
     assert any(np.allclose(np.abs(points).max(axis=0), [2.0, 0.1]) for points in drawn)
     shifted = np.array([[10.0, 0.0, 0.0], [10.5, 0.4, 0.05]])  # close to the middle of a set elsewhere
     moved = SimpleNamespace(L=certificate.L, polytope=None, safe_set=_Moved(np.array([10.0, 0.0, 0.0])))
-    assert figures.plane_of(moved, shifted) == (1, 2)
+    assert figures.plane_of(moved, shifted, 3) == (1, 2)
+    assert figures.plane_of(moved, shifted, 2) == (0, 1)  # the third is a past input
 
 
 class _Moved:

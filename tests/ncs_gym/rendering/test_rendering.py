@@ -20,13 +20,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from agents import SB3VecEnv
-from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant
+from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant, SetpointTracking
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.phase_plane import PhasePlane
-from shields import SafetyShield, VectorSafetyShield
+from shields import SafetyShield, VectorSafetyShield, synthesize
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -150,6 +150,42 @@ def test_numbers_around_an_operating_point_are_absolute(monkeypatch):
     env.render()
     assert {"level", "+1.259 m", "heat", "\N{MINUS SIGN}0.25", "pump", "+0.250"} <= set(written)
     assert {"level [m]", "0.2", "1.1", "2", "heat", "\N{MINUS SIGN}3", "\N{MINUS SIGN}1", "1"} <= set(written)
+
+
+@pytest.mark.parametrize("factor", [1.0, 100.0, -0.5])
+def test_target_of_a_multiple_of_a_state_is_that_of_the_state(factor):
+    limits = {"state_limits": (0.2, 2.0), "operating_state": [1.0], "input_limits": (0.0, 1.0), "operating_input": 0.5}
+    names = {"state_names": ("level",), "state_units": ("m",)}
+    plant = LinearPlant(A=[[0.8]], B=[[0.4]], dt=1.0, gamma=1e-4, **limits, **names)
+    own = SetpointTracking(output=[factor], reach=0.5 * abs(factor), width=0.1 * abs(factor))
+    env = make("ncs_gym/LinearNCS-v0", plant=plant, task=own)
+    observation, _ = env.reset(seed=0, options={"state": [0.26]})
+    tracked = env.unwrapped.renderer.frame_record().tracked
+    assert (tracked.name, tracked.unit) == ("level", "m")
+    ends = tracked.value, tracked.target, tracked.low, tracked.high
+    assert ends == pytest.approx((1.26, 1.0 + observation[-1] / factor, 0.5, 1.5))
+
+
+@pytest.mark.parametrize("states", [1, 2])
+def test_past_inputs_are_not_drawn(monkeypatch, states):
+    limits = {"state_limits": (0.2, 2.0), "operating_state": np.ones(states), "input_limits": (0.0, 1.0)}
+    own = {"A": 0.8 * np.eye(states), "B": np.full((states, 1), 0.4), "dt": 20.0, "gamma": 1e-4, "operating_input": 0.5}
+    plant = LinearPlant(**own, **limits, input_delay=1, du_max=0.6, input_names=("valve",))
+    env = SafetyShield(make("ncs_gym/LinearNCS-v0", plant=plant), synthesize(plant))
+    written, draw = [], Canvas.text
+
+    def text(canvas, words, *place, **style):
+        written.append(words)
+        return draw(canvas, words, *place, **style)
+
+    monkeypatch.setattr(Canvas, "text", text)
+    env.reset(seed=0)
+    env.step(np.ones(1, np.float32))
+    env.render()
+    assert not [words for words in written if "ago" in words or "more limits" in words]
+    assert {"x1", "step 1", "20 s"} <= set(written)
+    assert ("time [steps]" in written) == (states == 1)
+    assert written.count("x2") == 2 * (states == 2)  # a bar and an axis
 
 
 @pytest.mark.parametrize(
