@@ -91,12 +91,13 @@ def _figures(evaluation: Evaluation) -> list[str]:
     violating = sum(episode.violation_steps > 0 for episode in episodes)
     returns = [episode.episode_return for episode in episodes]
     interventions = sum(episode.interventions for episode in episodes)
+    count = len(episodes)
     return [
-        f"- mean return: {np.mean(returns):.4g}, of {counted(len(episodes), 'episode')} and {counted(steps, 'step')}",
-        f"- episodes in which the true state violated the safe box: {violating} of {len(episodes)}",
-        f"- violating steps: {sum(episode.violation_steps for episode in episodes)} of {steps}",
-        f"- interventions of the shield: {interventions} of {counted(steps, 'step')}",
-        f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
+        f"- mean return: {np.mean(returns):.4g}, of {counted(count, 'episode')} and {counted(steps, 'step')}",
+        f"- episodes in which the true state violated the safe box: {violating:,} of {count:,}",
+        f"- violating steps: {sum(episode.violation_steps for episode in episodes):,} of {steps:,}",
+        f"- interventions of the shield: {interventions:,} of {counted(steps, 'step')}",
+        f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes):,}",
     ]
 
 

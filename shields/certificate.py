@@ -325,6 +325,10 @@ class Certificate(ReadOnlyArrays):
     def __hash__(self) -> int:
         return hash(self.checksum)
 
+    def __repr__(self) -> str:
+        """Short, in place of all numbers: it is a part of the settings of others."""
+        return f"<Certificate for the plant {self.fingerprint[:16]}, {self.contract or 'without a contract'}>"
+
     def __str__(self) -> str:
         (m, n), recorded, points = self.K.shape, self.provenance, self.between_samples
         claim = f"at all times ({points} of each step, and a bound on what is between them)"

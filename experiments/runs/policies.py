@@ -49,6 +49,9 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize
         nothing = Fallback.of_gain(np.zeros((env.plant.m, env.plant.n)))
         act = controller(_SHORT.get(name, name), env, nothing, seed, tuned_weights(env_id, name))
         return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
+    if name != PRETRAINED and not Path(name).exists():
+        names = ", ".join(each for each in (*UNTRAINED_POLICIES, PRETRAINED) if ":" not in each)
+        raise ValueError(f"no policy {name}: there is no such file or folder, and those with a name are {names}")
     agent, _ = agent_named(name, env_id, vec_normalize)
     if name != PRETRAINED and agent.env_kwargs:
         say(f"{name} was trained with its own {', '.join(agent.env_kwargs)}: here it acts in {env_id} as registered")

@@ -276,7 +276,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If an option is unknown or wrong, or the environment cannot have the channel.
         """
-        start = start_option(options, self._plant.n)
+        start = start_option(options, self._plant)
         read = [links.read((options or {}).get(name), name) for name, links in self._links()]
         fixed = self._process.read_parameters((options or {}).get("parameters"))
         super().reset(seed=seed)

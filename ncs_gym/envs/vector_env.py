@@ -206,7 +206,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         Raises:
             ValueError: If an option is unknown or wrong, or the environments cannot have the channel.
         """
-        mask, starts = vector_reset_options(options, self.num_envs, self._plant.n)
+        mask, starts = vector_reset_options(options, self.num_envs, self._plant)
         links = list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
         read = [each.read((options or {}).get(name), name) for name, each in links]
         fixed = self._process.read_parameters((options or {}).get("parameters"))

@@ -29,12 +29,13 @@ def described(plant: LinearPlant) -> str:
     radius = f"spectral radius {plant.spectral_radius:.6g}"
     stable = f"stable ({radius})"
     unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
+    own = plant.n - inputs_under_way(plant)  # past inputs are known, and their rows limit nothing: inputs have limits
+    states = plant.state_names[:own], plant.state_units[:own]
     extents = {
-        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix)), plant.state_names, plant.state_units),
+        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix))[:own], *states),
         "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *outputs_of(plant)),
-        "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix)), plant.state_names, plant.state_units),
+        "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix))[:own], *states),
     }
-    own = plant.n - inputs_under_way(plant)  # rows of past inputs alone limit nothing: inputs have limits
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],

@@ -41,6 +41,7 @@ from ncs_gym.validation import (
     as_number,
     as_setting,
     as_units,
+    counted,
     own_error_state,
     read_only,
     reason_of,
@@ -493,6 +494,11 @@ class LinearPlant(LimitValues, HardBounds):
 
     def __str__(self) -> str:
         return described(self)
+
+    def __repr__(self) -> str:
+        """Short, in place of all numbers: it is a part of the messages and settings of others."""
+        counts = ((self.n, "state"), (self.m, "input"), (self.p, "output"))
+        return f"<LinearPlant: {', '.join(counted(*each) for each in counts)}, fingerprint {self.fingerprint[:16]}>"
 
     @property
     def assumptions(self) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ def test_every_id_has_a_small_agent_with_its_card(env_id):
     card = (folder_of(env_id) / "README.md").read_text()
     assert f"`{env_id}`" in card
     assert "stable-baselines3 2" in card
-    assert "violating steps: 0 of 40000" in card
+    assert "violating steps: 0 of 40,000" in card
 
 
 @pytest.mark.cases(5)

@@ -182,7 +182,7 @@ ONE_SENTENCE = [
     ("render --out a.avi", "--out must end in one of .gif, .mp4, .png"),
     ("render --env CartPole-v1", "unknown environment 'CartPole-v1'"),
     ("render --out nowhere/a.gif", "No such file or directory"),
-    ("render --policy nowhere", "no agent in nowhere"),
+    ("render --policy nowhere", "no policy nowhere:", "those with a name are greedy, zero, random, lqr"),
     ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
     ("attack --env ncs_gym/CSTR-v0 --noise gaussian", "noise=\"gaussian\" needs a covariance"),
     ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
