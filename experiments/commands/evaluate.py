@@ -74,6 +74,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     others = {name: value for name, value in loop.kwargs.items() if name != "channel"}
     made = ", the plant of its files" if "plant" in others else ""
     made += "".join(f", {name}={value!r}" for name, value in others.items() if name != "plant")
+    made += "" if loop.channel is None else f", channel={loop.channel}"
     what = f"{agent.algorithm} of {folder}{statistics} in {agent.env}{made}"
     print(wrapped(f"{what}, {counted(settings.episodes, 'episode')}"), end="\n\n")
     print(summary_text(arms, {}))

@@ -410,12 +410,13 @@ def _require_limits(arguments: dict[str, Any]) -> None:
 
 
 def _require_operating_input(arguments: dict[str, Any], state: np.ndarray) -> None:
-    """Raises ValueError if limits of inputs with two ends are around an operating input that is not given.
+    """Raises ValueError if limits of inputs with two ends are around an operating input that nobody gave or checks.
 
-    It would be zero, which seldom keeps a plant at an operating state other than zero.
+    It would be zero, which seldom keeps a plant at an operating state other than zero; with `offset` that is checked.
     """
     absolute = [each for each in ("input_limits", "mixed_limits") if arguments.get(each) is not None]
-    if absolute and state.any() and arguments.get("operating_input") is None:
+    is_known = any(arguments.get(each) is not None for each in ("operating_input", "offset"))
+    if absolute and state.any() and not is_known:
         raise ValueError(f"{absolute[0]} are absolute: beside operating_state give operating_input, too (0 if it is)")
 
 

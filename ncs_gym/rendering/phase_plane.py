@@ -103,12 +103,11 @@ class PhasePlane:
         """Draws what moves: the error bound, the path, the stored plan, the estimate and the true state."""
         canvas.clip(self._rect)
         pair = list(self._pair)
-        ellipse = self.pixels_of(frame.estimate[pair] + self._projection(frame.error_shape))
-        ellipse = ellipse.clip(-_MAX_COORDINATE, _MAX_COORDINATE)
+        ellipse = self._drawable(frame.estimate[pair] + self._projection(frame.error_shape))
         canvas.polygon(ellipse, theme.ERROR_FILL)
         canvas.line([*ellipse, ellipse[0]], theme.LATE, 1.0)
         self._draw_path(canvas, frame)
-        draw_plan(canvas, [self._inside(state) for state in frame.planned_states[:, pair]])
+        draw_plan(canvas, [*self._drawable(frame.planned_states[:, pair])])
         canvas.circle(self._inside(frame.estimate[pair]), 5.0, theme.ESTIMATE, width=1.5)
         truth = self._inside(frame.state[pair])
         canvas.circle(truth, 4.0, theme.DANGER if frame.violated else theme.INK)
@@ -116,11 +115,10 @@ class PhasePlane:
             canvas.circle(truth, 9.0, theme.DANGER, width=2.0)
         canvas.clip(None)
         if np.any(np.abs(frame.state[pair] - self._middle) > _AXIS_REACH * self._half):
-            place = self._rect.right - 6, self._rect.y + 9
-            canvas.text("state outside the axes", place, theme.DANGER, align=1.0, bold=True)
+            _say_outside(canvas, self._rect, truth[1])
 
     def _draw_path(self, canvas: Canvas, frame: FrameRecord) -> None:
-        points = [self._inside(state) for state in frame.path[:, list(self._pair)]]
+        points = [*self._drawable(frame.path[:, list(self._pair)])]
         count = len(points)
         for i in range(1, count):
             color = theme.blend(theme.FAINT, theme.INK, i / count)
@@ -135,6 +133,12 @@ class PhasePlane:
     def _projection(self, shape: np.ndarray) -> np.ndarray:
         """Returns points around an ellipsoid's projection onto the two coordinates, shape (k, 2)."""
         return _ellipse_points(shape[np.ix_(self._pair, self._pair)])
+
+    def _drawable(self, points: np.ndarray) -> np.ndarray:
+        """Returns where points, shape (k, 2), are in the frame, those far outside nearer in the same direction."""
+        moved = self.pixels_of(points) - self._center
+        farthest = np.abs(moved).max(axis=1, keepdims=True, initial=1.0)
+        return self._center + np.minimum(1.0, _MAX_COORDINATE / farthest) * moved
 
     def _inside(self, point: np.ndarray) -> np.ndarray:
         """Returns where a point is in the frame, moved to the border if it is outside the axes [pixels]."""
@@ -200,15 +204,18 @@ class TimePlot:
         """Draws what moves: the path, the error bound as a bar, the estimate and the true state."""
         canvas.clip(self._rect)
         count = len(frame.path)
-        points = [(self._x(count - 1 - i), self._y(float(frame.path[i, 0]))) for i in range(count)]
+        points = [(self._x(count - 1 - i), self._height(float(frame.path[i, 0]))) for i in range(count)]
         if count > 1:
             canvas.line(points, theme.MUTED, 1.5)
         _draw_interventions(canvas, points, frame)
+        truth = self._y(float(frame.state[0]))
         x, estimate, bound = self._x(0), float(frame.estimate[0]), float(np.sqrt(frame.error_shape[0, 0]))
         canvas.line([(x, self._y(estimate - bound)), (x, self._y(estimate + bound))], theme.LATE, 3.0)
         canvas.circle((x, self._y(estimate)), 5.0, theme.ESTIMATE, width=1.5)
-        canvas.circle(points[-1], 4.0, theme.DANGER if frame.violated else theme.INK)
+        canvas.circle((x, truth), 4.0, theme.DANGER if frame.violated else theme.INK)
         canvas.clip(None)
+        if abs(float(frame.state[0]) - self._range.middle) > _AXIS_REACH * self._range.half:
+            _say_outside(canvas, self._rect, truth)
 
     def _fill_band(self, canvas: Canvas, low: float, high: float, color: theme.Color) -> None:
         top, bottom = self._y(high), self._y(low)
@@ -217,10 +224,21 @@ class TimePlot:
     def _x(self, age: float) -> float:
         return self._rect.right - 12 - (self._rect.w - 24) * age / RECENT_STEPS
 
-    def _y(self, value: float) -> float:
+    def _height(self, value: float) -> float:
+        """Returns where a value is, above or below the frame if it is outside the axes, but not far [pixels]."""
         half = self._rect.h / 2
         load = (value - self._range.middle) / (_AXIS_REACH * self._range.half)
-        return self._rect.y + half - (half - 2) * float(np.clip(load, -1.0, 1.0))
+        return self._rect.y + half - float(np.clip((half - 2) * load, -_MAX_COORDINATE, _MAX_COORDINATE))
+
+    def _y(self, value: float) -> float:
+        """Returns where a value is, at the border if it is outside the axes [pixels]."""
+        return float(np.clip(self._height(value), self._rect.y + 2, self._rect.bottom - 2))
+
+
+def _say_outside(canvas: Canvas, rect: theme.Rect, y: float) -> None:
+    """Says that the state is outside the axes, on the side where its mark at height y is not."""
+    place = rect.x + rect.w / 2, rect.y + 12 if y > rect.y + rect.h / 2 else rect.bottom - 12
+    canvas.text("state outside the axes", place, theme.DANGER, align=0.5, bold=True)
 
 
 def _axis_title(name: str, unit: str) -> str:

@@ -252,7 +252,7 @@ def _second_search(
     if certificate is not None:
         return certificate
     if was_sought or infeasible.binding in ("B", "E1"):
-        raise _with_hints(infeasible, plant, contract, progress, clock, polytope=polytope) from infeasible
+        raise _with_hints(infeasible, plant, contract, progress, clock, polytope=polytope) from None
     raise infeasible
 
 

@@ -234,17 +234,29 @@ def test_truck_stretches_its_coupling_which_turns_red_near_its_limit_and_its_est
 
 def test_numbers_beside_bars_are_red_only_beyond_their_limit_and_a_state_beyond_the_axes_is_said_to_be():
     limit = resting(REACTOR)[0].plant.half_widths[0]
-    number, corner = theme.Rect(516, 99, 70, 14), theme.Rect(theme.PLANE.right - 150, theme.PLANE.y + 2, 146, 16)
+    number, words = theme.Rect(516, 99, 70, 14), theme.Rect(theme.PLANE.x + 30, theme.PLANE.bottom - 20, 172, 16)
 
     def red_of(fraction):
         pixels = picture((fraction * limit, 0.0, 0.0, 0.0), REACTOR, violated=False)
-        return count(pixels, theme.DANGER, number), count(pixels, theme.DANGER, corner)
+        return count(pixels, theme.DANGER, number), count(pixels, theme.DANGER, words)
 
     near, beyond, far = map(red_of, (0.97, 1.02, 3.0))
     assert near[0] == 0
     assert min(beyond[0], far[0]) > 20
     assert near[1] == beyond[1] < 5
     assert far[1] > 100
+
+
+@pytest.mark.parametrize("far", [5.0, 1e6])
+def test_path_outside_the_axes_is_not_drawn_along_their_border(far):
+    plane = theme.PLANE
+    top = theme.Rect(plane.x + 2, plane.y + 1, plane.w - 4, 20)
+    there = np.array([(-1.5, 0.0), (-1.0, far), (1.0, far), (1.5, 0.0)])
+    empty, gone = picture((1.5, 0.0)), picture((1.5, 0.0), path=there, interventions=np.zeros(4, np.bool_))
+    columns = np.flatnonzero((empty != gone).any(axis=2)[round(top.y) : round(top.y + top.h)].any(axis=0))
+    between = plane.x + plane.w * np.array([0.45, 0.55])
+    assert columns.size  # the ways out and back
+    assert not ((between[0] < columns) & (columns < between[1])).any()
 
 
 def test_packets_are_on_time_late_or_lost_travel_and_are_marked_where_the_contract_forces_them():
