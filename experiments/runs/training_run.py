@@ -90,7 +90,8 @@ class RunResult:
         violating = sum(episode.violation_steps > 0 for episode in self.episodes)
         mean = sum(episode.episode_return for episode in self.episodes) / len(self.episodes)
         training = f"{self.train_violation_steps:,} violating training steps, " if self.train_steps else ""
-        return f"{training}{violating} of {counted(len(self.episodes), 'episode')} violating, return {mean:z.2f}"
+        which = "as trained " if self.scenarios else ""
+        return f"{training}{which}{violating} of {counted(len(self.episodes), 'episode')} violating, return {mean:z.2f}"
 
 
 @dataclass(frozen=True, kw_only=True)

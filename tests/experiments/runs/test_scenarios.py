@@ -16,6 +16,7 @@ from experiments.runs.run_store import RunStore
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
+from tests.experiments.results import run
 
 CRUISE, CART_POLE, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
 ATTACKS = ("attacked", "attacked on an ideal channel")
@@ -25,6 +26,13 @@ ALL = ("worst-case disturbance", "worse channel", "gaussian")
 def run_of(certificate, name, scenarios=ALL, episodes=8):
     settings = CompareSettings(scenarios=scenarios, episodes=episodes)
     return run_of_arm(settings, LoopConfig(env=CRUISE), certificate, name, 0)
+
+
+def test_line_about_a_run_says_under_which_scenario_where_there_are_several():
+    alone = run("shielded", violations=(0, 3))
+    assert alone.outcome == "7 violating training steps, 1 of 2 episodes violating, return -2.00"
+    several = replace(alone, scenarios={"attacked": alone.episodes})
+    assert several.outcome == "7 violating training steps, as trained 1 of 2 episodes violating, return -2.00"
 
 
 def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():
