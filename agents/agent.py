@@ -71,6 +71,10 @@ class Agent:
     is_filtered: bool = False
     kwargs: dict[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Short, in place of all settings."""
+        return f"<Agent: {self.algorithm} in {self.env}, weights {self.checksum[:16]}>"
+
     @property
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of the environment that it was trained in: `gym.make(agent.env, **agent.env_kwargs)`."""

@@ -43,6 +43,11 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
     return _rounded(_rational(matrix).inv())
 
 
+def rank(matrix: np.ndarray) -> int:
+    """Returns the rank of a float matrix, whatever its units."""
+    return int(_rational(matrix).rank())
+
+
 def total(values: np.ndarray) -> float:
     """Returns the sum of all entries, rounded once."""
     return math.fsum(values.ravel().tolist())

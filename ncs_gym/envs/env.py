@@ -127,7 +127,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         disturbance: "ball", "box", "sinusoid" (truncated process noise is added), "sphere", "adversarial" (in
             its place), a `Disturbance`, or a callable (rng, plant, nominal_next) -> d.
         initial_set: Ellipsoid of starting states; by default a tenth of the safe box, where its ends are not symmetric
-            about the operating point of the largest box inside that is.
+            about the operating point of the largest box inside that is; states without a limit start at that point.
         terminate_on_violation: End the episode when the true state leaves the safe box.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
@@ -229,9 +229,11 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         histories = arrival_histories(plant, self._channel, self._certificate_contract)
         self._error_set = histories.recursion.error_set
         if not histories.uses_samples:
+            step = self._channel.quantization_step
+            rounded = f", rounded to {step:g}" if step else ""
             warn_caller(
-                f"no packet is of use: with a quantization step of {self._channel.quantization_step:g} and this sensor "
-                "noise samples move the estimate by less than 1 % of what they differ by, so that it is a prediction",
+                f"no packet is of use: with this sensor noise{rounded}, samples move the estimate by less than 1 % of "
+                "what they differ by, so that it is a prediction",
                 UnusedPacketsWarning,
             )
         self._estimator = Estimator(plant, self._channel, histories=histories)
@@ -471,7 +473,8 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         estimate, number = estimator.numbered(self._committed.pending)
         (applied, committed, missing), table = inputs, estimator.table
         age, damaged = estimator.age, estimator.damaged
-        self._known = Known(estimate, table.shape(number), age, alarm, damaged, applied, committed, table, number)
+        shape, outside = table.shape(number), self._process.alarm
+        self._known = Known(estimate, shape, age, alarm, damaged, applied, committed, table, number, outside)
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)

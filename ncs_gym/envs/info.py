@@ -32,6 +32,7 @@ class Known(NamedTuple):
         committed: The input decided in the last step, of the same shape.
         table: What holds Sigma_k by its number; another one after shapes were forgotten.
         number: That number, an int or shape (N,), by which everything that follows from Sigma_k is found again.
+        outside: Whether `alarm` is also about a step of the process outside E(D), a bool or shape (N,).
     """
 
     estimate: np.ndarray
@@ -43,6 +44,7 @@ class Known(NamedTuple):
     committed: np.ndarray
     table: ErrorTable
     number: Any
+    outside: Any
 
 
 class Constraints(NamedTuple):

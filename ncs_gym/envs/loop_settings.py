@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
@@ -58,7 +59,7 @@ def loop_contracts(
 
 
 def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:
-    """Returns the ellipsoid that states start in, by default {x : |C x|^2 <= 0.1^2}; W bounds what C leaves free.
+    """Returns the ellipsoid that states start in, by default {x : |C x|^2 <= 0.1^2}, and nowhere in what C leaves free.
 
     C are the rows of the largest symmetric box inside the plant's. States that are past inputs start at the operating
     one.
@@ -67,7 +68,9 @@ def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid
         ValueError: If it is none, or of another dimension than the plant.
     """
     if initial_set is None:
-        shape = START_FRACTION**2 * np.linalg.inv(weight_of(plant.symmetric_box))
+        box = plant.symmetric_box
+        is_bounded = exact.rank(box) == plant.n
+        shape = START_FRACTION**2 * (np.linalg.inv(weight_of(box)) if is_bounded else np.linalg.pinv(box.T @ box))
         past = plant.n - inputs_under_way(plant)
         shape[past:], shape[:, past:] = 0.0, 0.0
         return Ellipsoid(shape)

@@ -463,12 +463,12 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         table = self._estimator.histories.table
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        age, damaged = self._estimator.age.copy(), self._estimator.damaged.copy()
+        age, damaged, outside = self._estimator.age.copy(), self._estimator.damaged.copy(), self._process.alarm.copy()
         applied, committed, missing = inputs
         shapes = table.shapes.take(numbers, axis=0)
-        for array in (estimates, shapes, age, alarm, damaged, numbers):
+        for array in (estimates, shapes, age, alarm, damaged, numbers, outside):
             array.setflags(write=False)
-        self._known = Known(estimates, shapes, age, alarm, damaged, applied, committed, table, numbers)
+        self._known = Known(estimates, shapes, age, alarm, damaged, applied, committed, table, numbers, outside)
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced

@@ -78,13 +78,13 @@ def _reads_as_two_sides(value: Any, rows: np.ndarray, n: int) -> bool:
     """Returns whether a box, as it was given and as rows (k, n), reads as (low, high), or as such a pair per state.
 
     Pairs of two states are told from rows by being tuples. Of an array, which is computed, only low = -high is refused,
-    as rows the same limit twice.
+    and of either the same in the other order: as rows that is one limit twice.
     """
     is_computed = not isinstance(value, (tuple, list))
     if rows.shape == (n, 2) and (n != 2 or (not is_computed and all(isinstance(each, tuple) for each in value))):
         return True
     sides = [rows, rows.T] if rows.shape == (2, 2) else [rows] if len(rows) == 2 else []
-    return any(bool((low < high).all()) and (not is_computed or np.array_equal(low, -high)) for low, high in sides)
+    return any(np.array_equal(low, -high) or (not is_computed and bool((low < high).all())) for low, high in sides)
 
 
 def as_operating_point(value: Any, size: int, name: str) -> np.ndarray:
@@ -122,7 +122,9 @@ def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"{name} must be a pair (low, high), each a number or shape ({size},), got {shown(limits)}")
     low, high = (np.broadcast_to(np.asarray(side), (size,)).copy() for side in ends)
     if not (low < high).all():
-        raise ValueError(f"{name} must be (low, high) with low < high everywhere, got {shown(limits)}")
+        raise ValueError(
+            f"{name} must be (low, high), each a number or a vector, with low < high everywhere, got {shown(limits)}"
+        )
     return low, high
 
 
@@ -373,6 +375,7 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
         ValueError: If limits are wrong or given twice, or the operating point is no equilibrium of a model with
             `offset`.
     """
+    arguments = {name: value for name, value in arguments.items() if not _is_no_limit(name, value)}
     _require_limits(arguments)
     given = {name: arguments.get(name) for name in PUBLISHED}
     fields = {name: value for name, value in arguments.items() if name not in PUBLISHED}
@@ -396,6 +399,11 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
         declared = as_bound(np.zeros(n) if bound is None else bound, n, "disturbance_bound")
         fields["disturbance_bound"] = _with_residual(declared, lacking, as_box_rows(fields["box"], n))
     return fields
+
+
+def _is_no_limit(name: str, value: Any) -> bool:
+    """Returns whether an argument is a list of limits without any."""
+    return name in ("output_limits", "mixed_limits") and isinstance(value, list | tuple) and not len(value)
 
 
 def _require_limits(arguments: dict[str, Any]) -> None:

@@ -43,6 +43,12 @@ def inputs_under_way(plant: LinearPlant) -> int:
     return stored
 
 
+def inputs_are_late(plant: LinearPlant) -> bool:
+    """Returns whether inputs take effect steps after they are decided, as with `input_delay`."""
+    stored = inputs_under_way(plant)
+    return stored > 0 and not plant.B[: plant.n - stored].any()
+
+
 def is_row_of_past_input(plant: LinearPlant) -> np.ndarray:
     """Returns which rows of the box `storing` added, shape (k,): nobody gave them, and no input ever reaches them."""
     first, found = plant.n - inputs_under_way(plant), np.zeros(len(plant.box), np.bool_)
@@ -80,8 +86,8 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
     """
     if np.any(plant.initial_cov):
         raise ValueError(
-            "with inputs as states the first error must be given by initial_bound: that of initial_cov is a ball "
-            "in all states, and past inputs are known"
+            "with inputs as states the first error must be given by initial_bound (initial_cov=0 where a plant comes "
+            "with one): that of initial_cov is a ball in all states, and past inputs are known"
         )
     if plant.between_samples is not None:
         raise ValueError("between_samples is for plants without input_delay and without limits of rates")
@@ -146,8 +152,7 @@ def without_past_inputs(plant: LinearPlant) -> tuple[LinearPlant, bool]:
     """
     from ncs_gym.plants.linear_plant import LinearPlant
 
-    m, n = plant.m, plant.n - inputs_under_way(plant)
-    is_late = not plant.B[:n].any()
+    m, n, is_late = plant.m, plant.n - inputs_under_way(plant), inputs_are_late(plant)
     rows = ~plant.box[:, n:].any(axis=1)
     own = LinearPlant(
         A=plant.A[:n, :n],

@@ -28,7 +28,7 @@ class Range(NamedTuple):
 
     Attributes:
         low, high: The limits of the state; where an end is open, or the safe box has none, how far it reaches in the
-            ellipsoid inside the box.
+            ellipsoid inside the box, or how far inputs push it within `RECENT_STEPS` steps if that is less.
     """
 
     low: float
@@ -53,6 +53,12 @@ class Range(NamedTuple):
 def range_of(plant: LinearPlant, index: int) -> Range:
     """Returns the range of a state: between the closest limits of it alone."""
     (low, high), reach = plant.own_limits[:, index].tolist(), float(plant.half_widths[index])
+    if not np.isfinite([low, high]).all():
+        pushed, effect = 0.0, plant.B
+        for _ in range(RECENT_STEPS):
+            pushed += float(np.abs(effect[index]) @ plant.largest_input)
+            effect = plant.A @ effect
+        reach = min(reach, pushed) if pushed > 0.0 else reach
     return Range(low if np.isfinite(low) else -reach, high if np.isfinite(high) else reach)
 
 

@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.past_inputs import is_row_of_past_input
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_covariance
 
@@ -18,7 +19,8 @@ class Regulation(Task):
     """Keep the state near zero: reward -(x'Qx + u'Ru) with the true next state x and the input applied.
 
     Attributes:
-        state_cost: Q, shape (n, n); None: C'C, so that the edge of the safe box costs about 1.
+        state_cost: Q, shape (n, n); None: C'C, so that the edge of the safe box costs about 1. Rows C of past inputs
+            are left out.
         input_cost: R, shape (m, m); None: 0.01 diag(1 / h^2), h half the range of the inputs.
 
     Raises:
@@ -50,6 +52,7 @@ class Regulation(Task):
 
 @lru_cache(maxsize=64)
 def _costs(task: Regulation, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
-    Q = plant.box.T @ plant.box if task.state_cost is None else task.state_cost
+    box = plant.box[~is_row_of_past_input(plant)]
+    Q = box.T @ box if task.state_cost is None else task.state_cost
     R = np.diag(0.01 / plant.input_half**2) if task.input_cost is None else task.input_cost
     return Q, R

@@ -18,6 +18,7 @@ from shields.runtime.safety_filter import MARGIN, SafetyFilter
 from shields.runtime.set_test import FARTHEST, PredictedErrors
 
 ALARM = "a measurement contradicts the assumed bounds"
+OUTSIDE_BOUND = "the simulation saw a step outside the bound on disturbances of the model"
 NOT_FINITE = "a sample held NaN or infinity: where a sensor has no reading, no packet may be sent"
 OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
@@ -37,7 +38,7 @@ OTHER_EPISODE = "the actuator echoes inputs of another episode: tell it the epis
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NOT_KNOWN_INSIDE,
     LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED, NOT_FINITE,
-    OTHER_EPISODE,
+    OTHER_EPISODE, OUTSIDE_BOUND,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 # Follows an explanation where `safe_steps` are left.
@@ -72,11 +73,12 @@ class LoopObservation(NamedTuple):
     Attributes:
         estimate: x_hat, shape (n,) or (n, N); NaN if it is unusable.
         errors: What is known of the error shapes, in the same order.
-        alarm: Whether the innovation monitor raised an alarm.
+        alarm: Whether the innovation monitor raised an alarm, or a simulation saw what it would be about.
         age: Steps since the newest sample used was taken, which is asked for only to explain a large error.
         damaged: Whether that alarm is about a sample that was no finite numbers.
         stays: Whether an error in a certified set is known to stay there while the contract is kept, which its shape
             alone does not say (`ErrorStatistics.certified`).
+        outside: Whether that alarm is about a step that a simulation saw, and perhaps no measurement shows.
     """
 
     estimate: np.ndarray
@@ -85,6 +87,7 @@ class LoopObservation(NamedTuple):
     age: Any = 0
     damaged: Any = False
     stays: Any = False
+    outside: Any = False
 
 
 class GuaranteeMonitor:
@@ -236,12 +239,12 @@ class GuaranteeMonitor:
         self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True
     ) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves: not what was on the way."""
-        estimate, errors, alarm, _, damaged, stays = report
+        estimate, errors, alarm, _, damaged, stays, outside = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
         if alarm is not False or damaged is not False:
-            broken = _first(_first(broken, damaged, NOT_FINITE), alarm, ALARM)
+            broken = _first(_first(_first(broken, damaged, NOT_FINITE), outside, OUTSIDE_BOUND), alarm, ALARM)
         if np.count_nonzero(within) < within.size:  # quicker than all()
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)

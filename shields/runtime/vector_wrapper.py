@@ -207,7 +207,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
     def _observed(self, known: Known) -> LoopObservation:
         errors = self._errors.many(known.table, known.number)
         seen = np.ascontiguousarray(known.estimate), errors, known.alarm, known.age, known.damaged
-        return LoopObservation(*seen, known.table.certified.take(known.number))
+        return LoopObservation(*seen, known.table.certified.take(known.number), known.outside)
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
@@ -261,7 +261,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         errors = self._errors.many(known.table, known.number[done])
         known = known._replace(applied=known.applied[:, done], committed=known.committed[:, done])
         seen = known.estimate[:, done], errors, known.alarm[done], known.age[done], known.damaged[done]
-        report = LoopObservation(*seen, known.table.certified[known.number[done]])
+        report = LoopObservation(*seen, known.table.certified[known.number[done]], known.outside[done])
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
         same_input, on_time = _as_decided(known, decided.input, None if due is None else due[:, done])

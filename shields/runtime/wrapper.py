@@ -316,7 +316,8 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
     def _observed(self, known: Known) -> LoopObservation:
         errors = self._monitored.errors.one(known.table, known.number)
         stays = known.table.is_certified(known.number)
-        return LoopObservation(known.estimate, errors, known.alarm, known.age, known.damaged, stays)
+        seen = known.estimate, errors, known.alarm, known.age, known.damaged
+        return LoopObservation(*seen, stays, known.outside)
 
     def _read_clock(self) -> tuple[int, int]:
         return self._inner.episodes, self._inner.steps

@@ -235,7 +235,7 @@ def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
     Past inputs are within their limits, not in the wider rows that the box has for them.
     """
     rows, past = plant.box, inputs_under_way(plant)
-    is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n
+    is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n and rows.any(axis=0).all()
     if not is_product or not np.isfinite(plant.box_ends).all():
         return None
     order = np.abs(rows).argmax(axis=0)  # the row of each state

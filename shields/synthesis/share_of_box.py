@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from ncs_gym import LinearPlant
+from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.past_inputs import inputs_under_way
 
 # A box with more rows than states is a polytope, whose corners are too many to count in more dimensions or with more
@@ -33,13 +33,15 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
         return {"share_of_box_unknown": "the set is flat in float64"}
     if not plant.is_symmetric and (len(plant.box) != plant.n or not np.isfinite(plant.box_ends).all()):
         return {"share_of_box_unknown": "the volume of limits with two ends that are no box is not computed"}
+    if exact.rank(plant.box) < plant.n:
+        return {"share_of_box_unknown": "the box is unbounded"}
     stored = inputs_under_way(plant)
     if not stored:
         share = _share(plant.box, L)
         return {"share_of_box_unknown": _reason(plant.box)} if share is None else {"share_of_box": share}
     kept = plant.n - stored
     rows = plant.box[plant.box[:, :kept].any(axis=1)]
-    if rows[:, kept:].any() or np.linalg.matrix_rank(rows[:, :kept]) < kept:
+    if rows[:, kept:].any() or exact.rank(rows[:, :kept]) < kept:
         return {"share_of_box_unknown": "the box of the states depends on inputs under way, or is unbounded"}
     share = _share(rows[:, :kept], np.linalg.inv(np.linalg.inv(L)[:kept, :kept]))
     if share is None:
@@ -75,6 +77,4 @@ def _volume(C: np.ndarray) -> float | None:
 
 def _reason(C: np.ndarray) -> str:
     """Returns why there is no share."""
-    if np.linalg.matrix_rank(C) < C.shape[1]:
-        return "the box is unbounded"
     return f"a box of {C.shape[0]} rows in {C.shape[1]} dimensions has too many corners to compute its volume"

@@ -115,6 +115,10 @@ def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, 
     assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate, mode, horizon=horizon))
 
 
+def test_short_form_has_no_settings(agent):
+    assert repr(agent) == f"<Agent: PPO in {CRUISE}, weights {agent.checksum[:16]}>"
+
+
 def test_folder_keeps_how_the_environment_was_made(tmp_path):
     downlink = Channel(loss=0.3, delay=2, max_consecutive_losses=3)
     kwargs = {"downlink": downlink, "between_samples": 8, "observe": ("age",), "channel": Channel(loss=0.1)}

@@ -337,6 +337,8 @@ PLANTS = [
         ({"A": [[0.5]], "B": [[1.0]], "box": [(0.5, 1.0)]}, "box looks like lower and upper limits"),
         ({"A": np.eye(3) / 2, "B": np.ones((3, 1)), "box": [[-1, 1]] * 3}, r"box looks like.*\(state_limits="),
         ({"A": np.eye(3) / 2, "B": np.ones((3, 1)), "box": ([-1, -2, -3], [1, 2, 3])}, "box looks like lower and"),
+        ({"A": np.eye(3) / 2, "B": np.ones((3, 1)), "box": ([1, 2, 3], [-1, -2, -3])}, "box looks like lower and"),
+        ({"box": [[0.05, -0.05], [0.01, -0.01]]}, "box looks like lower and upper limits"),
         (
             {"A": np.eye(3) / 2, "B": np.ones((3, 1)), "box": np.array([[-1, -2, -3], [1, 2, 3]])},
             "box looks like lower and upper limits",

@@ -230,3 +230,41 @@ def test_starts_that_seem_to_be_absolute_are_told():
             env.reset(options={"state": [40.0]})  # 40 is outside, either way
     with pytest.warns(UserWarning, match="inside if it is absolute"):
         many.reset(options={"state": [[1.0], [65.0]]})
+
+
+@pytest.mark.parametrize("limits", [{"box": [5.0, np.inf]}, {"box": [[0.2, 0.0], [0.4, 0.0]]}, {"box": [[1.0, -1.0]]}])
+def test_states_without_a_limit_start_at_the_operating_point(limits):
+    plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=1.0, gamma=1e-4, **limits)
+    env, free = gym.make(LINEAR, plant=plant), np.linalg.svd(plant.box)[2][-1]
+    starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(50)])
+    np.testing.assert_allclose(starts @ free, 0.0, atol=1e-12)
+    assert 0.05 < np.abs(starts @ plant.box.T).max() <= 0.1 + 1e-9
+
+
+def test_past_inputs_cost_nothing_but_what_inputs_do():
+    settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "box": 1.0, "u_max": 1.0, "gamma": 0.0}
+    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
+    plain, limited = (LinearPlant(**settings, **quiet, **each) for each in ({}, {"du_max": 1.9}))
+    returns = []
+    for plant in (plain, limited):
+        env, total = gym.make(LINEAR, plant=plant, channel=Channel()), 0.0
+        env.reset(seed=0, options={"state": np.zeros(plant.n)})
+        for step in range(30):
+            total += env.step(np.float32([0.5 * np.sin(step)]))[1]
+        returns.append(total)
+    assert returns[0] < -0.01
+    assert returns[1] == pytest.approx(returns[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"input_delay": 2}, "input_delay act later than the task's speed moves: give it as a downlink"),
+        ({"operating_input": [1.0]}, "the operating point must count from zero, got 1"),
+    ],
+)
+def test_speeds_are_those_of_inputs_that_act_at_once_from_zero(changes, words):
+    settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "box": 1.0, "u_max": 4.0, "gamma": 1e-4}
+    gym.make(LINEAR, plant=LinearPlant(**settings, du_max=1.0), task=SpeedTracking())
+    with pytest.raises(ValueError, match=words):
+        gym.make(LINEAR, plant=LinearPlant(**settings, **changes), task=SpeedTracking())

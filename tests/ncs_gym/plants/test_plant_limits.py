@@ -31,6 +31,13 @@ def test_rows_stay_what_they_are_when_a_plant_is_replaced():
     np.testing.assert_array_equal(plant.box, plant.box_rows)
 
 
+def test_empty_lists_of_limits_are_none():
+    plain, empty = LinearPlant(**MODEL, box=1.0), LinearPlant(**MODEL, box=1.0, output_limits=[], mixed_limits=[])
+    assert plain.fingerprint == empty.fingerprint
+    with pytest.raises(TypeError, match="LinearPlant needs limits"):
+        LinearPlant(**MODEL, output_limits=[])
+
+
 def test_limits_around_an_operating_point_keep_both_ends():
     plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
     np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-2.0, 5.0]])

@@ -25,7 +25,7 @@ from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS
-from ncs_gym.rendering.phase_plane import PhasePlane
+from ncs_gym.rendering.phase_plane import PhasePlane, range_of
 from shields import SafetyShield, VectorSafetyShield, synthesize
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -164,6 +164,12 @@ def test_target_of_a_multiple_of_a_state_is_that_of_the_state(factor):
     assert (tracked.name, tracked.unit) == ("level", "m")
     ends = tracked.value, tracked.target, tracked.low, tracked.high
     assert ends == pytest.approx((1.26, 1.0 + observation[-1] / factor, 0.5, 1.5))
+
+
+def test_axis_of_a_state_without_a_limit_reaches_as_far_as_inputs_do():
+    plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=2.0, gamma=1e-4, box=[5.0, np.inf])
+    assert range_of(plant, 1).high == pytest.approx(1.0, rel=1e-3)  # 2 * 0.1 / (1 - 0.8)
+    assert range_of(plant, 0) == (-5.0, 5.0)
 
 
 @pytest.mark.parametrize("states", [1, 2])

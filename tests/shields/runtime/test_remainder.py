@@ -1,10 +1,11 @@
 """A plant with a remainder: what its certificate says, and when its guarantee ends."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, Remainder
-from shields import Infeasible, SafetyFilter, SafetyShield, synthesize
+from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSEnv, Remainder
+from shields import Infeasible, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
 from tests.plants import with_remainder
@@ -15,6 +16,7 @@ BOUND = Ellipsoid(1e-4 * np.eye(2))
 EXACT = LinearPlant(**COMMON, disturbance_bound=BOUND)
 LEFT_OUT = Remainder(BOUND, False, "an example")
 LOCAL = with_remainder()
+LINEAR = "ncs_gym/LinearNCS-v0"
 
 
 def late(steps, remainder=LEFT_OUT):
@@ -128,3 +130,23 @@ def test_family_that_the_box_cannot_bear_is_named_by_the_ranges_of_its_parameter
 
     with pytest.raises(Infeasible, match=r"remainder or less \(shrink the ranges of the parameters\)"):
         synthesize(LinearPlant.family(furnace, {"loss": (-6.0, 8.0)}, monotone=True))
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_step_that_no_measurement_shows_is_no_measurement(many):
+    """Two states apart from each other; only the first is measured, and the process differs in the second alone."""
+    bounds = {"disturbance_bound": [0.01, 0.02], "sensor_bound": [0.01], "initial_bound": [0.05, 0.02]}
+    model = {"A": np.diag([0.9, 0.8]), "B": [[0.1], [0.1]], "H": [[1.0, 0.0]], "dt": 1.0, "box": 1.0, "u_max": 2.0}
+    plant = LinearPlant(**model, **bounds)
+    process = FunctionProcess(lambda x, u: plant.A @ x + plant.B @ u + [0.0, 0.3])
+    given = {"plant": plant, "process": process, "allow_assumption_violation": True}
+    certificate = synthesize(plant)
+    if many:
+        env = VectorSafetyShield(gym.make_vec(LINEAR, num_envs=2, **given), certificate, on_unproved="ignore")
+    else:
+        env = SafetyShield(gym.make(LINEAR, **given), certificate, on_unproved="ignore")
+    env.reset(seed=0)
+    info = env.step(np.zeros((2, 1) if many else 1, np.float32))[4]
+    reason = info["shield_reason"][0] if many else info["shield_reason"]
+    assert reason == "the simulation saw a step outside the bound on disturbances of the model"
+    assert np.all(info["assumption_violated"])

@@ -131,7 +131,7 @@ def test_infos_without_cost_are_named():
 @pytest.mark.parametrize("step", [0.15, 0.5, 9.0])  # packets of the first have gains, but make no error bound smaller
 def test_rounding_too_coarse_for_any_update_is_named_once(step):
     with pytest.warns(
-        UnusedPacketsWarning, match=f"no packet is of use: with a quantization step of {step:g}"
+        UnusedPacketsWarning, match=f"no packet is of use: with this sensor noise, rounded to {step:g}, samples"
     ) as caught:
         env = gym.make("ncs_gym/TruckTrailer-v0", channel=Channel(quantization_step=step))
     assert len(caught) == 1

@@ -56,6 +56,18 @@ def test_too_many_corners_are_a_reason_not_a_number(certificate):
     assert "%" not in text
 
 
+@pytest.mark.parametrize(
+    "rows", [[[1, 0], [1, 0]], [[1, 0], [2, 0]], [[1, -1], [2, -2], [3, -3]], [[1, 0], [2, 0], [3, 0]]]
+)
+def test_parallel_rows_bound_nothing_in_the_other_direction(rows):
+    settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "u_max": 1.0}
+    plant = LinearPlant(**settings, box=rows, disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001)
+    certificate = synthesize(plant)
+    assert verify(certificate, plant).valid
+    assert "an unknown share of the safe box (the box is unbounded)" in " ".join(str(certificate).split())
+    assert "polytope_share_of_box" not in certificate.provenance
+
+
 def test_unbounded_box_is_the_reason():
     plant = replace(truck_trailer(), box=np.array([[0.5, 0.0]]))
     assert share_of_box(plant, np.diag([1.0, 5.0])) == {"share_of_box_unknown": "the box is unbounded"}
