@@ -98,11 +98,13 @@ def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProble
     """Returns what a regulator of an environment's task minimizes.
 
     Its cost weighs the error in the task's width, states in units of the box and inputs in units of their limits. The
-    speed error of `SpeedTracking`, e+ = e - dt u, is a state of its own.
+    speed error of `SpeedTracking`, e+ = e - dt u, is a state of its own. For `Regulation` it is what the reward counts.
     """
     plant, task = env.plant, env.task
     if isinstance(task, SetpointTracking):
         return _tracking_problem(plant, task, weights)
+    if isinstance(task, Regulation):
+        return _regulation_problem(plant, task)
     states, effort = np.sqrt(weights.state) * plant.box, np.sqrt(weights.effort + _LEAST_WEIGHT)
     A, B, E, target = plant.A, plant.B, states, np.zeros(plant.n)
     if isinstance(task, SpeedTracking):
@@ -115,6 +117,18 @@ def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProble
     D = np.vstack([np.zeros((len(E), plant.m)), effort * np.diag(1.0 / plant.input_half)])
     E = np.vstack([E, np.zeros((plant.m, len(A)))])
     return RegulatorProblem(A, B, E, D, target)
+
+
+def _regulation_problem(plant: LinearPlant, task: Regulation) -> RegulatorProblem:
+    """Returns the problem of x'Q x + u'R u of the task, with as little more as keeps it well-posed."""
+    costs, units = task.costs(plant), (plant.half_widths, plant.input_half)
+    least = _LEAST_WEIGHT * max((np.diag(cost) * unit**2).max() for cost, unit in zip(costs, units, strict=True))
+    states, inputs = (
+        np.linalg.cholesky(cost + np.diag(least / unit**2)).T for cost, unit in zip(costs, units, strict=True)
+    )
+    E = np.vstack([states, np.zeros((plant.m, plant.n))])
+    D = np.vstack([np.zeros((plant.n, plant.m)), inputs])
+    return RegulatorProblem(plant.A, plant.B, E, D, np.zeros(plant.n))
 
 
 def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: RegulatorWeights) -> RegulatorProblem:

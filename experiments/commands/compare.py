@@ -194,10 +194,10 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
     for name, arm in summary["arms"].items():
         if not arm["shielded"]:
             continue
-        if not arm["train_intervention_rate"] and not arm["intervention_rate"]:
-            findings.append(
-                f"{name}: nothing was overridden, so that this arm shows nothing of the shield: train longer."
-            )
+        evaluated = [arm, *arm.get("conditions", {}).values()]
+        if not arm["train_intervention_rate"] and not any(each["intervention_rate"] for each in evaluated):
+            longer = ": train longer" if arm.get("train_steps") else ""
+            findings.append(f"{name}: nothing was overridden, so that this arm shows nothing of the shield{longer}.")
             continue
         leaves = ", which may be left in this mode; the box may not" if arm["mode"] == "lookahead" else ""
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"

@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.json_values import flat
 from experiments.plots.figure_style import ArmStyle
+from experiments.report.text_tables import proofs_text
 from experiments.runs.arms import Arm
 from experiments.runs.loops import losses_text
 from shields import Report
@@ -40,8 +41,10 @@ def sweep_report(summary: dict[str, Any], verification: Report, figures: Figures
     """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings."""
     title, context = f"Channels of {summary['settings']['env']}", _origin("sweep", summary, verification)
     cells = summary["cells"]
-    trains, losses = _trains([cell["arms"] for cell in cells]), losses_text(cells)
-    return render_page("sweep.html.j2", figures, title=title, trains=trains, losses=losses, **context)
+    context |= {"losses": losses_text(cells), "proofs": proofs_text(cells)}
+    return render_page(
+        "sweep.html.j2", figures, title=title, trains=_trains([cell["arms"] for cell in cells]), **context
+    )
 
 
 def _trains(groups: Sequence[Mapping[str, dict[str, Any]]]) -> bool:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import floor, log10
 from typing import Any
 
 from experiments.runs.loops import losses_text
 from experiments.terminal import text_table, wrapped
+from ncs_gym.validation import counted
 from shields import Certificate, Report
 from shields.certificate_text import size_of
 
 _MOST_DECIMALS = 4
+# Arms and points whose proof did not hold that are listed.
+_MOST_LOST = 6
 # Two lines of the header of what a point of a sweep fixes, by its key.
 _SIDES = {
     "loss": ("", "loss"),
@@ -125,8 +128,24 @@ def sweep_table(cells: list[dict[str, Any]]) -> str:
         rows += [[*point, name, *_outcome(arm)] for name, arm in cell["arms"].items()]
     table = text_table(rows, rules=(2,), left_columns=0, keys=len(swept) + 1)
     above = [f"in all rows: {', '.join(common)}"] if common else []
-    below = [text] if (text := losses_text(cells)) else []
+    below = [text for text in (proofs_text(cells), losses_text(cells)) if text]
     return "\n\n".join([*map(wrapped, above), table, *map(wrapped, below)])
+
+
+def proofs_text(cells: Sequence[dict[str, Any]]) -> str:
+    """Returns where the proof of a shield did not hold in all evaluation episodes, in a sentence; nothing if it did."""
+    swept = [side for side in _SIDES if len({cell.get(side) for cell in cells}) > 1]
+    lost = []
+    for cell in cells:
+        point = ", ".join(f"{_name(side)} {_side_text(side, cell[side])}" for side in swept)
+        for name, arm in cell["arms"].items():
+            held, played = arm["guaranteed_episodes"], arm["eval_episodes"]
+            if arm["shielded"] and held < played:
+                lost.append(f"{name}{' at ' + point if point else ''} ({held:,} of {played:,})")
+    if not lost:
+        return ""
+    more = f" and {counted(len(lost) - _MOST_LOST, 'other')}" if len(lost) > _MOST_LOST else ""
+    return f"The proof held in some evaluation episodes only: {'; '.join(lost[:_MOST_LOST])}{more}."
 
 
 def _name(side: str) -> str:

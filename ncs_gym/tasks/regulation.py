@@ -38,6 +38,10 @@ class Regulation(Task):
                 object.__setattr__(self, name, as_covariance(value, None, name))
         self._make_arrays_read_only()
 
+    def costs(self, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
+        """Returns Q, shape (n, n), and R, (m, m), for a plant."""
+        return _costs(self, plant)
+
     def reward(self, plant, task_state, state, u):  # noqa: D102
         Q, R = _costs(self, plant)
         return -np.add.reduce(state * (Q @ state)) - np.add.reduce(u * (R @ u))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
@@ -12,6 +13,7 @@ from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym import Channel, LinearPlant, NCSEnv, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
+from tests.plants import small
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
 
@@ -65,6 +67,19 @@ def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for(
         controller("greedy", other, rests, 0)
     for name in ("zero input", "K x_hat", "random"):
         controller(name, other, rests, 0)
+
+
+@pytest.mark.parametrize("costs", [{}, {"state_cost": [[1.0, 0.0], [0.0, 0.0]], "input_cost": [[1e-4]]}])
+def test_regulator_of_regulation_is_that_of_its_reward(costs):
+    plant = small([[1.0, 0.1], [0.0, 0.95]], B=[[0.005], [0.1]], box=[1.0, 2.0], gamma=1e-6)
+    env = NCSEnv(plant=plant, task=Regulation(**costs), channel=Channel(max_consecutive_losses=1))
+    Q, R = env.task.costs(plant)
+    P = solve_discrete_are(plant.A, plant.B, Q, R)
+    gain = -np.linalg.solve(R + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
+    states = 0.01 * np.random.default_rng(0).standard_normal((20, 2))
+    for name in ("lqr", "mpc"):
+        actions = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0)(states, {"estimate": states})
+        np.testing.assert_allclose(actions, states @ gain.T / plant.input_half, rtol=5e-3, atol=1e-6)
 
 
 def test_governor_is_refused_where_there_are_no_targets():

@@ -8,7 +8,7 @@ import pytest
 from experiments.analysis.episodes import episodes_table
 from experiments.commands.compare import findings_of
 from experiments.report.html import comparison_report
-from experiments.report.text_tables import scenario_text, summary_text, sweep_table
+from experiments.report.text_tables import proofs_text, scenario_text, summary_text, sweep_table
 from experiments.study.summary import study_summary
 from experiments.study.tables import comparisons_table, evaluation_table, margins_table, prices_table
 from shields import Report
@@ -65,6 +65,19 @@ def test_no_table_prints_a_negative_zero(runs):
 @pytest.mark.parametrize("text", ["-0.0", "-0.0000", "\N{MINUS SIGN}0.0", "[-0.0, 1.0]", "-0"])
 def test_a_negative_zero_would_be_found(text):
     assert NEGATIVE_ZERO.search(f"return {text}")
+
+
+def test_sweep_says_where_the_proof_did_not_hold():
+    broken = cell(loss=0.6)
+    assert proofs_text([cell(), broken]) == ""
+    broken["arms"]["shielded"] |= {"guaranteed_episodes": 1, "eval_episodes": 4}
+    text = "The proof held in some evaluation episodes only: shielded at loss 0.6 (1 of 4)."
+    assert proofs_text([cell(), broken]) == text
+    assert " ".join(sweep_table([cell(), broken]).split()).endswith(text)
+    many = [cell(loss=0.1 * k) for k in range(1, 10)]
+    for each in many:
+        each["arms"]["shielded"] |= {"guaranteed_episodes": 0, "eval_episodes": 4}
+    assert proofs_text(many).endswith("shielded at loss 0.6 (0 of 4) and 3 others.")
 
 
 def test_sweep_says_once_what_all_points_have_in_common():
