@@ -263,6 +263,19 @@ def test_the_shield_is_explained_as_its_mode_acts(mode):
     assert ("where not every input" in swept("shielded", mode=mode)) == (mode == "boundary")
 
 
+@pytest.mark.parametrize(
+    ("arm", "words"),
+    [
+        ("lqr+psf:20", "no disturbance, and no proof. A margin of 20 percent of box and safe set is kept."),
+        ("trusting:lookahead:40", "the shield's lookahead, with the estimate taken for the true state"),
+        ("psf:tube", "whose limits are tightened by a tube; no proof."),
+        ("pretrained+shielded", "the small agent that comes with the package;"),
+    ],
+)
+def test_filters_with_margins_and_agents_of_the_package_are_explained(arm, words):
+    assert words in " ".join("".join(Reader(comparison("shielded", arm)).text).split())
+
+
 def test_every_condition_has_a_table_and_every_arm_an_explanation():
     change = {"scenarios": {"gaussian": run("shielded", violations=(3, 0)).episodes}}
     page = Reader(comparison("shielded", "trusting", "lagrangian", "lqr+psf", "shield at test", change=change))
