@@ -111,8 +111,8 @@ def synthesize(
                     f"{infeasible}; this is around the resting_state that was given, without one the synthesis chooses",
                     infeasible.binding,
                     infeasible.shortfall,
-                ) from infeasible
-            raise _with_changes(infeasible, plant, contract, report, clock, polytope=True) from infeasible
+                ) from None
+            raise _with_changes(infeasible, plant, contract, report, clock, polytope=True) from None
     if safe_set == "ellipsoid":
         known = [each.without_polytope() for each in known if each.keeps_ellipsoid]
     largest, *others = _certificates(plant, contract, report, known, clock, polytope=safe_set != "ellipsoid")
