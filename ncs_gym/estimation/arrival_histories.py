@@ -182,9 +182,8 @@ class ArrivalHistories:
         with self._lock:
             for _ in range(FIRST_STEPS):
                 number = table.after_step(number)
-                updated = table.after_update(number)
-                is_used = self.recursion.prefers(table.statistics(updated), table.statistics(number))
-                if is_used and np.diagonal(H @ table.update(number)[0]).max() >= SMALLEST_SHARE:
+                table.after_update(number)
+                if np.diagonal(H @ table.update(number)[0]).max() >= SMALLEST_SHARE:
                     return True
         return False
 

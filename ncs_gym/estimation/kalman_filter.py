@@ -6,6 +6,7 @@ changes in place, which what many estimators share must not; `Estimator.as_filte
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import ceil, isfinite, log2
 from typing import NamedTuple
 
@@ -123,30 +124,37 @@ class ErrorRecursion:
     def updated(self, statistics: ErrorStatistics) -> tuple[np.ndarray, ErrorStatistics] | None:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
 
-        It is the first gain whose ellipsoid lies inside the certified set of age 0. After the Kalman and the
-        set-membership gain comes the certified one of the estimate's age, which (C2) maps into that set. Without a
-        contract there is none, and None says that the sample must not be used. After an outage no ellipsoid lies inside
-        at first, and the gain is chosen for the way back.
+        It is the first gain whose ellipsoid lies inside the certified set of age 0: the Kalman gain, the set-membership
+        one, then the certified one of the estimate's age, which (C2) maps into that set. After an outage no ellipsoid
+        lies inside at first, and the gain is chosen for the way back.
+
+        Without a contract an update may be left out, so that the ellipsoid must not become larger either. No gain is
+        certified; the last one that is tried is that of the way back, which reaches least far out of the set. If none
+        will do, None says that the sample must not be used.
         """
         covariance, shape, age, _ = statistics
-        sets = self.error_set
-        newest = sets.shape_at(0)
+        certified = self.error_set
+        newest, may_be_left_out = certified.shape_at(0), certified.contract is None
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
-        if kalman is not None and is_inside(updated := self.sets.updated(shape, kalman[0]), newest):
-            return kalman[0], ErrorStatistics(covariance, updated, 0, True)
+        for gain, updated in self._updates(shape, None if kalman is None else kalman[0]):
+            if is_inside(updated, newest) and (not may_be_left_out or self._is_no_larger(updated, shape)):
+                return gain, ErrorStatistics(covariance, updated, 0, True)
+        if may_be_left_out:
+            return None
+        assert age > 0  # every update follows a prediction
+        last = min(age, certified.oldest)  # whatever lies in a set is led back by its gain
+        if is_inside(shape, certified.shapes[last]):
+            return certified.gains[last - 1], ErrorStatistics(covariance, newest, 0, True)  # by (C2)
+        return gain, ErrorStatistics(covariance, updated, 0, False)
+
+    def _updates(self, shape: np.ndarray, kalman_gain: np.ndarray | None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yields gains, (n, p), and the shape after an update with each, (n, n), in the order in which to try them."""
+        if kalman_gain is not None:
+            yield kalman_gain, self.sets.updated(shape, kalman_gain)
         gain = self.sets.gain(shape)
-        updated = self.sets.updated(shape, gain)
-        if not is_inside(updated, newest):
-            if sets.contract is None:
-                return None
-            assert age > 0  # every update follows a prediction
-            last = min(age, sets.oldest)  # whatever lies in a set is led back by its gain
-            if is_inside(shape, sets.shapes[last]):
-                gain, updated = sets.gains[last - 1], newest  # by (C2)
-            else:
-                gain, updated = self.sets.on_the_way_back(shape)
-        return gain, ErrorStatistics(covariance, updated, 0, is_inside(updated, newest))
+        yield gain, self.sets.updated(shape, gain)
+        yield self.sets.on_the_way_back(shape)
 
     def prefers(self, replayed: ErrorStatistics, present: ErrorStatistics) -> bool:
         """Returns whether a replayed history is better than the present one.
@@ -155,8 +163,12 @@ class ErrorRecursion:
         """
         if self.error_set.contract is not None and replayed.age < present.age:
             return True
+        return self._is_no_larger(replayed.shape, present.shape)
+
+    def _is_no_larger(self, shape: np.ndarray, other: np.ndarray) -> bool:
+        """Returns whether a shape is no larger than another one: its squares, in units of the safe box, add up."""
         weight = self.plant.weight
-        return bool(np.vdot(weight, replayed.shape) <= np.vdot(weight, present.shape))
+        return bool(np.vdot(weight, shape) <= np.vdot(weight, other))
 
     def _kalman_update(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns gain and covariance of the Kalman filter; None if it is too ill-conditioned (after a long outage)."""

@@ -215,8 +215,13 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
     plant, contract = PLANTS["batch reactor"]
     sets = certified_error_set(plant, contract)
     recursion = ErrorRecursion(plant, 0.0, sets)
-    monkeypatch.setattr(recursion.sets, "gain", lambda shape: np.full((4, 2), 50.0))
+    useless = np.full((4, 2), 50.0)
     monkeypatch.setattr(recursion, "_kalman_update", lambda covariance: None)
+    monkeypatch.setattr(recursion.sets, "gain", lambda shape: useless)
+    back = recursion.sets.on_the_way_back
+    monkeypatch.setattr(
+        recursion.sets, "on_the_way_back", lambda shape: (useless, recursion.sets.updated(shape, useless))
+    )
 
     def updated(shape, age):
         return recursion.updated(ErrorStatistics(np.eye(4), shape, age, True))
@@ -232,6 +237,10 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
     np.testing.assert_array_equal(gain, sets.gains[-1])
     assert late.certified
     np.testing.assert_array_equal(late.shape, sets.shapes[0])
+    monkeypatch.setattr(recursion.sets, "on_the_way_back", back)
+    gain, inside = updated(sets.shapes[oldest], oldest)  # better than the certified gain, where that would lead inside
+    assert not np.array_equal(gain, sets.gains[-1])
+    assert is_inside(inside.shape, sets.shapes[0])
     _, late = updated(1.1 * sets.shapes[oldest], oldest + 9)
     assert not late.certified
     assert not is_inside(late.shape, sets.shapes[0])
