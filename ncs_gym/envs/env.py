@@ -106,7 +106,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     | `episode_steps` | int | steps | steps taken in this episode |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
     | `packet_arrived` | bool | - | whether a packet arrived at this step |
-    | `assumption_violated` | bool | - | whether a measurement or the process broke a bound since the last reset |
+    | `assumption_violated` | bool | - | whether a measurement or the plant's step broke a bound since the reset |
     | `episode_violations` | float | steps | sum of `cost` in this episode |
     | `is_success` | float | - | 1.0 while `episode_violations` is zero, else 0.0 |
     | `contract_broken` | bool | - | whether the newest sample used is older now than the channel's contract allows |
@@ -129,7 +129,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         initial_set: Ellipsoid of starting states; by default a tenth of the safe box, where its ends are not symmetric
             about the operating point of the largest box inside that is; states without a limit start at that point.
         terminate_on_violation: End the episode when the true state leaves the safe box.
-        allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
+        allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising; infos say so.
         contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
             if the plant is unstable, none if it is stable. A channel that may break it is allowed.
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need

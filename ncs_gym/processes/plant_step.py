@@ -88,6 +88,7 @@ class PlantSimulation:
             self._limit = self._limit[:, None]
         self._is_drawn_ahead = disturbance.memoryless and disturbance.vectorized
         self._trusted = stays_inside(disturbance)
+        self._may_leave = allow_assumption_violation and not self._trusted
         if not self._trusted and not self.process.is_written:
             raise ValueError("a disturbance of your own can act only on a process with write_state: give it one")
         acts = not self._trusted or bool(np.any(self.plant.nominal_disturbance.shape_matrix))
@@ -234,7 +235,8 @@ class PlantSimulation:
         """
         nominal = self._model.A.dot(state) + self._model.B.dot(u)
         if self._is_linear:
-            return self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
+            x_next = self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
+            return self._watched(x_next, nominal) if self._may_leave else x_next
         step = self.process.step if self.size is None else self.process.step_many
         x_next = np.array(step(self._model, guarded(state), u))  # which others may write over
         if self._is_disturbed:
@@ -243,6 +245,10 @@ class PlantSimulation:
             x_next = self._limited(x_next)
         if self._is_disturbed:
             x_next = self.process.write(x_next)
+        return self._watched(x_next, nominal)
+
+    def _watched(self, x_next: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+        """Returns x+, and raises the alarm where x+ - A x - B u lies outside E(D)."""
         gauge = self._model.disturbance.gauge((x_next - nominal).T)  # NaN where it overflows
         self.alarm = self.alarm | np.logical_not(gauge <= 1.0)
         return x_next

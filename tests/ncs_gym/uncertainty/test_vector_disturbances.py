@@ -8,6 +8,9 @@ from ncs_gym import (
     AdversarialDisturbance,
     BallDisturbance,
     BoxDisturbance,
+    Disturbance,
+    FunctionProcess,
+    LinearPlant,
     NCSEnv,
     NCSVectorEnv,
     SinusoidDisturbance,
@@ -85,3 +88,25 @@ def test_disturbances_that_are_drawn_ahead_are_checked(kind):
     env.reset(seed=0)
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert np.abs(info["state"]).max() > 4.0
+
+
+@pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(3, **settings)])
+def test_disturbances_outside_their_bound_violate_the_assumption_at_the_step_at_which_they_act(kind):
+    plant = LinearPlant(
+        A=0.5 * np.eye(2), B=[[0.0], [0.3]], box=1.0, u_max=1.0, dt=0.1,
+        disturbance_bound=0.05, sensor_bound=0.01, initial_bound=0.02,
+    )  # fmt: skip
+    bound = plant.nominal_disturbance.extreme_point(np.array([1.0, 0.3]))
+
+    class Late(Disturbance):
+        """At the fourth step of an episode a little too large, before that on the boundary."""
+
+        def draw(self, rng, plant, nominal_next, step, memory):
+            return (1.001 if step == 3 else 1.0) * bound
+
+    for process in (None, FunctionProcess(lambda x, u: plant.A @ x + plant.B @ u)):
+        env = kind(plant=plant, disturbance=Late(), allow_assumption_violation=True, process=process)
+        env.reset(seed=0)
+        flags = [env.step(np.zeros(env.action_space.shape, np.float32))[4]["assumption_violated"] for _ in range(6)]
+        assert np.array(flags).reshape(6, -1).all(axis=1).tolist() == [False, False, False, True, True, True]
+        assert not np.any(env.reset(seed=1)[1]["assumption_violated"])

@@ -4,10 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel
+from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel, truck_trailer
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.backup_plans.plan_search import completed
-from shields.runtime.guarantee import ALARM
+from shields.runtime.guarantee import ALARM, OUTSIDE_BOUND
 from tests.certificates import certificate_of
 from tests.shields.attacks.cases import case
 
@@ -90,18 +90,23 @@ def test_a_loop_prints_for_how_long_the_box_is_kept():
     assert "in silence" not in str(SafeLoop(CART.certificate, CART.plant, Channel(delay=1), "lookahead"))
 
 
-def test_nothing_is_promised_on_bounds_that_a_measurement_contradicts():
+@pytest.mark.parametrize("broken", [ALARM, OUTSIDE_BOUND])
+def test_nothing_is_promised_on_bounds_that_a_measurement_or_the_simulation_contradicts(broken):
+    plant = truck_trailer(mass=4000.0, delta=0.97)
+    settings = {"noise": "gaussian"} if broken == ALARM else {
+        "disturbance": lambda rng, plant, nominal: 40.0 * plant.disturbance.sample_boundary(rng),
+        "allow_assumption_violation": True,
+    }  # fmt: skip
     env = SafetyShield(
-        gym.make("ncs_gym/TruckTrailerCruise-v0", channel=Channel(), allow_assumption_violation=True,
-                 disturbance=lambda rng, plant, nominal: 40.0 * plant.disturbance.sample_boundary(rng)),
+        NCSEnv(plant, Channel(), **settings), certificate_of(plant),
         mode="lookahead", least_safe_steps=3, on_unproved="ignore",
     )  # fmt: skip
     _, info = env.reset(seed=0)
     assert info["shield_safe_steps"] == 3
     for _ in range(30):
         *_, info = env.step(np.zeros(1, np.float32))
-        assert info["shield_safe_steps"] == 0 or info["shield_reason"] != ALARM
-    assert info["shield_reason"] == ALARM
+        assert info["shield_safe_steps"] == 0 or info["shield_reason"] != broken
+    assert info["shield_reason"] == broken
 
 
 @pytest.mark.parametrize("is_vector", [False, True], ids=["scalar", "vector"])
