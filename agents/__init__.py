@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from agents.loop import BasePolicy, LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
-    from agents.training import TrainingResult, train
+    from agents.training import TrainingResult, train, untrained
 
 __distribution__ = "ncs-gym"
 
@@ -50,6 +50,7 @@ __all__ = [
     "train",
     "tuned_hyperparams",
     "tuned_steps",
+    "untrained",
 ]
 
 _MODULES = {
@@ -62,7 +63,7 @@ _MODULES = {
     "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
     "agent_file": ("AgentError", "pretrained_folder"),
-    "training": ("TrainingResult", "train"),
+    "training": ("TrainingResult", "train", "untrained"),
 }
 # Packages of the extra `train` that modules here import.
 _OF_TRAINING = {"torch", "stable_baselines3"}

@@ -96,7 +96,7 @@ def _figures(evaluation: Evaluation) -> list[str]:
         f"- mean return: {np.mean(returns):.4g}, of {counted(count, 'episode')} and {counted(steps, 'step')}",
         f"- episodes in which the true state violated the safe box: {violating:,} of {count:,}",
         f"- violating steps: {sum(episode.violation_steps for episode in episodes):,} of {steps:,}",
-        f"- interventions of the shield: {interventions:,} of {counted(steps, 'step')}",
+        f"- steps in which the shield, or another filter, intervened: {interventions:,} of {counted(steps, 'step')}",
         f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes):,}",
     ]
 

@@ -121,9 +121,9 @@ class DualAscentCallback(BaseCallback):
 
         multiplier <- max(0, multiplier + learning_rate (J - d)).
 
-    Rollouts shorter than an episode (off-policy algorithms') are taken together until they are as long. J does not wait
-    for episodes to end, which those of many environments do in the same step, and an episode that a violation ends does
-    not count as a cheap one.
+    It is for algorithms that learn from fresh rollouts: a replay buffer keeps rewards at former prices. Rollouts that
+    are shorter than an episode are taken together until they are as long. J does not wait for episodes to end, which
+    those of many environments do in the same step, and an episode that a violation ends does not count as a cheap one.
 
     This is the constrained baseline of Ray et al. 2019 with a plain gradient step in place of Adam, and the PID
     controller of Stooke et al. 2020 with the integral term alone (docs/bibliography.md). The cost is part of

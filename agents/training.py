@@ -163,6 +163,11 @@ def _trainable(
     """
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
+    if loop.lagrangian is not None and algorithm not in ON_POLICY:
+        raise ValueError(
+            f"lagrangian is for {', '.join(ON_POLICY)}, which learn from what they have just done: the replay buffer "
+            f"of {algorithm} keeps rewards with the price of a violation that there was when they were collected"
+        )
     envs = loop.vector(hyperparams["n_envs"])
     if hyperparams.get("stored_action") == "applied" and loop.base_policy is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')

@@ -74,12 +74,16 @@ def arm_summaries(episodes: pd.DataFrame, mode: str) -> dict[str, dict[str, Any]
     """Returns what `arm_summary` says of every arm, by its name and in the order of the rows."""
     arms = {str(name): (Arm.of(str(name), mode), rows) for name, rows in episodes.groupby("arm", sort=False)}
     return {
-        name: arm_summary(rows, arm.mode, fixed_policy=not arm.differs_from_run_to_run)
+        name: arm_summary(
+            rows, arm.mode, fixed_policy=not arm.differs_from_run_to_run, filters_training=arm.filters_training
+        )
         for name, (arm, rows) in arms.items()
     }
 
 
-def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool) -> dict[str, Any]:
+def arm_summary(
+    episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool, filters_training: bool = True
+) -> dict[str, Any]:
     """Returns the summary of an arm, JSON values only.
 
     `eval_violation_rate_ci95` is the Clopper-Pearson interval of the probability that an episode violates, given the
@@ -97,6 +101,7 @@ def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool)
         episodes: Rows of the arm in what `episodes_table` returns.
         mode: Mode of its shield, or name of its other filter; None for neither.
         fixed_policy: Whether the policy is the same in all runs.
+        filters_training: Whether the shield or filter acts in training, too.
     """
     training = episodes.groupby("run")[TRAINING].first()
     steps, violations, interventions = (int(total) for total in training.sum())
@@ -106,6 +111,7 @@ def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool)
     }
     return {
         "mode": mode,
+        "train_mode": mode if filters_training else None,
         "shielded": is_shield(mode),
         "runs": len(training),
         "train_steps": steps,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,8 +72,15 @@ def channel(settings: ChannelSettings) -> None:
 def _promise(settings: ChannelSettings, plant: LinearPlant | None) -> _Promise | None:
     if settings.certificate is not None and plant is not None:
         certificate = Certificate.load(settings.certificate)
-        silence = silence_of(certificate, plant)
-        return _Promise("certificate", plant.dt, certificate.contract, silence and silence.max_age + silence.anywhere)
+        silence, ahead = silence_of(certificate, plant), settings.committed_ahead
+        if certificate.contract is None:
+            return _Promise("certificate", plant.dt, None, None)
+        max_age = certificate.contract.max_age - ahead
+        if max_age < 0:
+            most = certificate.contract.max_age
+            raise ValueError(f"--committed-ahead {ahead}: the certificate's contract is of {most} steps in all")
+        contract = replace(certificate.contract, max_age=max_age)
+        return _Promise("certificate", plant.dt, contract, silence and max_age + silence.anywhere)
     if settings.env is None:
         return None
     env = registered_env(settings.env)
@@ -184,7 +192,15 @@ def _compared(promise: _Promise, found: dict[str, Any]) -> str:
     row = _row(found, contract.max_age)
     share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
     said = f"The {promise.whose}'s contract, a newest sample of at most {counted(contract.max_age, 'step')}, was broken"
-    return f"{said} {how_often(row)}{share}."
+    both = (
+        ""
+        if promise.whose == "environment"
+        else (
+            " Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, which "
+            "--committed-ahead takes off."
+        )
+    )
+    return f"{said} {how_often(row)}{share}.{both}"
 
 
 def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from experiments.report.text_tables import sweep_table
 from experiments.runs.arms import full_names, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.policies import CERTIFICATES
 from experiments.runs.provenance import experiment_provenance
 from experiments.runs.training_run import require_trainable
 from experiments.settings import SweepSettings
@@ -78,6 +79,9 @@ def sweep(settings: SweepSettings) -> None:
         } | experiment_provenance(settings, loops[0], certificates[0], runs)
         figures = sweep_figures(summary, settings.arms)
         certificates[0].save(settings.out / "certificate.json")
+        (settings.out / CERTIFICATES).mkdir(exist_ok=True)
+        for point, certificate in zip(points, certificates, strict=True):
+            certificate.save(settings.out / CERTIFICATES / f"{name_of(point)}.json")
         verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
         files = {
             "episodes.parquet": parquet(pd.concat(parts), summary),

@@ -156,7 +156,10 @@ def _training_caption(arms: ResultsByArm, is_watched: bool) -> str:
     band = f"Lines are means over {runs} runs per arm, bands reach from the lowest to the highest run."
     text = f"Training. {band if runs > 1 else 'One run per arm, so there is no band.'}"
     if is_watched:
-        text += f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many)."
+        text += (
+            f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many). "
+            "Episodes begin together: where those of all environments take more steps, rates rise and fall with them."
+        )
     unfinished = [name for name, results in arms.items() if not np.isfinite(_histories(results)[1]).any()]
     if 0 < len(unfinished) < len(arms):
         text += (

@@ -24,6 +24,8 @@ _SIDES = {
     "burst_length": ("", "burst"),
     "mass_factor": ("", "mass"),
 }
+# Those that not every environment has.
+_OF_SOME = ("downlink_loss", "mass_factor")
 _OUTCOMES = (
     ("", "arm"),
     ("violating", "episodes"),
@@ -67,10 +69,10 @@ def _text(arms: _Arms, above: int, columns: list[_Column], corner: str = "") -> 
     return text_table(rows, rules=(len(titles), len(titles) + above))
 
 
-def _overridden(arm: dict[str, Any], key: str = "intervention_rate") -> str:
+def _overridden(arm: dict[str, Any], key: str = "intervention_rate", mode: str = "mode") -> str:
     """Returns a rate of interventions; in brackets what a monitor would have done."""
     text = f"{100 * arm[key]:.1f}"
-    return {"monitor": f"({text})", None: "-"}.get(arm["mode"], text)
+    return {"monitor": f"({text})", None: "-"}.get(arm[mode], text)
 
 
 def _violating(arm: dict[str, Any]) -> str:
@@ -92,7 +94,7 @@ def _return_text(arm: dict[str, Any]) -> str:
 _Column = tuple[tuple[str, str, str], Callable[[dict[str, Any]], str]]
 _TRAINING: list[_Column] = [
     (("training:", "violating", "steps"), lambda arm: f"{arm['train_violation_steps']:,}"),
-    (("over-", "ridden", "[%]"), lambda arm: _overridden(arm, "train_intervention_rate")),
+    (("over-", "ridden", "[%]"), lambda arm: _overridden(arm, "train_intervention_rate", "train_mode")),
 ]
 _EVALUATION: list[_Column] = [
     (("evaluation:", "violating:", "episodes [%]"), _violating),
@@ -118,7 +120,7 @@ def decimals_of(*numbers: float) -> int:
 def sweep_table(cells: list[dict[str, Any]]) -> str:
     """Returns a row per point of the grid and arm, below a line that says what all points have in common."""
     swept = [side for side in _SIDES if len({cell[side] for cell in cells}) > 1]
-    fixed = [side for side in _SIDES if side not in swept and (side != "downlink_loss" or cells[0][side] is not None)]
+    fixed = [side for side in _SIDES if side not in swept and (side not in _OF_SOME or cells[0][side] is not None)]
     common = [f"{_name(side)} {_side_text(side, cells[0][side])}" for side in fixed]
     if steps := max(arm["train_steps"] for cell in cells for arm in cell["arms"].values()):
         common.append(f"{steps:,} training steps per arm")

@@ -24,6 +24,8 @@ _SHORT = {"zero": "zero input"}
 PRETRAINED = "pretrained"
 # Agents that a message names.
 _MOST_LISTED = 4
+# Folder of a sweep's certificates, one for each channel.
+CERTIFICATES = "certificates"
 
 # Maps an observation, shape (entries,), and its info to an action, shape (m,).
 Policy = Callable[[np.ndarray, dict], np.ndarray]
@@ -109,7 +111,14 @@ def _only_agent(folder: Path) -> Path:
 
 
 def certificate_file(agent: Path) -> Path | None:
-    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none."""
+    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none.
+
+    A sweep has one for each channel, whose name the names of its agents begin with.
+    """
     agent = agent.resolve()
-    folders = [agent, agent.parent.parent] if agent.parent.name == "models" else [agent]
-    return next((file for folder in folders if (file := folder / "certificate.json").is_file()), None)
+    found = [agent / "certificate.json"]
+    if agent.parent.name == "models":
+        run = agent.parent.parent
+        found += [each for each in (run / CERTIFICATES).glob("*.json") if agent.name.startswith(f"{each.stem}-")]
+        found += [run / "certificate.json"]
+    return next((file for file in found if file.is_file()), None)

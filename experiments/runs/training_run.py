@@ -90,7 +90,7 @@ class RunResult:
         violating = sum(episode.violation_steps > 0 for episode in self.episodes)
         mean = sum(episode.episode_return for episode in self.episodes) / len(self.episodes)
         training = f"{self.train_violation_steps:,} violating training steps, " if self.train_steps else ""
-        which = "as trained " if self.scenarios else ""
+        which = "on its channel " if self.scenarios else ""
         return f"{training}{which}{violating} of {counted(len(self.episodes), 'episode')} violating, return {mean:z.2f}"
 
 
@@ -339,7 +339,7 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
 
 def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
     """Raises what training would raise later if agents cannot be trained with the hyperparameters given."""
-    if settings.hyperparams or settings.conf_file is not None:
+    if settings.hyperparams or settings.conf_file is not None or loop.lagrangian is not None:
         from agents import training  # imports torch
 
         training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)

@@ -288,6 +288,8 @@ class ChannelSettings:
         env: Id of an environment whose contract is compared with the record.
         certificate: File of a certificate whose contract is compared with the record, in place of an environment's.
         plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
+        committed_ahead: Steps by which inputs are committed ahead behind a downlink, of --certificate, whose contract
+            counts them, too: samples may be so many steps less old (docs/contracts.md).
         least_safe_steps: Steps that a shield of it in mode "lookahead" promises while the contract is kept: the command
             counts longer silences. Whether it promises them is to be seen in `info["shield_safe_steps"]`.
         out: File for the numbers (JSON).
@@ -300,11 +302,14 @@ class ChannelSettings:
     env: str | None = None
     certificate: Path | None = None
     plant: Path | None = None
+    committed_ahead: int = 0
     least_safe_steps: int = 0
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1))
+        require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1), committed_ahead=0)
+        if self.committed_ahead and self.certificate is None:
+            raise ValueError("--committed-ahead is of --certificate: an environment knows its own")
         if (self.certificate and not self.plant) or (self.env and self.plant):
             raise ValueError("give --certificate and --plant, or --env, whose contract and certificate are known")
         if self.least_safe_steps and self.env is None and self.certificate is None:

@@ -245,6 +245,11 @@ class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorAr
     def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
+        if not hasattr(env, "channel"):
+            raise ValueError(
+                "VectorRandomChannel is for an NCSVectorEnv, or another one in VectorNetworked, got "
+                f"{env.unwrapped}: gymnasium's sync and async ones take RandomChannel around each environment"
+            )
         self._drawn: dict[_Which, _Draw] = {}
         self.draw_from(channel, downlink)
 

@@ -106,6 +106,18 @@ def as_point(value: Any, size: int, name: str) -> np.ndarray:
     return as_vector([value] if size == 1 and numbers is not None and numbers.ndim == 0 else value, size, name)
 
 
+def as_points(value: Any, size: int, name: str) -> np.ndarray:
+    """Returns what `as_point` does, or many of these, shape (N, size).
+
+    Raises:
+        ValueError: If a row is no finite vector of this size.
+    """
+    numbers = as_numbers(value)
+    if numbers is None or numbers.ndim != 2:
+        return as_point(value, size, name)
+    return np.array([as_point(row, size, name) for row in numbers]).reshape(len(numbers), size)
+
+
 def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Returns the low and the high ends of limits, shape (size,) each; infinite where there is none.
 

@@ -643,19 +643,19 @@ class LinearPlant(LimitValues, HardBounds):
         """Returns a physical state, input or output as its deviation from the operating point.
 
         Args:
-            value: Shape (n,), (m,) or (p,).
+            value: Shape (n,), (m,) or (p,), or of many environments (N, n), (N, m) or (N, p).
             of: "state", "input" or "output"; the output at the operating point is H x0.
 
         Raises:
-            ValueError: If `of` is none of these, or the value no finite vector of its size.
+            ValueError: If `of` is none of these, or the values are no finite vectors of its size.
         """
         center = self._operating_value(of)
-        return limits.as_point(value, len(center), f"the {of}") - center
+        return limits.as_points(value, len(center), f"the {of}") - center
 
     def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
         center = self._operating_value(of)
-        return limits.as_point(value, len(center), f"the {of}") + center
+        return limits.as_points(value, len(center), f"the {of}") + center
 
     def _operating_value(self, of: str) -> np.ndarray:
         values = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}

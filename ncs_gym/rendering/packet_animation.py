@@ -11,7 +11,7 @@ from ncs_gym.validation import counted
 _FADE_STEPS, _DRIFT = 2, 27.0
 # Pixels between the sensor and a packet just sent, and between an arriving packet and the controller.
 _DEPARTURE_GAP, _ARRIVAL_GAP = 40.0, 22.0
-# Of several packets closer together than this only the oldest is labeled [pixels].
+# Of several packets closer together than this only one is labeled, that lost at this step or the oldest [pixels].
 _LABEL_SPACING = 100.0
 
 
@@ -23,23 +23,23 @@ def draw_packets(canvas: Canvas, frame: FrameRecord, start: float, end: float) -
     arrived = any(packet.arrival == frame.step for packet in frame.packets)
     _draw_endpoint(canvas, start, "sensor", 1.0, active=sent)
     _draw_endpoint(canvas, end, "controller", 0.0, active=arrived)
-    in_flight = []
+    in_flight, labeled, middle = [], [], 0.5 * (start + end)
     for packet in frame.packets:
         if packet.arrival is None:
-            _draw_lost(canvas, 0.5 * (start + end), frame.step - packet.stamp)
+            _draw_lost(canvas, middle, frame.step - packet.stamp)
+            labeled += [middle] * (frame.step == packet.stamp)
         elif frame.step <= packet.arrival:
             length = end - start - _DEPARTURE_GAP - _ARRIVAL_GAP
             x = start + _DEPARTURE_GAP + length * _progress(packet, frame.step)
             in_flight.append((frame.step - packet.stamp, x))
     for age, x in in_flight:
         canvas.line([(start + 10, y), (x, y)], theme.blend(_color(age), theme.PAPER, 0.6), 2.5)
-    labeled = float("inf")
     for age, x in in_flight:
         _draw_envelope(canvas, (x, y), _color(age))
-        if age and abs(x - labeled) > _LABEL_SPACING:
+        if age and all(abs(x - other) > _LABEL_SPACING for other in labeled):
             text = f"{counted(age, 'step')} late"
             canvas.text(text, (x, y - 18), theme.INK, align=0.5, bold=True)
-            labeled = x
+            labeled.append(x)
 
 
 def _progress(packet: PacketRecord, step: int) -> float:

@@ -67,7 +67,7 @@ class Family(ReadOnlyArrays):
 
         Args:
             given: A dictionary of some parameters, each a number or, for many environments, shape (size,); None for
-                an empty one.
+                an empty one. Or all of them in the order of `names`, shape (k,) or (size, k), as infos have them.
             size: Number of environments; None without that axis.
             anywhere: Whether parameters beyond their ranges are allowed.
 
@@ -75,8 +75,13 @@ class Family(ReadOnlyArrays):
             ValueError: If it is no such dictionary, or there is no such member.
         """
         values = np.full((1 if size is None else size, len(self.names)), np.nan)
+        in_order = None if isinstance(given, Mapping) else as_numbers(given)
+        if in_order is not None and in_order.shape in ((len(self.names),), (size, len(self.names))):
+            given = dict(zip(self.names, in_order.T, strict=True))
         if given is not None and not (isinstance(given, Mapping) and set(given) <= set(self.names)):
-            raise ValueError(f"options['parameters'] must be a dictionary of {list(self.names)}, got {shown(given)}")
+            raise ValueError(
+                f"options['parameters'] must be a dictionary of {list(self.names)}, or all of them, got {shown(given)}"
+            )
         for name, value in (given or {}).items():
             numbers, column = as_numbers(value), self.names.index(name)
             if numbers is None or numbers.shape not in ((), (size,)) or not np.isfinite(numbers).all():

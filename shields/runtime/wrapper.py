@@ -349,5 +349,6 @@ def _hint_for(env: Any) -> str:
     if isinstance(inner, NCSVectorEnv):
         return ": use VectorSafetyShield for a vectorized environment"
     if isinstance(inner, VectorEnv):
-        return ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
+        each = "make_vec(..., vectorization_mode='sync', wrappers=[SafetyShield])"
+        return f": for gymnasium's sync and async vector environments give {each}"
     return ", which has no linear model with bounds: docs/own_plant.md says how one is given to it"

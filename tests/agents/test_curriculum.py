@@ -174,6 +174,9 @@ def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_in
 
 def test_specification_of_vector_wrappers_makes_no_environments_without_them():
     envs = gym.make_vec(ID, num_envs=2)
+    for other in (gym.make_vec(CLASSIC, num_envs=2), gym.make_vec(ID, num_envs=2, vectorization_mode="sync")):
+        with pytest.raises(ValueError, match=r"VectorRandomChannel is for an NCSVectorEnv.* take RandomChannel around"):
+            VectorRandomChannel(other, [Channel()])
     made_of = [VectorSafetyShield(envs), VectorRandomChannel(envs, [Channel()]), CostPenalty(envs, 1.0)]
     made_of.append(VectorNetworked(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"), Channel(delay=1)))
     for env in made_of:

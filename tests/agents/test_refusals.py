@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -74,6 +75,8 @@ HYPERPARAMS = [
 
 CALLS = [
     (partial(train, CRUISE, 64, 0, "SAC", REPLAY), "a training of 64 steps trains nothing: learning starts after 64"),
+    (partial(train, replace(CRUISE, lagrangian=LagrangianSettings()), 2000, 0, "SAC"),
+     "lagrangian is for PPO, A2C, TRPO, which learn from what they have just done: the replay buffer of SAC keeps"),
     (partial(train, CRUISE, -5, 0), "steps must be at least 1, got -5"),
     (partial(train, CRUISE, 64, 0, "DQN"), "unknown algorithm 'DQN'"),
     (partial(require_trainable, CRUISE, 2_000, "SAC", {}), "a training of 2,000 steps trains nothing"),

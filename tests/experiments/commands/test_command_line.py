@@ -16,6 +16,7 @@ import pytest
 
 import shields
 from agents.agent import Agent
+from experiments.runs.policies import certificate_file
 from ncs_gym import truck_trailer
 from shields import Certificate, certify
 from tests.certificates import feasible_bounds_not_sought
@@ -308,6 +309,39 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_worke
         again = succeeded("sweep", "--config", out / "settings.json")
     assert "2 of 4 runs were finished before" in again.stderr
     assert json.loads((out / "summary.json").read_text()) == summary
+
+
+@pytest.mark.slow
+def test_agents_of_a_sweep_are_evaluated_behind_the_certificate_of_their_own_channel(tmp_path, without_workers):
+    grid = ["--env", "ncs_gym/CartPoleTwoWay-v0", "--losses", 0.2, "--delays", 1, "--downlink-losses", 0, 0.3]
+    out = tmp_path / "sweep"
+    succeeded("sweep", *grid, "--episodes", 3, "--steps", 256, "--arms", "shielded", "--seeds", 1, "--out", out)
+    ages = []
+    for cell in json.loads((out / "summary.json").read_text())["cells"]:
+        agent = out / "models" / f"loss0.2-delay1-burst0.0-down{cell['downlink_loss']}-shielded-0"
+        ages.append(Certificate.load(certificate_file(agent)).contract.max_age)
+        assert cell["arms"]["shielded"]["eval_proved_steps"] == 600
+        assert "The guarantee held after 600 of 600 steps." in succeeded("evaluate", agent, "--episodes", 3).prose
+    assert ages == [6, 8]
+    assert Certificate.load(out / "certificate.json").contract.max_age == 6
+
+
+def test_certificate_of_an_agent_is_that_beside_it_then_that_of_its_channel_then_that_of_its_run(tmp_path):
+    agent, single = tmp_path / "models" / "loss0.2-delay1-shielded-0", tmp_path / "agent"
+    for folder in (agent, single, tmp_path / "certificates"):
+        folder.mkdir(parents=True)
+    assert certificate_file(agent) is certificate_file(single) is None
+    last = tmp_path / "certificate.json"
+    for file in (
+        last,
+        tmp_path / "certificates" / "loss0.2-delay1.json",
+        agent / "certificate.json",
+    ):
+        (tmp_path / "certificates" / "loss0.2-delay10.json").touch()
+        file.touch()
+        assert certificate_file(agent) == file
+        assert certificate_file(tmp_path / "models" / "loss0.5-delay1-shielded-0") == last
+    assert certificate_file(single) is None
 
 
 def assert_verdict_first(printed, last):

@@ -117,8 +117,41 @@ def test_channel_compares_a_record_with_a_certificate_of_one_s_own_as_with_that_
     own = ("--certificate", tmp_path / "certificate.json", "--plant", tmp_path / "plant.json")
     both = own, ("--env", "ncs_gym/CartPole-v0")
     texts = [succeeded("channel", file, *given, "--least-safe-steps", 3).prose for given in both]
-    assert texts[0].replace("The certificate's contract", "The environment's contract") == texts[1]
+    behind = " Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, which"
+    behind += " --committed-ahead takes off."
+    assert behind in texts[0]
+    assert texts[0].replace("The certificate's contract", "The environment's contract").replace(behind, "") == texts[1]
     assert "The certificate's contract, a newest sample of at most 4 steps, was broken" in texts[0]
+
+
+def test_samples_have_what_inputs_committed_ahead_leave_of_a_certificate_s_contract(record, tmp_path):
+    file = record(0.02 * np.arange(500), delay=0.01, loss=0.4, seed=1)
+    env = gym.make("ncs_gym/CartPoleTwoWay-v0").unwrapped
+    ahead = env.certificate_contract.max_age - env.contract.max_age
+    assert ahead > 0
+    env.plant.save(tmp_path / "plant.json")
+    certificate_for(env.plant, env.certificate_contract).save(tmp_path / "certificate.json")
+    own = (
+        "--certificate",
+        tmp_path / "certificate.json",
+        "--plant",
+        tmp_path / "plant.json",
+        "--committed-ahead",
+        ahead,
+    )
+    ours, theirs = (succeeded("channel", file, *each).prose for each in (own, ("--env", "ncs_gym/CartPoleTwoWay-v0")))
+    assert theirs.partition("The environment's")[2] in ours.partition("The certificate's")[2].replace(
+        " Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, which "
+        "--committed-ahead takes off.",
+        "",
+    )
+    for given, words in (
+        ((*own[:-1], 9), "--committed-ahead 9: the certificate's contract is of 8 steps in all"),
+        (("--committed-ahead", 1), "--committed-ahead is of --certificate"),
+    ):
+        refused = ncs("channel", file, *given)
+        assert refused.returncode == 2
+        assert words in refused.stderr
 
 
 def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(record):

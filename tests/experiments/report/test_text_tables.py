@@ -41,6 +41,14 @@ def cell(**changes):
     return {"mean_loss": given["loss"]} | given
 
 
+def test_arms_that_nothing_filters_in_training_have_no_share_of_overridden_training_steps():
+    summary = summary_of(results_of(1, ("unshielded", "shielded", "shield at test")), seeds=1)
+    training = summary_text(summary["arms"], {}).partition("\n\n")[0].splitlines()
+    last = {line[:14].strip(): line.split()[-1] for line in training[-3:]}
+    assert last["unshielded"] == last["shield at test"] == "-"
+    assert float(last["shielded"]) >= 0.0
+
+
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("runs", [1, 2])
 def test_no_table_prints_a_negative_zero(runs):
@@ -82,7 +90,7 @@ def test_sweep_says_where_the_proof_did_not_hold():
 
 def test_sweep_says_once_what_all_points_have_in_common():
     first, table = sweep_table([cell(), cell(loss=0.6)]).split("\n\n")
-    common = "in all rows: delay 2, quantization own, burst none, mass own, 200 training steps per arm"
+    common = "in all rows: delay 2, quantization own, burst none, 200 training steps per arm"
     assert " ".join(first.split()) == common
     _, header, _, *rows = table.splitlines()
     assert header.split()[:2] == ["loss", "arm"]

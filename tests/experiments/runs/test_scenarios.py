@@ -32,7 +32,7 @@ def test_line_about_a_run_says_under_which_scenario_where_there_are_several():
     alone = run("shielded", violations=(0, 3))
     assert alone.outcome == "7 violating training steps, 1 of 2 episodes violating, return -2.00"
     several = replace(alone, scenarios={"attacked": alone.episodes})
-    assert several.outcome == "7 violating training steps, as trained 1 of 2 episodes violating, return -2.00"
+    assert several.outcome == "7 violating training steps, on its channel 1 of 2 episodes violating, return -2.00"
 
 
 def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():

@@ -78,6 +78,20 @@ def between(function, ranges, count, seed=0):
         (HULL, [np.hstack([each.A, each.B]) for each in TRUCKS], (2.0, 2.0, 4.0)),
     ],
 )
+def test_states_of_many_environments_are_moved_to_the_operating_point_and_back():
+    plant = LinearPlant(
+        A=0.9, B=0.1, dt=0.1, state_limits=(1.0, 3.0), input_limits=(0.0, 1.0),
+        operating_state=2.0, operating_input=0.4,
+        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
+    )  # fmt: skip
+    many = np.array([[0.5], [-0.25], [0.0]])
+    np.testing.assert_array_equal(plant.from_deviation(many), [[2.5], [1.75], [2.0]])
+    np.testing.assert_array_equal(plant.to_deviation(plant.from_deviation(many, "input"), "input"), many)
+    np.testing.assert_array_equal(plant.from_deviation([0.5]), [2.5])
+    with pytest.raises(ValueError, match=r"the state must have shape \(1,\)"):
+        plant.from_deviation(np.zeros((3, 2)))
+
+
 def test_bound_holds_every_member_exactly_and_is_not_far_larger(plant, members, widths):
     gauge = largest_gauge(plant, members, widths)
     assert 0.4 < gauge <= 1

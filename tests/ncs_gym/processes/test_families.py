@@ -60,6 +60,19 @@ def test_what_the_members_declare_is_drawn_beside():
     assert 0.99 < min(gauges) <= max(gauges) <= 1.0
 
 
+def test_parameters_that_infos_have_are_options_again():
+    for plant in (FAMILY, TRUCKS):
+        env, envs = NCSEnv(plant), NCSVectorEnv(3, plant=plant)
+        for each in (env, envs):
+            met = each.reset(seed=1)[1]["parameters"]
+            again = each.reset(seed=2, options={"parameters": met})[1]["parameters"]
+            np.testing.assert_array_equal(again, met)
+        with pytest.raises(ValueError, match=r"must be a dictionary of \['.*\], or all of them, got"):
+            env.reset(options={"parameters": np.ones(len(plant.members.names) + 1)})
+        with pytest.raises(ValueError, match="or all of them, got"):
+            envs.reset(options={"parameters": np.ones((2, len(plant.members.names)))})
+
+
 def test_options_fix_some_parameters_or_all():
     env = NCSEnv(FAMILY)
     _, info = env.reset(seed=0, options={"parameters": {"stiffness": 4400.0}})
