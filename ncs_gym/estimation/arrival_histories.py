@@ -182,8 +182,9 @@ class ArrivalHistories:
         with self._lock:
             for _ in range(FIRST_STEPS):
                 number = table.after_step(number)
-                table.after_update(number)
-                if np.diagonal(H @ table.update(number)[0]).max() >= SMALLEST_SHARE:
+                updated = table.after_update(number)
+                is_used = self.recursion.prefers(table.statistics(updated), table.statistics(number))
+                if is_used and np.diagonal(H @ table.update(number)[0]).max() >= SMALLEST_SHARE:
                     return True
         return False
 

@@ -125,22 +125,19 @@ class ErrorRecursion:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
 
         It is the first gain whose ellipsoid lies inside the certified set of age 0: the Kalman gain, the set-membership
-        one, then the certified one of the estimate's age, which (C2) maps into that set. After an outage no ellipsoid
-        lies inside at first, and the gain is chosen for the way back.
-
-        Without a contract an update may be left out, so that the ellipsoid must not become larger either. No gain is
-        certified; the last one that is tried is that of the way back, which reaches least far out of the set. If none
-        will do, None says that the sample must not be used.
+        one, that of the way back, which reaches least far out of the set, and under a contract the certified one of the
+        estimate's age, which (C2) maps into the set. After an outage no ellipsoid lies inside at first, and the way
+        back is taken. Without a contract the sample must not be used then, which None says.
         """
         covariance, shape, age, _ = statistics
         certified = self.error_set
-        newest, may_be_left_out = certified.shape_at(0), certified.contract is None
+        newest = certified.shape_at(0)
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
         for gain, updated in self._updates(shape, None if kalman is None else kalman[0]):
-            if is_inside(updated, newest) and (not may_be_left_out or self._is_no_larger(updated, shape)):
+            if is_inside(updated, newest):
                 return gain, ErrorStatistics(covariance, updated, 0, True)
-        if may_be_left_out:
+        if certified.contract is None:
             return None
         assert age > 0  # every update follows a prediction
         last = min(age, certified.oldest)  # whatever lies in a set is led back by its gain
@@ -163,12 +160,8 @@ class ErrorRecursion:
         """
         if self.error_set.contract is not None and replayed.age < present.age:
             return True
-        return self._is_no_larger(replayed.shape, present.shape)
-
-    def _is_no_larger(self, shape: np.ndarray, other: np.ndarray) -> bool:
-        """Returns whether a shape is no larger than another one: its squares, in units of the safe box, add up."""
         weight = self.plant.weight
-        return bool(np.vdot(weight, shape) <= np.vdot(weight, other))
+        return bool(np.vdot(weight, replayed.shape) <= np.vdot(weight, present.shape))
 
     def _kalman_update(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns gain and covariance of the Kalman filter; None if it is too ill-conditioned (after a long outage)."""

@@ -185,17 +185,19 @@ def test_samples_are_used_however_wide_the_box_of_another_state_is(current, chan
     assert np.mean(speeds) < (0.1 if channel == Channel() else 0.4) * np.sqrt(Sigma[0, 0])
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_without_a_contract_a_sample_that_is_used_makes_no_ellipsoid_larger_and_is_left_out_else(seed):
-    plant = random_plant(seed, 2 + seed % 3, 1, p=1 + seed % 2)
-    recursion = ErrorRecursion(plant, 0.01, certified_error_set(plant))
-    rng, known, used = np.random.default_rng(seed), recursion.first, 0
-    for _ in range(60):
-        known = recursion.predicted(known)
-        if (update := recursion.updated(known)) is not None and rng.random() < 0.5:
-            assert np.vdot(plant.weight, update[1].shape) <= np.vdot(plant.weight, known.shape)
-            known, used = update[1], used + 1
-    assert used >= 10
+def test_an_update_may_enlarge_what_later_steps_shrink():
+    """Where the trace decided at the step of the sample, late ones were skipped: 1.48 in place of .22."""
+    plant = LinearPlant(
+        A=[[0.02, 0.63], [-1.1, -0.07]], B=[[1.0], [1.0]], H=[[0.05, 1.4]], box=[0.5, 650.0], u_max=1.0, dt=0.1,
+        disturbance_bound=[0.076, 0.001], sensor_bound=[0.007], initial_bound=[0.8, 0.2],
+    )  # fmt: skip
+    estimator, traces = Estimator(plant, Channel(delay=1)), []
+    estimator.reset(np.zeros(2))
+    for step in range(1, 201):
+        estimator.advance(np.zeros(1), [Packet(step - 1, np.zeros(1))] if step > 1 else [])
+        traces.append(np.vdot(plant.weight, estimator.estimate.shape))
+        assert estimator.age == 1
+    assert np.mean(traces[100:]) < 0.05 * np.vdot(plant.weight, certified_error_set(plant).Sigma)
 
 
 def test_under_a_contract_gains_that_are_tried_leave_smaller_bounds_than_the_certified_one():
