@@ -329,9 +329,9 @@ class RenderSettings:
         out: File to write: .gif, .mp4, or .png for the last frame alone.
         log: Folder of the logs of `ncs loop`: draws the last steps of its newest episode, of the plant that `--env`
             names, into a .png.
-        policy: "greedy" (toward the task's target as hard as it can), "zero", "random", a regulator ("lqr", "governor",
-            "mpc"), "pretrained" (the small agent that comes with the package), the folder of a trained agent, or a zip
-            that `model.save` of stable-baselines3 wrote.
+        policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
+            "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
+            package), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
         vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
