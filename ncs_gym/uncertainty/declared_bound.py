@@ -68,7 +68,7 @@ def sample_box(bound: Ellipsoid, rng: np.random.Generator, count: int | None = N
     Returns:
         Shape (n,), or (n, count).
     """
-    axes = bound.factor / np.sqrt(max(np.count_nonzero(bound.factor.any(axis=0)), 1))
+    axes = bound.factor * bound.drawn_axes / np.sqrt(np.count_nonzero(bound.drawn_axes))
     return axes @ rng.uniform(-1.0, 1.0, bound.dim if count is None else (bound.dim, count))
 
 

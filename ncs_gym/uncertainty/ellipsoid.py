@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 # Directions whose variance is below this fraction of the largest count as flat: about 100 float64 roundings.
 FLAT = 2e-14
+# Points are not drawn along axes whose variance is below this fraction of the largest: so thin is the room for rounding
+# that a declared bound without an extent there was given (`LinearPlant`, a disturbance with two ends).
+THIN = 1e-7
 # A point this far off a flat ellipsoid, relative to its extent, still counts as rounding.
 OFF_FLAT = 1e-12
 # Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried;
@@ -66,10 +69,13 @@ class Ellipsoid(ReadOnlyArrays):
         return scale, values, vectors
 
     @cached_property
-    def _extended(self) -> np.ndarray:
-        """Which principal axes have a length, shape (n,); all of them for a single point, where it does not matter."""
+    def drawn_axes(self) -> np.ndarray:
+        """Which columns of the factor points are drawn along, shape (n,): those that are neither flat nor thin.
+
+        All of them for a single point, where it does not matter.
+        """
         _, values, _ = self._principal_axes
-        return (values > 0.0) | (not values.any())
+        return (values > THIN * values[-1]) | (not values.any())
 
     @own_error_state
     def support(self, direction: np.ndarray) -> np.ndarray | float:
@@ -108,7 +114,7 @@ class Ellipsoid(ReadOnlyArrays):
     @own_error_state
     def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
         """Returns a uniformly distributed point, shape (n,), or `count` of them, shape (count, n)."""
-        radius = rng.random(None if count is None else (count, 1)) ** (1.0 / np.count_nonzero(self._extended))
+        radius = rng.random(None if count is None else (count, 1)) ** (1.0 / np.count_nonzero(self.drawn_axes))
         return self.sample_boundary(rng, count) * radius
 
     @own_error_state
@@ -117,7 +123,7 @@ class Ellipsoid(ReadOnlyArrays):
 
         Of a flat ellipsoid they lie on its own boundary, not inside it: the sphere has as many dimensions as it.
         """
-        directions = rng.standard_normal(self.dim if count is None else (count, self.dim)) * self._extended
+        directions = rng.standard_normal(self.dim if count is None else (count, self.dim)) * self.drawn_axes
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)) @ self.factor.T
 
     @own_error_state

@@ -72,7 +72,7 @@ def between(function, ranges, count, seed=0):
 
 def test_states_of_many_environments_are_moved_to_the_operating_point_and_back():
     plant = LinearPlant(
-        A=0.9, B=0.1, dt=0.1, state_limits=(1.0, 3.0), input_limits=(0.0, 1.0),
+        A=[[0.9]], B=[[0.1]], dt=0.1, state_limits=(1.0, 3.0), input_limits=(0.0, 1.0),
         operating_state=2.0, operating_input=0.4,
         disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
     )  # fmt: skip

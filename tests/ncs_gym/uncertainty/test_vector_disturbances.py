@@ -1,5 +1,7 @@
 """Disturbances of many environments at once: within their bound, and like those of one."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from ncs_gym import (
     Disturbance,
     FunctionProcess,
     LinearPlant,
+    MovedOperatingPointWarning,
     NCSEnv,
     NCSVectorEnv,
     SinusoidDisturbance,
@@ -88,6 +91,29 @@ def test_disturbances_that_are_drawn_ahead_are_checked(kind):
     env.reset(seed=0)
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert np.abs(info["state"]).max() > 4.0
+
+
+@pytest.mark.parametrize("size", [0.02, 0.0002])
+@pytest.mark.parametrize("name", ["box", "ball"])
+def test_a_load_about_a_middle_that_is_not_zero_is_drawn_between_its_ends(name, size):
+    """The point where its middle rests is rounded, and the bound has room for that in all directions."""
+    E = size * np.array([[0.5], [1.0]])
+    drawn = {}
+    for ends in ((-0.5, 0.5), (0.0, 1.0)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MovedOperatingPointWarning)
+            plant = LinearPlant(
+                A=[[0.8, 0.0], [0.1, 0.7]], B=[[0.4], [0.0]], dt=1.0, box=[1.0, 1.0], u_max=1.0,
+                disturbance_bound=(E, *ends), sensor_bound=0.01, initial_bound=0.02,
+            )  # fmt: skip
+        env = NCSVectorEnv(2000, plant=plant, disturbance=name)
+        before = env.reset(seed=0)[1]["state"]
+        *_, infos = env.step(np.zeros(env.action_space.shape, np.float32))
+        d = infos["state"] - before @ plant.A.T - infos["input"] @ plant.B.T
+        drawn[ends] = np.sort(d @ E[:, 0] / (E.T @ E).item())
+        assert np.abs(d - np.outer(d @ E[:, 0], E[:, 0]) / (E.T @ E).item()).max() < 1e-6 * size
+    for load in drawn.values():  # deviations from the middle
+        np.testing.assert_allclose(load, np.linspace(-0.5, 0.5, 2000), atol=0.04)
 
 
 @pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(3, **settings)])
