@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import inf
 from pathlib import Path
@@ -95,7 +95,7 @@ def requirements(settings: RequirementsSettings) -> None:
     for table in tables:
         print(table.text, end="\n\n")
     sentences = [
-        *map(_boundary_text, found.largest_ages),
+        *(_boundary_text(each, _late(found)) for each in found.largest_ages),
         *(() if log is None else _log_texts(log, found, today, plant)),
         _today_text(found, today),
         _requests_text(found, settings),
@@ -315,18 +315,28 @@ def _index_of(found: Requirements, network: Network) -> int | None:
     return next((i for i, point in enumerate(found.points) if point.network == network), None)
 
 
-def _boundary_text(largest: LargestAge) -> str:
-    network = largest.network
+def _late(found: Requirements) -> list[int]:
+    """Returns by how many steps inputs are late in the networks asked about, which ages of contracts count."""
+    return sorted({point.network.input_delay for point in found.points})
+
+
+def _boundary_text(largest: LargestAge, late: list[int]) -> str:
+    network, counted_too = largest.network, late[0] if len(late) == 1 else 0
     where = network.setting.capitalize()
-    if largest.certified is None:
+    if counted_too:
+        where += f", inputs {counted(counted_too, 'step')} late"
+    if largest.certified is None or largest.certified < counted_too:
         return f"{where}: no certificate was found for any age of the newest sample that was asked."
     if largest.certified == inf:
         return f"{where}: a certificate needs no samples at all."
-    time = in_time(largest.certified * network.sampling_period)
-    text = f"{where}: the newest sample may be {largest.certified:g} steps ({time}) old"
+    age = largest.certified - counted_too
+    steps = f"{age:g} steps ({in_time(age * network.sampling_period)})"
+    text = f"{where}: the newest sample may be {steps} old"
+    if len(late) > 1:
+        text = f"{where}: the age of the newest sample and the steps that inputs are late may be {steps} together"
     beyond = "; no older one was asked"
     if largest.none_found is not None:
-        beyond = f"; for {_shown_age(largest.none_found)} no certificate was found"
+        beyond = f"; for {_shown_age(largest.none_found - counted_too)} no certificate was found"
     return f"{text}{beyond}."
 
 
@@ -335,16 +345,23 @@ def _log_texts(log: PacketLog, found: Requirements, today: Network | None, plant
     yield log.read_as
     yield log.disagreement
     widest = "The widest contract with a certificate"
+    late = _late(found)
     asked = [
-        (widest if each.none_found is not None else f"{widest} of those asked", each.network, each.certified)
+        (
+            (widest if each.none_found is not None else f"{widest} of those asked")
+            + (f" for inputs {counted(steps, 'step')} late" if len(late) > 1 else ""),
+            replace(each.network, input_delay=steps),
+            each.certified,
+        )
         for each in found.largest_ages
+        for steps in late
     ]
     if today is not None and today.contract is not None:
         asked.insert(0, ("Today's contract", today, today.contract.max_age))
     if any(each.certified == inf for each in found.largest_ages):
         yield "A certificate that needs no samples at all keeps whatever the record lost."
     for which, network, age in asked:
-        if age is not None and age != inf:
+        if age is not None and age != inf and age >= network.input_delay:
             dt, oldest = network.sampling_period, int(age) - network.input_delay
             (row,) = (each for each in broken_contracts(log.ages(dt), dt, (oldest,)) if each["max_age"] == oldest)
             yield f"{which}, {counted(oldest, 'step')} of {dt:g} s, the record breaks {how_often(row)}."

@@ -234,7 +234,8 @@ class RequirementsSettings(BackendSettings):
         losses: Most packets lost in a row; "any" for no limit, which only stable plants can bear.
         delays: Fixed delays of a sample [steps].
         jitters: Largest further delays [steps].
-        input_delays: Steps from a decision until its input takes effect, as behind a network to the actuator.
+        input_delays: Steps from a decision until its input takes effect, as behind a network to the actuator, by which
+            the newest sample must be less old.
         quantization_steps: Steps of the quantizer, in the units of the measurements; 0 for none.
         disturbances: Factors on the radii of the disturbances.
         noises: Factors on the radii of sensor noise and first errors.

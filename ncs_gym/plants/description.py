@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ncs_gym.plants.past_inputs import inputs_under_way
+from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
 from ncs_gym.validation import counted
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def described(plant: LinearPlant) -> str:
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [row_limit(plant, j) for j in range(len(plant.box)) if plant.box[j, :own].any()],
+        "safe box": [row_limit(plant, j) for j in np.flatnonzero(~is_row_of_past_input(plant)).tolist()],
         "input limits": [
             _between(name, low, high, center, unit)
             for name, low, high, center, unit in zip(

@@ -11,6 +11,7 @@ import numpy as np
 
 from ncs_gym.network.channel import Packet
 from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.plants.description import mixed_limit
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
@@ -102,7 +103,7 @@ class FrameRecord:
         committed: The input decided in that step, shape (m,); behind a downlink it is applied later. None at reset.
         violations: Number of steps of this episode with a violation.
         violated: Whether the true state violated the safe box in the step that led here.
-        worst: Largest |c_j x| of that step: now, and between samples where they count (`between_samples`).
+        worst: `worst_constraint_values` of that step, shape (k + q,).
         measurement_age: Steps since the newest measurement used was taken.
         missing_inputs: Number of steps of this episode in which the downlink broke and zero was applied.
         input_missing: Whether that was so in the step that led here.
@@ -124,7 +125,7 @@ class FrameRecord:
     committed: np.ndarray | None
     violations: int
     violated: bool
-    worst: float
+    worst: np.ndarray
     measurement_age: int
     missing_inputs: int
     input_missing: bool
@@ -143,9 +144,14 @@ class FrameRecord:
         return annotation is not None and annotation.intervened and annotation.protects
 
     @property
-    def violated_between_samples(self) -> bool:
-        """Whether the true state violated the safe box in the step that led here, and is inside it again."""
-        return self.violated and bool((self.plant.constraint_values(self.state) <= 0.0).all())
+    def broken_elsewhere(self) -> str:
+        """What the step that led here broke that its state does not show: a limit of inputs, or one between samples."""
+        of_states, mixed = np.split(self.worst, [len(self.plant.box)])
+        if (mixed > 0.0).any():
+            return f"broken: {mixed_limit(self.plant, int(mixed.argmax()))}"
+        if self.violated and (self.plant.constraint_values(self.state) <= 0.0).all():
+            return f"{1.0 + of_states.max():.3f} of a limit between two samples"
+        return ""
 
     @property
     def planned_states(self) -> np.ndarray:
@@ -238,7 +244,7 @@ class EpisodeRecord:
         self._path.append(info["state"].copy())
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._violations, self._violated = int(info["episode_violations"]), bool(info["cost"] > 0.0)
-        self._worst = 1.0 + float(info["worst_constraint_values"].max())
+        self._worst = info["worst_constraint_values"].copy()
         self._measurement_age = int(info["measurement_age"])
         self._input_missing = bool(info["downlink_broken"])
         self._forced.append(bool(info["request_forced"]))

@@ -29,9 +29,9 @@ def draw_header(canvas: Canvas, frame: FrameRecord) -> None:
     color, fill = (theme.DANGER, theme.DANGER_FILL) if count else (theme.SAFE, theme.SAFE_FILL)
     left = _draw_label(canvas, theme.WIDTH - 16, text, color, fill, filled=frame.violated)
     _draw_shield(canvas, frame, left - 10)
-    if frame.violated_between_samples:
-        text, place = f"{frame.worst:.3f} of a limit between two samples", (theme.WIDTH - 16, theme.HEADER.h + 13)
-        canvas.text(text, place, theme.DANGER, theme.BODY, align=1.0, bold=True)
+    if text := frame.broken_elsewhere:
+        place, width = (theme.WIDTH - 16, theme.HEADER.h + 13), theme.WIDTH - 32
+        canvas.text(text, place, theme.DANGER, theme.BODY, align=1.0, bold=True, max_width=width)
     if frame.missing_inputs:
         text = f"downlink broken {frame.missing_inputs}\N{MULTIPLICATION SIGN}: zero applied"
         canvas.text(text, (16, theme.HEADER.h + 13), theme.DANGER, theme.BODY, bold=frame.input_missing)

@@ -157,6 +157,9 @@ def _kind_and_share(certificate: Certificate) -> tuple[str, float]:
 class LargestAge(NamedTuple):
     """How old the newest sample may become, for one sampling period, quantization step and size of what disturbs.
 
+    Ages are those of contracts for both directions: the steps that inputs are late count, so that the newest sample may
+    be so many steps less old (docs/contracts.md).
+
     Attributes:
         network: A network of these.
         certified: Largest age for which a certificate verified [steps]; None if there is none.

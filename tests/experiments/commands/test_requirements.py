@@ -207,3 +207,22 @@ def test_channel_refuses_a_file_in_one_sentence(content, words, tmp_path):
     assert found.returncode != 0
     assert len(found.stderr.strip().splitlines()) == 1
     assert words in found.stderr
+
+
+def test_age_of_the_newest_sample_is_said_without_the_steps_by_which_inputs_are_late(
+    plant_file, tmp_path, without_workers
+):
+    given = ("requirements", "--plant", plant_file, "--send-periods", 1, "--losses", 0)
+    for late in ((0,), (2,), (0, 2)):
+        out = tmp_path / "-".join(map(str, late))
+        said = succeeded(*given, "--input-delays", *late, "--out", out).prose
+        (largest,) = json.loads((out / "summary.json").read_text())["largest_ages"]
+        if late == (2,):
+            assert f"inputs 2 steps late: the newest sample may be {largest['certified'] - 2} steps (" in said
+            assert f"for {largest['none_found'] - 2} no certificate was found" in said
+        elif late == (0,):
+            assert f": the newest sample may be {largest['certified']} steps (" in said
+        else:
+            together = "the age of the newest sample and the steps that inputs are late may be"
+            assert f": {together} {largest['certified']} steps (" in said
+            assert " together; for " in said

@@ -108,3 +108,13 @@ def test_text_shows_slanted_rows_and_the_operating_point():
     assert "-0.333333 <= u1 <= 1 (operating point 0.333333)" in text
     assert "It is assumed that the first estimate is exact." in " ".join(text.split())
     assert "nan" not in text
+
+
+def test_limits_of_coupled_inputs_are_listed_where_inputs_take_effect_later():
+    plant = LinearPlant(
+        A=0.9 * np.eye(2), B=np.eye(2), dt=0.1, box=[1.0, 2.0], u_max=[1.0, 1.0],
+        disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.01, input_delay=1,
+        mixed_limits=[([0.0, 0.0], [1.0, 1.0], -0.5, 0.5)],
+    )  # fmt: skip
+    assert "|2 u1 of 1 step ago +2 u2 of 1 step ago| <= 1\n" in str(plant)
+    assert str(plant).count("of 1 step ago") == 2  # rows of past inputs alone limit nothing

@@ -20,7 +20,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from agents import SB3VecEnv
-from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant, SetpointTracking
+from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, SetpointTracking
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.canvas import Canvas
@@ -367,14 +367,42 @@ def test_picture_says_that_the_box_was_left_between_two_samples_where_that_count
     assert inside
     if points is None:
         assert (frame.violated, red) == (False, 0)
-        assert frame.worst <= 1.0
+        assert (frame.worst <= 0.0).all()
+        assert frame.broken_elsewhere == ""
     else:
         assert frame.violated
-        assert frame.worst == 1.0 + info["worst_constraint_values"].max() > 1.0
+        assert (
+            frame.broken_elsewhere
+            == f"{1.0 + info['worst_constraint_values'].max():.3f} of a limit between two samples"
+        )
         assert red > 20
         assert changed(picture_of(env, replace(frame, worst=frame.worst + 1.0)), shown, place) > 0
         env.step(np.array([0.0], np.float32))
-        assert not env.renderer.frame_record().violated_between_samples
+        assert env.renderer.frame_record().broken_elsewhere == ""
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"du_max": 0.1}, "broken: |u1 - u1 of 1 step ago| <= 0.1"),
+        ({"mixed_limits": [([0.0, -1.0], [1.0], -0.5, 0.6)]}, "broken: -0.5 <= u1 - x2 <= 0.6"),
+    ],
+)
+def test_picture_names_a_broken_limit_of_inputs_that_states_do_not_show(limits, said):
+    plant = LinearPlant(
+        A=[[0.95, 0.1], [0.0, 0.9]], B=[[0.0], [0.1]], dt=0.1, box=[1.0, 2.0], u_max=1.0,
+        disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.01, **limits,
+    )  # fmt: skip
+    env = NCSEnv(plant, render_mode="rgb_array")
+    env.reset(seed=0)
+    place = theme.Rect(10, theme.HEADER.h + 5, theme.WIDTH - 20, 16)
+    *_, info = env.step(np.zeros(1, np.float32))
+    assert (info["cost"], count(env.render(), theme.DANGER, place)) == (0.0, 0)
+    *_, info = env.step(np.ones(1, np.float32))
+    assert info["cost"] == 1.0
+    assert (info["constraint_values"] <= 0.0).all()
+    assert env.renderer.frame_record().broken_elsewhere == said
+    assert count(env.render(), theme.DANGER, place) > 20
 
 
 def test_packets_are_lost_and_late_as_the_channel_says():
