@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -137,7 +137,8 @@ class LoopConfig:
         kwargs: Keyword arguments of the environment (`gym.make(env, **kwargs)`), JSON values or the objects that they
             stand for: `{"channel": {"loss": 0.5}}` or `{"channel": Channel(loss=0.5)}`. None keeps the id's own.
         shield: Settings of the shield; None applies the agent's actions as they are.
-        filter: Puts another safety filter around vector environments, in place of a shield.
+        filter: Puts another safety filter around vector environments, in place of a shield. Evaluations leave out the
+            `penalty` of a dataclass, and keep what any other function subtracts from rewards.
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
@@ -202,8 +203,11 @@ class LoopConfig:
     @property
     def without_penalties(self) -> LoopConfig:
         """The same loop as it is evaluated: with the environment's own rewards, the policy's actions being complete."""
-        shield = self.shield and replace(self.shield, penalty=0.0)
-        return replace(self, shield=shield, violation_penalty=0.0, lagrangian=None, base_policy=None)
+        shield, filtered = self.shield and replace(self.shield, penalty=0.0), self.filter
+        if is_dataclass(filtered) and not isinstance(filtered, type) and hasattr(filtered, "penalty"):
+            filtered = replace(filtered, penalty=0.0)
+        bare = {"violation_penalty": 0.0, "lagrangian": None, "base_policy": None}
+        return replace(self, shield=shield, filter=filtered, **bare)
 
     def single(self, **settings: Any) -> gym.Env:
         """Returns one environment, with the shield; penalties of violations, filter and base policy are for vectors.

@@ -341,12 +341,13 @@ def _proportional(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     `SetpointTracking` the certified gain about the equilibrium at the target, u = u_s + K (x_hat - x_s); for other
     tasks, whose target is rest, the fallback.
     """
+    first = env.plant.n
     if isinstance(env.task, SpeedTracking):
         direction = np.eye(env.plant.m)[env.task.input_index] / env.plant.dt
-        return lambda observations, estimates: observations[:, -1:] * direction
+        return lambda observations, estimates: observations[:, first : first + 1] * direction
     if not isinstance(env.task, SetpointTracking):
         return _fallback(env, fallback, seed)
-    first, (x_s, u_s) = env.plant.n, equilibrium(env.plant, env.task.output)
+    x_s, u_s = equilibrium(env.plant, env.task.output)
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
         target = observations[:, first : first + 1].astype(np.float64)

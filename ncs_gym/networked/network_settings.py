@@ -18,7 +18,7 @@ from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of, largest_age
 from ncs_gym.network.downlink import downlink_protocol
-from ncs_gym.networked.observations import Entries, has_floats, parts_of, zero_of
+from ncs_gym.networked.observations import Entries, has_floats, parts_of, snapshot, zero_of
 from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, counted, setting, shown, warn_caller
 
 # Keys of infos that are the network's own.
@@ -189,7 +189,7 @@ def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
         raise ValueError(
             f"before the first command arrives some action has to act, and {shown(actions)} has no zero: give neutral="
         )
-    action = np.asarray(given, actions.dtype) if isinstance(actions, spaces.Box) else given
+    action = np.array(given, actions.dtype) if isinstance(actions, spaces.Box) else snapshot(given)
     if not actions.contains(action):
         raise ValueError(f"neutral must be an action, got {shown(given)}")
     return action

@@ -225,7 +225,8 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             self._applied, self._action_age = self._actuator.exchange(rng, self._steps, actions)
         if self._keeps_actions:
             self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
-        observations, rewards, terminated, truncated, info = self.env.step(self._applied)
+        # A copy: environments may change their actions in place, and these may act again.
+        observations, rewards, terminated, truncated, info = self.env.step(self._applied.copy())
         self._steps += 1
         done = terminated | truncated
         sampled = observations

@@ -205,7 +205,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             self._decided.append(snapshot(action))
         if self._requests is not None:
             self._requests.decide(self._oldest)
-        observation, reward, terminated, truncated, info = self.env.step(applied)
+        # A copy: environments may change their actions in place, and this one may act again.
+        observation, reward, terminated, truncated, info = self.env.step(snapshot(applied))
         self._step = step = step + 1
         if step == PATIENCE and self._requests is not None and not self._is_asked:
             warn_caller(

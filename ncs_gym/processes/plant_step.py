@@ -115,7 +115,7 @@ class PlantSimulation:
             noise = plant.process_noise.sample(rng, count, truncated=self._truncated).T
         if not self._is_drawn_ahead:
             return noise
-        d = source.draw(rng, plant, noise, None, None)
+        d = source.draw(rng, plant, noise if self._trusted else noise.copy(), None, None)
         fits = self._trusted or np.shape(d) == noise.shape  # another shape could be broadcast; the check refuses it
         return self._sum(d, noise if fits else None, count)
 
@@ -262,6 +262,8 @@ class PlantSimulation:
         if self._is_drawn_ahead:
             return self.process_noise.next(rng)
         draw = source.draw if self.size is None else source.draw_many
+        if not self._trusted:  # code of others may write into what it is given
+            nominal, steps = nominal.copy(), steps if self.size is None else steps.copy()
         d = draw(rng, self.plant, nominal, steps, memory)
         return self._sum(d, None if source.replaces_process_noise else self.process_noise.next(rng), self.size)
 

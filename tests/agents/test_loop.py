@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from agents.loop import CostPenalty, LoopConfig, ShieldSettings
+from experiments.baselines.filters import EstimateFilterSettings
 from ncs_gym import Channel
 from shields import SafetyShield, VectorSafetyShield
 
@@ -54,6 +57,14 @@ def test_loop_without_penalties_has_the_environments_own_rewards(certificate):
     assert isinstance(loop.vector(1), CostPenalty)
     assert not isinstance(loop.without_penalties.vector(1), CostPenalty)
     assert loop.without_penalties.shield.penalty == 0.0
+    settings = EstimateFilterSettings("trusting", certificate, penalty=3.0)
+    assert LoopConfig(env=CRUISE, filter=settings).without_penalties.filter == replace(settings, penalty=0.0)
+    assert LoopConfig(env=CRUISE, filter=own_filter).without_penalties.filter is own_filter
+
+
+def own_filter(env):
+    """A filter about whose rewards nothing is known."""
+    return env
 
 
 def test_changed_arguments_are_those_of_the_changed_loop_alone():

@@ -129,6 +129,8 @@ def test_speed_controllers_remove_the_error():
     u = env.plant.u_max * proportional(error, {"estimate": estimates})
     np.testing.assert_allclose(u[0] * env.plant.dt, 1.5)
     np.testing.assert_allclose(u[1], -env.plant.u_max)
+    more = np.hstack([error, [[3.0, 0.1], [0.0, 0.2]]]).astype(np.float32)  # an age and a half-width, with observe=
+    np.testing.assert_array_equal(proportional(more, {"estimate": estimates}), u / env.plant.u_max)
     regulator, x, left = controller("lqr", env, Fallback.of_gain(np.zeros((1, 2))), 0), np.zeros(2), 8.0
     for _ in range(40):
         u = env.plant.u_max * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]

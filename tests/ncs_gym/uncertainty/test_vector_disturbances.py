@@ -93,6 +93,28 @@ def test_disturbances_that_are_drawn_ahead_are_checked(kind):
     assert np.abs(info["state"]).max() > 4.0
 
 
+@pytest.mark.parametrize("promised", [(), ("vectorized",), ("vectorized", "memoryless")])
+@pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(3, **settings)])
+def test_a_disturbance_that_writes_into_what_it_is_given_moves_nothing(kind, promised):
+    class Scratch(Disturbance):
+        locals().update(dict.fromkeys(promised, True))
+
+        def draw(self, rng, plant, nominal_next, step, memory):
+            nominal_next += 1.0
+            if isinstance(step, np.ndarray):
+                step += 7
+            return np.zeros_like(nominal_next)
+
+    plant = truck_trailer(gamma=0.01, process_noise_cov=np.zeros((2, 2)))
+    env = kind(plant=plant, disturbance=Scratch())
+    _, info = env.reset(seed=0)
+    for step in range(1, 6):
+        before = info["state"]
+        *_, info = env.step(env.action_space.sample())
+        np.testing.assert_allclose(info["state"], before @ plant.A.T + info["input"] @ plant.B.T, atol=1e-12)
+        assert (np.asarray(info["episode_steps"]) == step).all()
+
+
 @pytest.mark.parametrize("size", [0.02, 0.0002])
 @pytest.mark.parametrize("name", ["box", "ball"])
 def test_a_load_about_a_middle_that_is_not_zero_is_drawn_between_its_ends(name, size):
