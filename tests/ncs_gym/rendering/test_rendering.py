@@ -8,6 +8,7 @@ import sys
 import warnings
 from dataclasses import replace
 from functools import cache, partial
+from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
@@ -403,6 +404,26 @@ def test_picture_names_a_broken_limit_of_inputs_that_states_do_not_show(limits, 
     assert (info["constraint_values"] <= 0.0).all()
     assert env.renderer.frame_record().broken_elsewhere == said
     assert count(env.render(), theme.DANGER, place) > 20
+
+
+def test_labels_of_packets_do_not_lie_on_each_other(monkeypatch):
+    env, written, write = make(channel=Channel(delay=2, loss=0.5)).unwrapped, [], Canvas.text
+
+    def noted(canvas, text, place, *arguments, **options):
+        written.append((text, *place))
+        return write(canvas, text, place, *arguments, **options)
+
+    monkeypatch.setattr(Canvas, "text", noted)
+    env.reset(seed=0)
+    seen = set()
+    for _ in range(30):
+        env.step(np.zeros(1, np.float32))
+        written.clear()
+        env.render()
+        places = sorted((x, text) for text, x, y in written if y == theme.PACKET_LINE - 18)
+        seen |= {text for _, text in places}
+        assert all(later[0] - earlier[0] > 80.0 for earlier, later in pairwise(places)), places
+    assert seen == {"lost", "1 step late", "2 steps late"}
 
 
 def test_packets_are_lost_and_late_as_the_channel_says():
