@@ -41,10 +41,10 @@ _Arms = dict[str, dict[str, Any]]
 def summary_text(arms: _Arms, baselines: _Arms) -> str:
     """Returns the tables of training and evaluation for a terminal; baselines stand below a rule.
 
-    Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Left S"
-    counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
-    decision the shield of mode "lookahead" had inputs of a certified plan in store. The training of those that
-    were trained has a table of its own.
+    Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Outside
+    S" counts episodes in which the true state was outside the safe set at some step, be it the first one, "from a plan"
+    the steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store. The training
+    of those that were trained has a table of its own.
     """
     everything = arms | baselines
     trained = {name: arm for name, arm in everything.items() if arm["train_steps"]}
@@ -99,7 +99,7 @@ _TRAINING: list[_Column] = [
 _EVALUATION: list[_Column] = [
     (("evaluation:", "violating:", "episodes [%]"), _violating),
     (("", "", "steps"), lambda arm: f"{arm['eval_violation_steps']:,}"),
-    (("", "left", "S"), lambda arm: f"{arm['eval_episodes_outside_set']:,}"),
+    (("out-", "side", "S"), lambda arm: f"{arm['eval_episodes_outside_set']:,}"),
     (("over-", "ridden", "[%]"), _overridden),
     (("", "return", "[95 % CI]"), _return_text),
 ]

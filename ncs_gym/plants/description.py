@@ -95,10 +95,21 @@ def row_limit(plant: LinearPlant, j: int) -> str:
         i = limited[0]
         low, high = sorted([low / float(row[i]), high / float(row[i])])
         return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
-    if low == -high:
-        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
-        return f"|{terms.removeprefix('+')}| <= 1"
-    return _sum_between(row, low, high, plant.operating_state, plant.state_names)
+    terms, size, center = limited_sum(plant, j)
+    return f"|{terms}| <= 1" if low == -high else _between(terms, low / size, high / size, center, "")
+
+
+def limited_sum(plant: LinearPlant, j: int) -> tuple[str, float, float]:
+    """Returns what row j of the safe box sums up, by what the row is divided for that, and the operating point of it.
+
+    Where the ends are symmetric these are deviations in units of the limit, else values in units of the largest entry.
+    """
+    row = plant.box[j]
+    if plant.box_low[j] == -plant.box_high[j]:
+        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in np.flatnonzero(row).tolist())
+        return terms.removeprefix("+"), 1.0, 0.0
+    terms, size = _sum_of(row, plant.state_names)
+    return terms, size, float(row @ plant.operating_state) / size
 
 
 def input_limit(plant: LinearPlant, i: int) -> str:
@@ -116,13 +127,18 @@ def mixed_limit(plant: LinearPlant, j: int) -> str:
 
 def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, names: Sequence[str]) -> str:
     """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units."""
-    size = float(np.abs(row).max())  # in units of its largest entry
+    terms, size = _sum_of(row, names)
+    return _between(terms, low / size, high / size, float(row @ center) / size, "")
+
+
+def _sum_of(row: np.ndarray, names: Sequence[str]) -> tuple[str, float]:
+    """Returns the sum that a row stands for, in units of its largest entry, and the size of that."""
+    size = float(np.abs(row).max())
     terms = "".join(
         f" {'-' if row[i] < 0.0 else '+'} {_factor(abs(float(row[i])) / size)}{names[i]}"
         for i in np.flatnonzero(row).tolist()
     )
-    terms = terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}"
-    return _between(terms, low / size, high / size, float(row @ center) / size, "")
+    return terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}", size
 
 
 def _factor(size: float) -> str:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ncs_gym.plants.description import limited_sum
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.past_inputs import is_row_of_past_input
 from ncs_gym.rendering import theme
@@ -29,7 +30,7 @@ class _Constraint(NamedTuple):
     """One row of the safe box.
 
     Attributes:
-        name: Name of the state it limits; a number for a row about several states.
+        name: Name of the state it limits, or their sum.
         unit: Unit of that state.
         half: Half the range of that state, in its unit.
         center: Its operating point, in its unit.
@@ -115,8 +116,8 @@ class ConstraintBarsDrawing:
 def _constraint(plant: LinearPlant, index: int) -> _Constraint:
     row, low, high = plant.box[index], float(plant.box_low[index]), float(plant.box_high[index])
     if np.count_nonzero(row) != 1:
-        center = float(row @ plant.operating_state)
-        return _Constraint(f"limit {index + 1}", "", 1.0, center, low, high, lambda state: float(row @ state))
+        terms, size, center = limited_sum(plant, index)
+        return _Constraint(terms, "", 1.0 / size, center, low, high, lambda state: float(row @ state))
     i = int(np.flatnonzero(row)[0])
     half, (low, high) = 1.0 / abs(row[i]), (low, high) if row[i] > 0.0 else (-high, -low)
     name, unit, center = plant.state_names[i], plant.state_units[i], float(plant.operating_state[i])

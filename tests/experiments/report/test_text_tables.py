@@ -115,7 +115,7 @@ def test_training_has_a_table_only_where_something_was_trained():
     short = summary_text(untrained, {})
     assert "training:" in whole
     assert "training:" in summary_text(arms, {"untrained": untrained["shielded"]})
-    assert short.splitlines()[0].split() == ["evaluation:", "over-"]
+    assert short.splitlines()[0].split() == ["evaluation:", "out-", "over-"]
     assert whole.endswith(f"\n\n{short}")
 
 

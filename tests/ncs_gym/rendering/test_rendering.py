@@ -406,6 +406,30 @@ def test_picture_names_a_broken_limit_of_inputs_that_states_do_not_show(limits, 
     assert count(env.render(), theme.DANGER, place) > 20
 
 
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"output_limits": [([1.0, 1.0], -4.0, 8.0)]}, ("x1 + x2", "+6.00")),
+        ({"output_limits": [([2.0, 0.5], -4.0, 8.0)]}, ("x1 + 0.25 x2", "+3.75")),
+        ({"output_limits": [([1.0, 1.0], -8.0, 8.0)]}, ("0.125 x1 +0.125 x2", "+0.75")),
+    ],
+)
+def test_bars_of_limits_on_several_states_have_their_sums_and_units(limits, said, monkeypatch):
+    plant = LinearPlant(
+        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, state_limits=([-10.0, -10.0], [10.0, 10.0]), u_max=1.0,
+        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01, **limits,
+    )  # fmt: skip
+    env, written, write = NCSEnv(plant, render_mode="rgb_array"), [], Canvas.text
+    monkeypatch.setattr(
+        Canvas, "text", lambda canvas, text, *rest, **named: written.append(text) or write(canvas, text, *rest, **named)
+    )
+    env.reset(seed=0, options={"state": np.array([3.0, 3.0])})
+    env.render()
+    assert set(said) <= set(written)
+    name = said[0] if limits["output_limits"][0][1] == -4.0 else f"|{said[0]}| <= 1"
+    assert name in str(plant)
+
+
 def test_labels_of_packets_do_not_lie_on_each_other(monkeypatch):
     env, written, write = make(channel=Channel(delay=2, loss=0.5)).unwrapped, [], Canvas.text
 
