@@ -122,7 +122,8 @@ class LimitValues(ReadOnlyArrays):
 
         Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
         """
-        values, (low, high) = self.box.dot(state), self._ends[state.ndim - 1]
+        values = self.box.dot(state)
+        low, high = self._ends[values.ndim - 1]
         return np.maximum(values - high, low - values)
 
     @cached_property

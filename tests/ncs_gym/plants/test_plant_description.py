@@ -118,3 +118,5 @@ def test_limits_of_coupled_inputs_are_listed_where_inputs_take_effect_later():
     )  # fmt: skip
     assert "|2 u1 of 1 step ago +2 u2 of 1 step ago| <= 1\n" in str(plant)
     assert str(plant).count("of 1 step ago") == 2  # rows of past inputs alone limit nothing
+    state = [0.5, -3.0, 0.0, 0.2]
+    np.testing.assert_array_equal(plant.constraint_values(state), plant.constraint_values(np.array(state)))
