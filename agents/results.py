@@ -35,9 +35,9 @@ class TrainingPoint(_Totals):
 
     Attributes:
         steps: Environment steps taken so far.
-        episode_return: Mean return of the last finished episodes as `Monitor` counts it (NaN before the first), with the
-            price of violations; it sees a shield's penalty only if it is outside the shield: with `SB3VecEnv`, not with
-            `make_vec_env`.
+        episode_return: Mean return of the last finished episodes as `Monitor` counts it, with the price of violations.
+            It sees a shield's penalty only if it is outside the shield: with `SB3VecEnv`, not with `make_vec_env` (NaN
+            before the first).
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
         multiplier: Price of a violating step then, of PPO-Lagrangian; NaN in other trainings.
