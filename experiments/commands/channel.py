@@ -192,15 +192,13 @@ def _compared(promise: _Promise, found: dict[str, Any]) -> str:
     row = _row(found, contract.max_age)
     share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
     said = f"The {promise.whose}'s contract, a newest sample of at most {counted(contract.max_age, 'step')}, was broken"
-    both = (
-        ""
-        if promise.whose == "environment"
-        else (
-            " Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, which "
-            "--committed-ahead takes off."
-        )
+    text = f"{said} {how_often(row)}{share}."
+    if promise.whose == "environment":
+        return text
+    return (
+        f"{text} Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, "
+        "which --committed-ahead takes off."
     )
-    return f"{said} {how_often(row)}{share}.{both}"
 
 
 def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:

@@ -119,6 +119,8 @@ def certificate_file(agent: Path) -> Path | None:
     found = [agent / "certificate.json"]
     if agent.parent.name == "models":
         run = agent.parent.parent
-        found += [each for each in (run / CERTIFICATES).glob("*.json") if agent.name.startswith(f"{each.stem}-")]
+        of_channel = [each for each in (run / CERTIFICATES).glob("*.json") if agent.name.startswith(f"{each.stem}-")]
+        # Of a former sweep with fewer sides to its grid another one may be there, with a shorter name.
+        found += sorted(of_channel, key=lambda each: -len(each.stem))
         found += [run / "certificate.json"]
     return next((file for file in found if file.is_file()), None)

@@ -406,6 +406,19 @@ def test_picture_names_a_broken_limit_of_inputs_that_states_do_not_show(limits, 
     assert count(env.render(), theme.DANGER, place) > 20
 
 
+@pytest.fixture
+def written(monkeypatch):
+    """The texts that pictures get from now on, each with its place."""
+    texts, write = [], Canvas.text
+
+    def noted(canvas, text, place, *arguments, **options):
+        texts.append((text, *place))
+        return write(canvas, text, place, *arguments, **options)
+
+    monkeypatch.setattr(Canvas, "text", noted)
+    return texts
+
+
 @pytest.mark.parametrize(
     ("limits", "said"),
     [
@@ -414,30 +427,21 @@ def test_picture_names_a_broken_limit_of_inputs_that_states_do_not_show(limits, 
         ({"output_limits": [([1.0, 1.0], -8.0, 8.0)]}, ("0.125 x1 +0.125 x2", "+0.75")),
     ],
 )
-def test_bars_of_limits_on_several_states_have_their_sums_and_units(limits, said, monkeypatch):
+def test_bars_of_limits_on_several_states_have_their_sums_and_units(limits, said, written):
     plant = LinearPlant(
         A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, state_limits=([-10.0, -10.0], [10.0, 10.0]), u_max=1.0,
         disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01, **limits,
     )  # fmt: skip
-    env, written, write = NCSEnv(plant, render_mode="rgb_array"), [], Canvas.text
-    monkeypatch.setattr(
-        Canvas, "text", lambda canvas, text, *rest, **named: written.append(text) or write(canvas, text, *rest, **named)
-    )
+    env = NCSEnv(plant, render_mode="rgb_array")
     env.reset(seed=0, options={"state": np.array([3.0, 3.0])})
     env.render()
-    assert set(said) <= set(written)
+    assert set(said) <= {text for text, _, _ in written}
     name = said[0] if limits["output_limits"][0][1] == -4.0 else f"|{said[0]}| <= 1"
     assert name in str(plant)
 
 
-def test_labels_of_packets_do_not_lie_on_each_other(monkeypatch):
-    env, written, write = make(channel=Channel(delay=2, loss=0.5)).unwrapped, [], Canvas.text
-
-    def noted(canvas, text, place, *arguments, **options):
-        written.append((text, *place))
-        return write(canvas, text, place, *arguments, **options)
-
-    monkeypatch.setattr(Canvas, "text", noted)
+def test_labels_of_packets_do_not_lie_on_each_other(written):
+    env = make(channel=Channel(delay=2, loss=0.5)).unwrapped
     env.reset(seed=0)
     seen = set()
     for _ in range(30):
