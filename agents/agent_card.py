@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import gymnasium as gym
 import numpy as np
 
-from agents.loop import ShieldSettings
+from agents.loop import LoopConfig, ShieldSettings
 from agents.results import Evaluation
 from ncs_gym.validation import counted
 
@@ -43,31 +43,25 @@ def agent_card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluati
         shield: The shield that it is meant to act behind; None for none.
         evaluation: Episodes whose figures the card gives; None leaves them out.
     """
-    env = gym.make(agent.env, **agent.kwargs).unwrapped
-    plant, channel = getattr(env, "plant", None), agent.channel or getattr(env, "channel", None)
-    others = {name: value for name, value in agent.kwargs.items() if name != "plant"}
-    kept = ", in `agent.json`" if "plant" in agent.kwargs else ""
-    rows = {
-        "environment": f"`{agent.env}`",
-        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`{kept}",
-        "channel": f"`{channel}`" + ("" if agent.channel else ", that of the id"),
-        "other settings": ", ".join(f"{name}={value!r}" for name, value in others.items()) or "those of the id",
-        "shield": _shield_text(shield),
+    rows = _loop_rows(LoopConfig(env=agent.env, kwargs=agent.env_kwargs, shield=shield))
+    table = rows | {
+        "channel": rows["channel"] + ("" if agent.channel else ", that of the id"),
+        "shield": "none" if shield is None else f"{rows['shield']}, penalty {shield.penalty:g} per intervention",
         "filter": "one that these files do not keep" if agent.is_filtered else "",
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in agent.hyperparams.items()),
         "residual": _residual_text(agent),
         "SHA-256 of the weights": f"`{agent.checksum}`",
         "saved with": _versions(),
     }
-    table = [f"| {name} | {value} |" for name, value in rows.items() if value]
-    parts = [f"# {agent.algorithm} in {agent.env}\n", "| | |", "|---|---|", *table, ""]
+    lines = [f"| {name} | {value} |" for name, value in table.items() if value]
+    parts = [f"# {agent.algorithm} in {agent.env}\n", "| | |", "|---|---|", *lines, ""]
     if shield is not None:
         parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
         check = "shields.verify(loop.shield.certificate, loop.single().unwrapped.plant)"
-        check = check if kept else "ncs verify certificate.json"
+        check = check if "plant" in agent.kwargs else "ncs verify certificate.json"
         parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `{check}`", ""]
     if evaluation is not None:
-        parts += ["## Evaluation", "", *_figures(evaluation), ""]
+        parts += ["## Evaluation", "", *_played_otherwise(agent, shield, evaluation.loop), *_figures(evaluation), ""]
     known = ""
     if shield is not None:
         horizon = "" if shield.horizon is None else f", horizon={shield.horizon}"
@@ -75,6 +69,38 @@ def agent_card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluati
         known = f'\n    shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"{horizon}),'
     imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
     return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
+
+
+def _loop_rows(loop: LoopConfig) -> dict[str, str]:
+    """Returns what a control loop is, in words: environment, plant, channel, other settings and shield."""
+    env, kwargs, shield = gym.make(loop.env, **loop.kwargs).unwrapped, loop.other_kwargs, loop.shield
+    plant = getattr(env, "plant", None)
+    kept = ", in `agent.json`" if "plant" in kwargs else ""
+    others = [f"{name}={value!r}" for name, value in kwargs.items() if name != "plant"]
+    mode = "none"
+    if shield is not None:
+        mode = f'mode "{shield.mode}"'
+        mode += "" if shield.horizon is None else f", plans of at most {counted(shield.horizon, 'step')}"
+        mode += f", {shield.least_safe_steps} safe steps sought" if shield.least_safe_steps else ""
+    return {
+        "environment": f"`{loop.env}`",
+        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`{kept}",
+        "channel": f"`{getattr(env, 'channel', None)}`",
+        "other settings": ", ".join(others) or "those of the id",
+        "shield": mode,
+    }
+
+
+def _played_otherwise(agent: Agent, shield: ShieldSettings | None, loop: LoopConfig) -> list[str]:
+    """Returns the line that says in what the loop of an evaluation differs from the rest of the card, if it does."""
+    here = _loop_rows(LoopConfig(env=agent.env, kwargs=agent.env_kwargs, shield=shield))
+    there = _loop_rows(loop)
+    differing = [f"{name} {value}" for name, value in there.items() if value != here[name]]
+    if shield is not None and loop.shield is not None and shield.certificate != loop.shield.certificate:
+        differing.append(f"the certificate with SHA-256 `{loop.shield.certificate.checksum}`")
+    if (loop.filter is not None) != agent.is_filtered:
+        differing.append("no filter" if loop.filter is None else "a filter that the agent was not trained behind")
+    return [f"- **not played as this card says**, but with: {'; '.join(differing)}"] if differing else []
 
 
 def _versions() -> str:
@@ -106,11 +132,3 @@ def _residual_text(agent: Agent) -> str:
         return ""
     offset = f" + {base.offset.tolist()}" if base.offset.any() else ""
     return f"`Agent` adds {base.gain.tolist()} x_hat{offset} [actions]; the weights alone are a part of the policy"
-
-
-def _shield_text(shield: ShieldSettings | None) -> str:
-    if shield is None:
-        return "none"
-    horizon = "" if shield.horizon is None else f", plans of at most {counted(shield.horizon, 'step')}"
-    horizon += f", {shield.least_safe_steps} safe steps sought" if shield.least_safe_steps else ""
-    return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

@@ -52,15 +52,15 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     if loop.episode_steps is None:
         raise ValueError(f"{loop.env} has no max_episode_steps, without which an evaluation may not end: give some")
+    alone = loop.without_penalties.with_kwargs(autoreset_mode=None)
     finished: list[Episode] = []
     trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
-        alone = loop.without_penalties.with_kwargs(autoreset_mode=None)
         played, path = _played(alone, policy, indices, seed, level_matrix, on_progress)
         trajectory = trajectory or path
         finished += played
-    return Evaluation(finished, trajectory)  # type: ignore[arg-type]
+    return Evaluation(loop, finished, trajectory)  # type: ignore[arg-type]
 
 
 def _played(

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ncs_gym import Channel, LinearPlant
-from ncs_gym.envs.json_settings import from_json
+from ncs_gym.envs.json_settings import from_json, read_plant, to_json
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     AroundEnvironments,
@@ -193,6 +193,14 @@ class LoopConfig:
     def channel(self) -> Channel | None:
         """Channel that replaces the one of the id; None where the id's own is kept."""
         return from_json(self.kwargs.get("channel"), (Channel,), "channel")
+
+    @property
+    def other_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments besides the channel, JSON values where they can be: as files of agents keep them."""
+        kwargs = {name: value for name, value in self.kwargs.items() if name != "channel"}
+        if "plant" in kwargs:
+            kwargs["plant"] = read_plant(kwargs["plant"])
+        return {name: to_json(value) for name, value in kwargs.items()}
 
     @property
     def episode_steps(self) -> int | None:

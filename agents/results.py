@@ -9,6 +9,8 @@ from math import nan
 
 import numpy as np
 
+from agents.loop import LoopConfig
+
 # File beside a checkpoint with the totals of its training.
 HISTORY_FILE = "history.json"
 
@@ -118,9 +120,11 @@ class Evaluation:
     """The finished episodes of an evaluation.
 
     Attributes:
+        loop: The control loop that they were played in, but for its penalties.
         episodes: All episodes, in order of their index.
         trajectory: The first episode, step by step.
     """
 
+    loop: LoopConfig
     episodes: list[Episode]
     trajectory: Trajectory

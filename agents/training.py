@@ -23,7 +23,6 @@ from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
-from ncs_gym.envs.json_settings import read_plant, to_json
 from ncs_gym.validation import counted, reason_of, warn_caller
 from shields.atomic_write import write_atomically
 
@@ -100,7 +99,7 @@ def train(
     hyperparams = complete_hyperparams(algorithm, hyperparams)
     before = history[-1].steps if history else 0
     try:
-        require_kept(_settings(loop), loop.env)
+        require_kept(loop.other_kwargs, loop.env)
     except ValueError as error:
         if checkpoints is not None:
             raise
@@ -225,13 +224,5 @@ def _agent(
         horizon=loop.shield and loop.shield.horizon,
         least_safe_steps=0 if loop.shield is None else loop.shield.least_safe_steps,
         is_filtered=loop.filter is not None,
-        kwargs=_settings(loop),
+        kwargs=loop.other_kwargs,
     )
-
-
-def _settings(loop: LoopConfig) -> dict[str, Any]:
-    """Returns the keyword arguments of an environment as files of agents keep them; the channel has its own place."""
-    kwargs = {name: value for name, value in loop.kwargs.items() if name != "channel"}
-    if "plant" in kwargs:
-        kwargs["plant"] = read_plant(kwargs["plant"])
-    return {name: to_json(value) for name, value in kwargs.items()}

@@ -48,8 +48,8 @@ LAYERS = {
         {"nodes", "silence", "torch"},
     ),
     "agents": (
-        {"hyperparams", "pickled_data", "results", "step_info"},
-        {"loop", "sb3_vec_env"},
+        {"hyperparams", "pickled_data", "step_info"},
+        {"loop", "results", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
         {"normalization", "sb3_zip", "agent_card"},
         {"agent"},

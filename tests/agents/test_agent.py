@@ -103,6 +103,26 @@ def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, t
     np.testing.assert_array_equal(Agent.load(shared).act(OBSERVATIONS), agent.act(OBSERVATIONS))
 
 
+def test_card_says_where_its_figures_are_of_another_loop(agent, certificate, tmp_path):
+    shield = ShieldSettings(certificate, penalty=1.0)
+    cruise = LoopConfig(env=CRUISE, kwargs=agent.env_kwargs, shield=shield)
+    for loop, words in (
+        (replace(cruise, violation_penalty=2.0), None),
+        (replace(cruise, shield=replace(shield, penalty=0.0)), None),
+        (replace(cruise, shield=None), "shield none"),
+        (replace(cruise, shield=ShieldSettings(certificate, "switch")), 'shield mode "switch"'),
+        (cruise.with_kwargs(channel=Channel(loss=0.1)), f"channel `{Channel(loss=0.1)}`"),
+        (cruise.with_kwargs(max_episode_steps=9), "other settings max_episode_steps=9"),
+        (LoopConfig(env="ncs_gym/TruckTrailer-v0"), "environment `ncs_gym/TruckTrailer-v0`"),
+    ):
+        evaluation = evaluate(loop, lambda seen, _: np.zeros((len(seen), 1), np.float32), episodes=1, seed=1)
+        agent.save(tmp_path, shield, evaluation)
+        card = (tmp_path / "README.md").read_text().partition("## Evaluation")[2]
+        assert "mean return" in card
+        assert ("not played as this card says" in card) == (words is not None)
+        assert words is None or words in card
+
+
 @pytest.mark.parametrize(("mode", "horizon"), [("project", None), ("lookahead", 4)])
 def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, tmp_path, monkeypatch, mode, horizon):
     agent.save(tmp_path, ShieldSettings(certificate, mode, horizon=horizon))
