@@ -14,7 +14,7 @@ plant = cart_pole()
 uplink = downlink = Channel(loss=0.4, delay=1, max_consecutive_losses=2)
 ages = contract_of(uplink).max_age + contract_of(downlink).max_age
 loop = SafeLoop(synthesize(plant, contract=ChannelContract(ages)), plant, uplink, downlink=downlink)
-actuator = Actuator(loop.input_delay, plant.m, plant.u_max)  # This would run next to the motor.
+actuator = Actuator(loop.input_delay, plant.m, plant.largest_input)  # This would run next to the motor.
 
 
 class Radio:

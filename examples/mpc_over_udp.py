@@ -63,7 +63,7 @@ async def main():
     wire, rng = Wire(plant, loop.input_delay, key), np.random.default_rng(0)
     at_controller = await UdpTransport.open(local=("127.0.0.1", 0))
     node = ControllerNode(loop, wire, at_controller, StepClock(plant.dt), np.zeros(plant.n), known=True)
-    clock, board = StepClock(plant.dt), Actuator(loop.input_delay, plant.m, plant.u_max)
+    clock, board = StepClock(plant.dt), Actuator(loop.input_delay, plant.m, plant.largest_input)
     sensor = SensorNode(wire, await UdpTransport.open(peer=at_controller.address), clock)
     actuator = ActuatorNode(wire, await UdpTransport.open(peer=at_controller.address), clock, board)
     state, worst, overridden, proved, last = np.zeros(plant.n), 0.0, 0, 0, -1

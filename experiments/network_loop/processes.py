@@ -217,7 +217,7 @@ async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
         nonlocal state, episode, last, memory, released
         if clock.episode != episode:
             episode, last = clock.episode, step - 1
-        released |= episode != 0 and step >= 0
+        released |= step >= 0
         controlled, outside = sensor.episode != 0 and step >= 0, bool((plant.constraint_values(state) > 0.0).any())
         if not released or (outside and not controlled):
             # It is held at the start before the first episode, and again where it left the box without a controller.

@@ -70,7 +70,8 @@ class Actuator(CopiedWhole):
     Args:
         input_delay: c, the number of steps from a decision to its effect.
         inputs: m, the number of inputs.
-        u_max: Largest size of each input, a number or shape (m,) [physical units]; None where the plant limits them.
+        u_max: Largest size of each input, a number or shape (m,) [physical units], of a plant `plant.largest_input`;
+            None where the plant limits them.
 
     Attributes:
         input_delay, inputs: c and m.

@@ -372,12 +372,13 @@ async def run_plant_side(
     Args:
         nodes: Nodes with a common clock.
         act: Called at the beginning of every step with its number: reads the sensor, applies the input. Numbers begin
-            anew with each episode, below 0 before it starts, and steps that were missed are left out.
+            anew with each episode, below 0 before it starts, and are below 0 until the first episode has started: only
+            then may a simulated plant move. Steps that were missed are left out.
         is_over: Asked after each step.
     """
     loop, clock = asyncio.get_running_loop(), nodes[0].clock
     clock.start(loop.time())
-    episode, last = NO_EPISODE, 0  # without an episode it only counts
+    episode, last, has_started = NO_EPISODE, 0, False  # without an episode it only counts
     while not is_over():
         await asyncio.sleep(max(clock.time_of(last + 1) - loop.time(), 0.0))
         now = loop.time()
@@ -388,8 +389,9 @@ async def run_plant_side(
             episode, last = clock.episode, step
         elif step > last:
             last = step
+            has_started |= step >= 0 and any(node.episode != NO_EPISODE for node in nodes)
             if clock.is_settled:
-                act(step)
+                act(step if has_started or step < 0 else step + NEVER)
 
 
 async def run_controller(

@@ -84,6 +84,41 @@ def test_loop_over_sockets_keeps_the_box_while_its_inputs_arrive(opened):
     assert reasons[0] == ""
 
 
+@pytest.mark.parametrize("last_step", [None, -20, 20], ids=["no controller", "gives up before it starts", "starts"])
+def test_steps_are_below_0_until_an_episode_has_started(last_step):
+    """A simulated plant that moves before would not start where the controller is told that it does."""
+    starts = last_step == 20
+
+    async def numbers():
+        at_controller, ways = await over_udp()
+        loop = SafeLoop(certificate_of(PLANT), PLANT, LATE, downlink=LATE, echo_age=50, on_unproved="ignore")
+        wire, clock = Wire(PLANT, loop.input_delay, bytes(32)), StepClock(DT)
+        node = ControllerNode(loop, wire, at_controller, StepClock(DT), np.zeros(2), known=True)
+        actuator = ActuatorNode(wire, ways[1], clock, Actuator(loop.input_delay, PLANT.m, PLANT.u_max))
+        sensor, steps, joined = SensorNode(wire, ways[0], clock), [], []
+
+        def act(step):
+            steps.append(step)
+            joined.append(sensor.episode != 0)
+            sensor.send(step, np.zeros(PLANT.p))
+            actuator.apply(step)
+
+        # Long enough for nodes that have joined to notice that nobody is there, and to count on beyond step 0.
+        ended = lambda: node.step >= (last_step or 0)  # noqa: E731
+        waiting = [run_plant_side([sensor, actuator], act, ended if starts else lambda: len(steps) >= 140)]
+        waiting += [] if last_step is None else [run_controller(node, full_throttle, is_over=ended)]
+        await asyncio.gather(*waiting)
+        for each in (at_controller, *ways):
+            each.close()
+        return steps, joined
+
+    steps, joined = asyncio.run(numbers())
+    first = joined.index(True) if last_step is not None else len(steps)
+    assert steps[:first] == sorted(set(steps[:first]))
+    assert all(step < 0 for step in steps[:first])
+    assert any(step >= 0 for step in steps) == starts
+
+
 def test_a_controller_that_fails_is_replaced_by_the_fallback():
     def broken(estimate):
         raise ZeroDivisionError
