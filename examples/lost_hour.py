@@ -28,7 +28,9 @@ def run(contract: ChannelContract | None) -> None:
         connected = not hour // 6 <= step < hour // 6 + hour
         y = plant.H @ state + plant.sensor_noise.sample(rng)
         packets = [Packet(loop.steps + 1, channel.quantize(y), loop.episode)] if connected else []
-    print(f"proved in {proved} of {step + 1} steps, outside the box in {violations}; now: {loop.guaranteed}; {reason}")
+    print(f"proved in {proved} of {step + 1} steps, outside the box in {violations}; now: {loop.guaranteed}")
+    if reason:
+        print(f"where it was not proved: {reason}")
 
 
 run(None)

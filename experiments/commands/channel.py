@@ -73,6 +73,8 @@ def _promise(settings: ChannelSettings, plant: LinearPlant | None) -> _Promise |
     if settings.certificate is not None and plant is not None:
         certificate = Certificate.load(settings.certificate)
         silence, ahead = silence_of(certificate, plant), settings.committed_ahead
+        if certificate.contract is None and ahead:
+            raise ValueError("--committed-ahead is counted by contracts, and this certificate needs none")
         if certificate.contract is None:
             return _Promise("certificate", plant.dt, None, None)
         max_age = certificate.contract.max_age - ahead

@@ -301,10 +301,14 @@ def _drawn(keys: list[Any], channel: Any, downlink: Any) -> dict[_Which, _Draw]:
         given["downlink", None] = downlink
     if not given:
         raise ValueError("give channel or downlink: a function (rng) -> Channel, or a list of channels")
-    return {(name, key): _draw(source, name, several=key is not None) for (name, key), source in given.items()}
+    return {
+        (name, key): _draw(source, name, keys if name == "channel" else [None]) for (name, key), source in given.items()
+    }
 
 
-def _draw(source: Any, name: str, *, several: bool) -> _Draw:
+def _draw(source: Any, name: str, keys: list[Any]) -> _Draw:
+    """Returns what draws a channel, given a function or a list; `keys` are those of the channels in this direction."""
+    several = keys != [None]
     if callable(source):
         return source
     try:
@@ -314,9 +318,14 @@ def _draw(source: Any, name: str, *, several: bool) -> _Draw:
             raise
         choices = []
     if not choices or not all(isinstance(each, Channel) for each in choices):
-        by_key = ", or a dictionary of these by the channels' keys" if several else ""
+        by_key = f", or a dictionary of these by the channels' keys {keys}" if several else ""
         wanted = f"a function (rng) -> Channel or a list of channels{by_key}"
-        raise ValueError(f"{name} must be {wanted}, got {shown(source)}")
+        alone = (
+            "; here is one channel for all, several are given to Networked by key"
+            if isinstance(source, Mapping)
+            else ""
+        )
+        raise ValueError(f"{name} must be {wanted}, got {shown(source)}{'' if several else alone}")
     return partial(_chosen, tuple(choices))
 
 

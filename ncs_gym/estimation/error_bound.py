@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,8 @@ GROWTH = 1.1
 DIGITS, RATE_DIGITS = 11, 4
 # Beyond this many roundings of the largest entry a checked inequality is taken to hold.
 ROUNDINGS = 100.0
-# Smaller singular values, and smaller distances from the unit circle, count as zero in the test of detectability.
+# Smaller singular values, and smaller distances from the unit circle, count as zero in the test of Popov, Belevitch and
+# Hautus.
 UNDETECTABLE = 1e-8
 # Flat disturbances are thickened by this fraction of their mean extent, so that (E1) has slack in every direction.
 THICKENING = 1e-9
@@ -61,7 +62,7 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns the error sets by age under a contract; see `error_sets_by_age`."""
     sets = error_sets_by_age(plant, contract)
     if sets is None:
-        if (unseen := _unseen_state(plant)) is not None:
+        if (unseen := unseen_state(plant.A, plant.H, plant.half_widths, plant.state_names)) is not None:
             raise ErrorSetError(f"no error set exists: the outputs do not show {unseen}, whose errors never decay")
         if contract.max_age == 0 or error_sets_by_age(plant, replace(contract, max_age=0)) is None:
             reason = _loudest_sensor(plant) or _least_shown_state(plant)
@@ -82,12 +83,18 @@ def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -
     return rounded
 
 
-def _unseen_state(plant: LinearPlant) -> str | None:
+def unseen_state(A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequence[str]) -> str | None:
     """Returns the state with the largest part in a mode that neither decays nor shows in the outputs; None without one.
 
-    The test of Popov, Belevitch and Hautus for detectability, in units of the safe box.
+    The test of Popov, Belevitch and Hautus for detectability; of the transposed model it is that for stabilizability.
+
+    Args:
+        A: Of x+ = A x, shape (n, n).
+        H: Of y = H x, shape (p, n).
+        widths: How large each state gets, shape (n,): their units.
+        names: Of the states, n of them.
     """
-    shown, state = min(_persistent_modes(plant), default=(1.0, ""))
+    shown, state = min(_persistent_modes(A, H, widths, names), default=(1.0, ""))
     return state if shown <= UNDETECTABLE else None
 
 
@@ -103,19 +110,20 @@ def _loudest_sensor(plant: LinearPlant) -> str:
 
 def _least_shown_state(plant: LinearPlant) -> str:
     """Returns which state the outputs show least, of those whose errors do not decay, as the rest of a sentence."""
-    _, state = min(_persistent_modes(plant), default=(1.0, ""))
+    _, state = min(_persistent_modes(plant.A, plant.H, plant.half_widths, plant.state_names), default=(1.0, ""))
     return f": of the states whose errors do not decay the outputs show {state} least" if state else ""
 
 
-def _persistent_modes(plant: LinearPlant) -> Iterator[tuple[float, str]]:
+def _persistent_modes(
+    A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequence[str]
+) -> Iterator[tuple[float, str]]:
     """Yields how much the outputs show of every mode that does not decay, and the state with the largest part in it."""
-    widths = plant.half_widths
-    A, H = plant.A * widths / widths[:, None], plant.H * widths
+    A, H = A * widths / widths[:, None], H * widths
     H = H / np.maximum(np.abs(H).max(axis=1, keepdims=True), np.finfo(float).tiny)
     for value in np.linalg.eigvals(A):
         if abs(value) >= 1.0 - UNDETECTABLE:
-            _, sizes, modes = np.linalg.svd(np.vstack([A - value * np.eye(plant.n), H]))
-            yield float(sizes[-1] / sizes[0]), plant.state_names[int(np.argmax(np.abs(modes[-1])))]
+            _, sizes, modes = np.linalg.svd(np.vstack([A - value * np.eye(len(A)), H]))
+            yield float(sizes[-1] / sizes[0]), names[int(np.argmax(np.abs(modes[-1])))]
 
 
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:

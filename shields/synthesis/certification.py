@@ -283,7 +283,7 @@ def _with_hints(
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
     if polytope and infeasible.binding != "E1":
-        sought = infeasibility(design_problem(plant, contract)[0], polytope=True)
+        sought = infeasibility(plant, design_problem(plant, contract)[0], polytope=True)
         polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
         infeasible = sought if polytope and infeasible.binding != "B" else infeasible
     return _with_changes(infeasible, plant, contract, progress, clock, polytope=polytope)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
+from ncs_gym.estimation.error_bound import unseen_state
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
 from ncs_gym.plants.past_inputs import inputs_under_way
@@ -95,16 +96,17 @@ class Clock:
 Certifies = Callable[[LinearPlant, ChannelContract | None, Clock], bool]
 
 
-def infeasibility(problem: DesignProblem, *, polytope: bool) -> Infeasible:
+def infeasibility(plant: LinearPlant, problem: DesignProblem, *, polytope: bool) -> Infeasible:
     """Returns the exception that names the binding condition and the fraction of the radii that is feasible.
 
     Args:
-        problem: The scaled design problem.
+        plant: The plant.
+        problem: Its scaled design problem.
         polytope: Whether a polytope alone would do, too.
     """
     fraction = min(_margin(problem, polytope=polytope), 1.0)
     if fraction == 0.0:
-        return _unstabilized()
+        return _unstabilized(plant)
     binding = "U" if _margin(problem, polytope=polytope, input_limits=False) >= 1.0 else "I"
     missing = "ellipsoid or polytope" if polytope else "ellipsoid"
     what = (
@@ -125,7 +127,7 @@ def infeasibility_around(plant: LinearPlant, contract: ChannelContract | None, r
     """
     tolerance = _tolerance_around(plant, contract)
     if tolerance.margin == 0.0:
-        return _unstabilized()
+        return _unstabilized(plant)
     if tolerance.margin >= 1.0:
         what = "(P) a gain bears disturbances and errors within the limits, but its polytope was not found"
         return Infeasible(f"{what}: {reason}", "P", 0.0)
@@ -139,8 +141,11 @@ def infeasibility_around(plant: LinearPlant, contract: ChannelContract | None, r
     return _with_share(what, what[1], tolerance.margin)
 
 
-def _unstabilized() -> Infeasible:
+def _unstabilized(plant: LinearPlant) -> Infeasible:
     unstabilized = "(I) no gain was found that stabilizes the plant, whatever the bounds are"
+    unmoved = unseen_state(plant.A.T, plant.B.T, 1.0 / plant.half_widths, plant.state_names)
+    if unmoved is not None:
+        unstabilized = f"(I) no gain stabilizes the plant: no input moves {unmoved}, which does not decay by itself"
     return Infeasible(unstabilized, "I", 1.0, {_SHARE: 0.0})
 
 

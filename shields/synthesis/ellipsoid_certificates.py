@@ -115,7 +115,7 @@ def largest_ellipsoid(
             "I",
             1.0,
         )
-    raise failure or infeasibility(problem, polytope=False)
+    raise failure or infeasibility(plant, problem, polytope=False)
 
 
 def nearby_ellipsoid(

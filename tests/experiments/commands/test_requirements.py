@@ -145,9 +145,14 @@ def test_samples_have_what_inputs_committed_ahead_leave_of_a_certificate_s_contr
         "--committed-ahead takes off.",
         "",
     )
+    cruise = gym.make("ncs_gym/TruckTrailerCruise-v0").unwrapped.plant
+    cruise.save(tmp_path / "cruise.json")
+    certificate_for(cruise).save(tmp_path / "cruise-certificate.json")
+    without = "--certificate", tmp_path / "cruise-certificate.json", "--plant", tmp_path / "cruise.json", *own[-2:]
     for given, words in (
         ((*own[:-1], 9), "--committed-ahead 9: the certificate's contract is of 8 steps in all"),
         (("--committed-ahead", 1), "--committed-ahead is of --certificate"),
+        (without, "--committed-ahead is counted by contracts, and this certificate needs none"),
     ):
         refused = ncs("channel", file, *given)
         assert refused.returncode == 2

@@ -381,13 +381,15 @@ def test_channels_of_several_sensors_are_drawn_by_their_keys(many):
     assert delays(drawn(inner, DELAYED)) == {(1, 1), (1, 3), (3, 1), (3, 3)}
     assert delays(drawn(inner, DELAYED), channel={"b": Channel(delay=7)}) == {(1, 7), (3, 7)}
     assert delays(drawn(inner, {"a": DELAYED}), channel=Channel(delay=4)) == {(4, 4)}
-    by_key = "a dictionary of these by the channels' keys, got"
+    by_key = "a dictionary of these by the channels' keys \\['a', 'b'\\], got"
     for wrong, words in (
         ({"c": DELAYED}, r"channel has the key 'c', the channels' are \['a', 'b'\]"),
         ([NETWORK], by_key), ({"a": Channel()}, by_key), ({}, "give channel or downlink"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=words):
             drawn(inner, wrong)
+    with pytest.raises(ValueError, match="here is one channel for all, several are given to Networked by key"):
+        RandomChannel(Networked(gym.make("CartPole-v1")), {"a": DELAYED})
 
 
 @pytest.mark.parametrize("make", [Counter, lambda: gym.wrappers.DtypeObservation(gym.make("CartPole-v1"), np.float64)])
