@@ -226,7 +226,8 @@ class AppliedActionBuffer(ReplayBuffer):
         if not ((steps == before + 1) | (steps == 1)).all():
             raise ValueError(
                 "an action of the agent takes several steps of the environment (action repeat, frame skipping), of "
-                f'which "{APPLIED}" says the last action alone: the buffer cannot store them as one'
+                f'which "{APPLIED}" says the last action alone, and the buffer cannot store them as one; or something '
+                "else has stepped the environment between two transitions"
             )
         self._steps = steps
         super().add(obs, next_obs, applied.astype(action.dtype), reward, done, infos)

@@ -30,20 +30,6 @@ _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 _FINAL = ("final_obs", "final_info")
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
 _EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
-# Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
-_STATEFUL_ATTRIBUTES = (
-    "state",
-    "known",
-    "steps",
-    "episodes",
-    "episode_channel",
-    "episode_downlink",
-    "np_random",
-    "starts",
-    "spec",
-    "num_envs",
-    "metadata",
-)
 
 
 class SB3VecEnv(AroundEnvironment, VecEnv):
@@ -198,16 +184,16 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         Raises:
             AttributeError: If there is no such attribute, or it holds arrays, which may be about all environments.
         """
-        chosen = self._get_indices(indices)
-        inner = self.vector_env.unwrapped
+        chosen, inner = self._get_indices(indices), self.vector_env.unwrapped
+        if attr_name in ("action_space", "observation_space"):
+            return [getattr(self, attr_name) for _ in chosen]
         if attr_name == "render_mode":
             return [self.vector_env.render_mode for _ in chosen]
-        if isinstance(inner, _WITH_RESET_MASK[1:]):
+        source = _wrapper_with(attr_name, self.vector_env)
+        if source is None and isinstance(inner, _WITH_RESET_MASK[1:]):
             values = inner.get_attr(attr_name)
             return [values[e] for e in chosen]
-        if isinstance(inner, NCSVectorEnv) and attr_name not in _STATEFUL_ATTRIBUTES:
-            inner = inner.single
-        source = _wrapper_with(attr_name, self.vector_env) or inner
+        source = source or inner
         value = getattr(source, attr_name)
         if any(isinstance(each, np.ndarray) for each in (value if isinstance(value, tuple) else (value,))):
             raise AttributeError(f"{attr_name} is an array of {type(source).__name__}: read it from vector_env")

@@ -85,8 +85,8 @@ def train(
             that count. Give another seed: with the same one it meets the same starts and packet losses once more.
         history: Totals of the training of that agent: counts and the multiplier of PPO-Lagrangian go on from the last,
             and rates fall as in one training of all steps. Empty to count from 0, and for rates that begin anew.
-        checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and when the
-            training is interrupted (Ctrl-C); None for none.
+        checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and at the end,
+            also of a training that is interrupted (Ctrl-C); None for none.
 
     Warns:
         UserWarning: If files of agents do not keep a keyword argument of the environment.
@@ -133,6 +133,7 @@ def train(
     except (KeyboardInterrupt, TrainingStopped):
         keep()
         raise
+    keep()
     agent = current()
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions

@@ -126,8 +126,10 @@ def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):
             Looking.seen += (tmp_path / "agent.json").exists()
             return True
 
-    train(loop, 2560, 0, hyperparams=SMALL, callbacks=[Looking()], checkpoints=tmp_path)
+    result = train(loop, 2560, 0, hyperparams=SMALL, callbacks=[Looking()], checkpoints=tmp_path)
     assert Looking.seen > 100
+    assert Agent.load(tmp_path).checksum == result.agent.checksum
+    assert (tmp_path / HISTORY_FILE).read_text() == history_document(result.history)
 
 
 @pytest.mark.cases(1)

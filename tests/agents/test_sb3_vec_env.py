@@ -13,8 +13,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-import ncs_gym  # noqa: F401
 from agents import SB3VecEnv
+from ncs_gym import Channel, VectorNetworked, VectorRequestActions
 from shields import SafetyShield, VectorSafetyShield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -228,7 +228,8 @@ def test_attributes():
     assert env.get_images() == [None] * 3
     for call in (
         lambda: env.get_attr("nothing"),
-        *(partial(env.get_attr, name) for name in ("steps", "state", "known")),
+        *(partial(env.get_attr, name) for name in ("steps", "state", "known", "starts")),
+        *(partial(env.get_attr, name) for name in ("estimator", "start", "request_state", "episode_channel")),
         lambda: env.set_attr("plant", 1),
         lambda: env.env_method("reset"),
     ):
@@ -239,6 +240,16 @@ def test_attributes():
     sync = SB3VecEnv(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
     sync.set_attr("length", 0.7, indices=1)
     assert sync.get_attr("length") == [0.5, 0.7]
+    stacked = SB3VecEnv(VectorNetworked(sync.vector_env, Channel(delay=2), observe=("age",)))
+    assert stacked.get_attr("channel") == [Channel(delay=2)] * 2
+    assert stacked.get_attr("length") == [0.5, 0.7]
+    assert stacked.get_attr("observation_space") == [stacked.observation_space] * 2
+    asking = SB3VecEnv(VectorRequestActions(gym.make_vec("ncs_gym/ConvoyOnRequest-v0", num_envs=2)))
+    assert asking.get_attr("action_space") == [asking.action_space] * 2
+    assert asking.action_space.shape == (2,)
+    asking.seed(3)
+    asking.reset()
+    assert asking.get_attr("np_random_seed") == [3, 3]
     sync.reset()
     assert len(sync.env_method("get_wrapper_attr", "length", indices=[0])) == 1
     env.close()
