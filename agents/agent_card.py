@@ -57,8 +57,9 @@ def agent_card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluati
     parts = [f"# {agent.algorithm} in {agent.env}\n", "| | |", "|---|---|", *lines, ""]
     if shield is not None:
         parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
+        is_own = "plant" in agent.kwargs or not agent.env.startswith("ncs_gym/")
         check = "shields.verify(loop.shield.certificate, loop.single().unwrapped.plant)"
-        check = check if "plant" in agent.kwargs else "ncs verify certificate.json"
+        check = check if is_own else "ncs verify certificate.json"
         parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `{check}`", ""]
     if evaluation is not None:
         parts += ["## Evaluation", "", *_played_otherwise(agent, shield, evaluation.loop), *_figures(evaluation), ""]

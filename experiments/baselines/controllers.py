@@ -21,6 +21,7 @@ from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.plants.lqr import lqr_gain
+from ncs_gym.plants.past_inputs import is_row_of_past_input
 from ncs_gym.validation import warn_caller
 from shields.certificate import Fallback
 from shields.runtime.rows_within_step import closed, rows_within_step
@@ -31,6 +32,8 @@ _clarabel: Any = clarabel
 GOVERNED_STEPS, PREDICTED_STEPS = 100, 20
 # What keeps the equations of a regulator well-posed where an input itself costs nothing.
 _LEAST_WEIGHT = 1e-6
+# What is no larger than this part of the sizes that it is a sum of is rounding.
+_ROUNDING = 1e-12
 # Price of leaving the limits of the box by their half-widths: a program without any solution serves nobody.
 _PRICE_OF_LEAVING = 1e4
 
@@ -306,19 +309,20 @@ def _fallback(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
 
 
 def _greedy(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
-    """Returns inputs that come closest to the task's goal in one step, and ignore the safe box.
+    """Returns inputs that come closest to the task's goal in the step in which they reach it, and ignore the safe box.
 
     For `SpeedTracking` they remove the error of the speed, for `SetpointTracking` that of the output, with as little
-    input as possible or with the largest input; for other tasks they are the least-squares solution of C x+ = 0.
+    input as possible or with the largest input; for other tasks they are the least-squares solution of C x = 0.
     """
     plant, task, first = env.plant, env.task, env.plant.n
     moved = np.zeros(first)
     if isinstance(task, SpeedTracking):
         effect = plant.dt * np.eye(plant.m)[task.input_index]
     elif isinstance(task, SetpointTracking):
-        effect, moved = task.output @ plant.B, task.output @ plant.A
+        effect, moved = _first_effect(plant, task.output)
     else:
-        gain = np.linalg.lstsq(plant.box @ plant.B, -plant.box @ plant.A)[0]
+        effect, moved = _first_effect(plant, plant.box[~is_row_of_past_input(plant)])
+        gain = np.linalg.lstsq(effect, -moved)[0]
         return lambda observations, estimates: estimates @ gain.T
     # The inputs that raise the output the most, and that lower it the most.
     low, high = plant.input_ends
@@ -334,19 +338,38 @@ def _greedy(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     return inputs
 
 
+def _first_effect(plant: LinearPlant, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what an input and the state add to `rows` x in the first step in which inputs reach it.
+
+    That is one step later for every past input or further state in between. Rows are a vector (n,) or a matrix (k, n);
+    the parts are of shape (m,) and (n,), or (k, m) and (k, n).
+
+    Raises:
+        ValueError: If no input ever does.
+    """
+    size = np.abs(rows)
+    for _ in range(plant.n):
+        effect, rows = rows @ plant.B, rows @ plant.A
+        felt = np.abs(effect) > _ROUNDING * (size @ np.abs(plant.B))
+        if felt.any():
+            return np.where(felt, effect, 0.0), rows
+        size = size @ np.abs(plant.A)
+    raise ValueError("greedy has nothing to do: no input moves what the task asks for")
+
+
 def _proportional(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     """Returns inputs in proportion to the error of the task.
 
     For `SpeedTracking` u = (target - speed) / dt, which within the limits removes the error in a step; for
-    `SetpointTracking` the certified gain about the equilibrium at the target, u = u_s + K (x_hat - x_s); for other
-    tasks, whose target is rest, the fallback.
+    `SetpointTracking` the certified gain about the equilibrium at the target, u = u_s + K (x_hat - x_s), which is the
+    operating point for other tasks, whatever the point at which the fallback rests.
     """
     first = env.plant.n
     if isinstance(env.task, SpeedTracking):
         direction = np.eye(env.plant.m)[env.task.input_index] / env.plant.dt
         return lambda observations, estimates: observations[:, first : first + 1] * direction
     if not isinstance(env.task, SetpointTracking):
-        return _fallback(env, fallback, seed)
+        return lambda observations, estimates: estimates @ fallback.gain.T
     x_s, u_s = equilibrium(env.plant, env.task.output)
 
     def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:

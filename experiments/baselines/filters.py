@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from ncs_gym import LinearPlant, NCSVectorEnv
+from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.validation import AroundEnvironment
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
@@ -45,7 +46,7 @@ class CertaintyEquivalentFilter:
         mode: "project" or "lookahead"; see `SafetyFilter`.
         horizon: Longest plan of mode "lookahead" [steps]; None for that of `SafetyFilter`.
         margin: Fraction of the safe set that is kept free after the next step: the next state is taken to be off by as
-            much, margin^2 L in the place of A Sigma_k A'.
+            much, margin^2 L in the place of A Sigma_k A', where states can be off at all: past inputs are known.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -61,8 +62,9 @@ class CertaintyEquivalentFilter:
         margin: float = 0.0,
     ) -> None:
         self._filter = SafetyFilter(certificate, plant, mode, horizon)
-        back = np.linalg.inv(plant.A) if margin else np.zeros_like(plant.A)
-        self._assumed = self._filter.errors_of_many((margin**2 * back @ certificate.L @ back.T)[None])
+        unknown, back = np.arange(plant.n) < plant.n - inputs_under_way(plant), np.linalg.pinv(plant.A)
+        off = margin**2 * np.where(np.outer(unknown, unknown), certificate.L, 0.0)
+        self._assumed = self._filter.errors_of_many((back @ off @ back.T)[None])
         self._plans = np.empty((0, plant.m, 0))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:

@@ -26,12 +26,12 @@ from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
-from experiments.runs.arms import Arm, by_arm, full_names, run_of_arm
+from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import TrainingRun, require_trainable
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import CompareSettings
 from experiments.settings.arguments import id_alone
 from experiments.terminal import say, wrapped
@@ -65,12 +65,15 @@ def compare(settings: CompareSettings) -> Comparison:
     settings = _with_full_names(shortened(settings))
     noise = "gaussian" if settings.noise == "gaussian" else None
     loop = loop_config(settings.env, settings.channel, noise=noise, between_samples=settings.between_samples)
-    require_trainable(settings, loop)
+    names = settings.arms + settings.baselines
+    require_arms(settings, loop, names)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):
         plant = ncs_env(loop.single()).plant
         verification = verify(certificate, plant)
-        print(wrapped(certificate_line(certificate, verification)), wrapped(settings.agent_line), sep="\n", flush=True)
+        print(wrapped(certificate_line(certificate, verification)), flush=True)
+        if is_any_trained(settings, names):
+            print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         runs = _training_runs(settings, loop, certificate)
         results = results_of(runs, settings.out, settings)

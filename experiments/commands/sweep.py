@@ -15,12 +15,11 @@ from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.html import sweep_report
 from experiments.report.text_tables import sweep_table
-from experiments.runs.arms import full_names, run_of_arm
+from experiments.runs.arms import full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import CERTIFICATES
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import require_trainable
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
@@ -52,10 +51,11 @@ def sweep(settings: SweepSettings) -> None:
         if settings.channel.get(name) is not None:
             raise ValueError(f"--channel {name} is a side of the grid: give its values there")
     loops = [loop_at(settings, point) for point in points]
-    require_trainable(settings, loops[0])
+    require_arms(settings, loops[0], settings.arms)
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
-        print(wrapped(settings.agent_line), flush=True)
+        if is_any_trained(settings, settings.arms):
+            print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         runs = [
             run_of_arm(settings, loop, certificate, name, index, grid_point=name_of(point))

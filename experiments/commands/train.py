@@ -6,12 +6,12 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import Arm, require_used, run_of_arm
+from experiments.runs.arms import Arm, require_arms, require_used, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import experiment_provenance
 from experiments.runs.resume import forget_checkpoint, resumed
-from experiments.runs.training_run import RunResult, require_trainable
+from experiments.runs.training_run import RunResult
 from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
 from ncs_gym.validation import counted
@@ -25,7 +25,7 @@ def train(settings: TrainSettings) -> None:
     settings = short_version(settings, **_SMOKE)
     require_used(settings, [settings.arm])
     loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
-    require_trainable(settings, loop)
+    require_arms(settings, loop, [settings.arm])
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("train", settings.completed):
         print(wrapped(settings.agent_line), flush=True)

@@ -202,6 +202,30 @@ def _is_weight(text: str) -> bool:
         return False
 
 
+def require_arms(settings: LearningSettings, loop: LoopConfig, names: Sequence[str]) -> None:
+    """Raises what arms cannot do in an environment, as far as that is known without a certificate.
+
+    Raises:
+        ValueError: If an arm or a scenario is unknown, an arm cannot pursue the task, a scenario cannot be simulated,
+            or agents cannot be trained with the hyperparameters given.
+    """
+    require_trainable(settings, loop)
+    task = registered_env(loop.env).task
+    for name in names:
+        if problem := why_aimless(Arm.of(name, settings.mode).policy, task):
+            raise ValueError(f"arm {name}: {problem}")
+    for scenario in other_scenarios(getattr(settings, "scenarios", ())):
+        try:
+            under(scenario, loop).single().close()
+        except ValueError as error:
+            raise ValueError(f"--scenarios {scenario}: {error}") from None
+
+
+def is_any_trained(settings: LearningSettings, names: Sequence[str]) -> bool:
+    """Returns whether an agent is trained in any of these arms."""
+    return any(Arm.of(name, settings.mode).is_trained for name in names)
+
+
 def run_of_arm(
     settings: LearningSettings,
     loop: LoopConfig,
@@ -229,8 +253,6 @@ def run_of_arm(
         agent_files = {name: (folder / name).read_bytes() for name in AGENT_FILES}
     training_loop, loop = arm.loops(loop, certificate, settings)
     if index == 0:  # what cannot be made is refused before anything is trained
-        if problem := why_aimless(arm.policy, registered_env(loop.env).task):
-            raise ValueError(f"arm {arm.name}: {problem}")
         if arm.is_trained:
             require_trainable(settings, training_loop)
         if arm.mode in FILTERS:
@@ -238,12 +260,6 @@ def run_of_arm(
                 loop.vector(1).close()
             except ValueError as error:
                 raise ValueError(f"arm {arm.name}: {error}") from None
-    scenarios = other_scenarios(getattr(settings, "scenarios", ()))
-    for scenario in scenarios:  # what cannot be simulated is refused before anything is trained
-        try:
-            under(scenario, loop).single().close()
-        except ValueError as error:
-            raise ValueError(f"--scenarios {scenario}: {error}") from None
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
     origin += "" if certificate.polytope is None else " with a polytope"
     return TrainingRun(
@@ -258,7 +274,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         certificate_basis=origin if settings.certificate is None else "",
-        scenarios=scenarios,
+        scenarios=other_scenarios(getattr(settings, "scenarios", ())),
         algorithm=settings.algo,
         settings=hyperparams,
         grid_point=grid_point,

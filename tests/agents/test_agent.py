@@ -16,7 +16,7 @@ from agents.hyperparams import with_changes
 from agents.loop import BasePolicy, LoopConfig, ShieldSettings
 from agents.results import TrainingPoint
 from agents.training import train
-from ncs_gym import Channel, GilbertElliott, truck_trailer
+from ncs_gym import Channel, GilbertElliott, register_plant, truck_trailer
 from shields import Certificate
 from shields.json_documents import digest
 from tests.certificates import certificate_of
@@ -121,6 +121,16 @@ def test_card_says_where_its_figures_are_of_another_loop(agent, certificate, tmp
         assert "mean return" in card
         assert ("not played as this card says" in card) == (words is not None)
         assert words is None or words in card
+
+
+def test_card_verifies_the_certificate_of_an_id_of_ones_own_by_its_plant(agent, certificate, tmp_path):
+    register_plant("Own/Card-v0", gym.make(CRUISE).unwrapped.plant)
+    for each, check in (
+        (agent, "`ncs verify certificate.json`"),
+        (replace(agent, env="Own/Card-v0"), "`shields.verify("),
+    ):
+        each.save(tmp_path, ShieldSettings(certificate))
+        assert check in (tmp_path / "README.md").read_text()
 
 
 @pytest.mark.parametrize(("mode", "horizon"), [("project", None), ("lookahead", 4)])

@@ -193,6 +193,13 @@ ONE_SENTENCE = [
     (f"loop --env {CRUISE} --key-file /dev/null --role plant", "not a regular file"),
 ]  # fmt: skip
 
+# Known without a certificate, which may take minutes.
+BEFORE_A_CERTIFICATE = [
+    ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
+    ("compare --env ncs_gym/TruckTrailer-v0 --arms lqr governor:10", "arm governor:10: governor:10 clips targets"),
+    ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "arm governor: governor clips targets"),
+]  # fmt: skip
+
 # There are a file `file` and a folder `here`.
 UNWRITABLE = [
     ("synthesize --out here", "Is a directory: here", "name the file"),
@@ -228,6 +235,13 @@ def test_usage_errors_are_the_parsers(line, words):
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
     assert words in " ".join(run.stderr.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(("line", "words"), BEFORE_A_CERTIFICATE)
+def test_arms_and_scenarios_are_refused_before_a_certificate_is_sought(line, words, tmp_path, monkeypatch):
+    for command in ("compare", "sweep"):
+        monkeypatch.delattr(f"experiments.commands.{command}.certificate_of")
+    assert_one_sentence(ncs(*line.split(), cwd=tmp_path), words)
 
 
 @pytest.mark.parametrize(("line", "words"), [(line, words) for line, *words in ONE_SENTENCE])

@@ -273,7 +273,8 @@ def test_actions_stand_for_inputs_between_both_ends(name):
     else:
         np.testing.assert_allclose([u.min(), u.max()], plant.input_ends[:, 0], atol=0.1)
     if name in ("K x_hat", "proportional"):
-        wanted = 0.125 + (estimates - [0.5, 0.25]) @ fallback.gain.T
+        x_c, u_c = ([0.5, 0.25], 0.125) if name == "K x_hat" else ([0.0, 0.0], 0.0)  # the task's rest is another one
+        wanted = u_c + (estimates - x_c) @ fallback.gain.T
         np.testing.assert_allclose(u, np.clip(wanted, plant.input_low, plant.input_high), atol=1e-12)
 
 
@@ -284,6 +285,46 @@ def test_greedy_inputs_reach_the_target_in_a_step_or_go_to_the_end_on_its_side()
     observations = np.stack([np.zeros(41), np.zeros(41), targets], axis=1)
     u = inputs_of(env.plant, policy(observations, {"estimate": np.zeros((41, 2))}))[:, 0]
     np.testing.assert_allclose(u, np.clip(targets / 0.114, *env.plant.input_ends[:, 0]), atol=1e-12)
+
+
+def cascade(task, **later):
+    """A pump that fills an upper tank, which fills a lower one."""
+    bounds = {"disturbance_bound": [0.02, 0.03], "sensor_bound": 0.05, "initial_bound": 0.1}
+    model = {"A": [[0.96, 0.03], [0.0, 0.94]], "B": [[0.0], [0.12]], "H": np.eye(2), "dt": 2.0}
+    plant = LinearPlant(**model, box=[5.0, 8.0], u_max=3.0, **bounds, **later)
+    tracking = SetpointTracking(output=np.eye(plant.n)[task or 0], reach=1.5, width=1.5)
+    return NCSEnv(plant=plant, channel=Channel(), task=Regulation() if task is None else tracking)
+
+
+@pytest.mark.parametrize(("task", "later"), [(0, {}), (1, {"input_delay": 1}), (0, {"input_delay": 2, "du_max": 5.0})])
+def test_greedy_inputs_reach_the_target_as_soon_as_they_reach_the_output(task, later):
+    env = cascade(task, **later)
+    plant, x, target = env.plant, np.zeros(env.plant.n), np.array([0.005])
+    policy = controller("greedy", env, Fallback.of_gain(np.zeros((1, plant.n))), 0)
+    observation = np.concatenate([x, target])[None].astype(np.float32)
+    (u,) = inputs_of(plant, policy(observation, {"estimate": x[None]}))
+    assert 0.0 < u[0] < 3.0
+    steps = 1 + later.get("input_delay", 0) + (task == 0)
+    for k in range(steps):
+        assert x[task] == 0.0
+        x = plant.A @ x + plant.B @ u * (k == 0)
+    np.testing.assert_allclose(x[task], target, rtol=1e-6)
+    far = np.concatenate([np.zeros(plant.n), [-1.4]])[None].astype(np.float32)
+    assert policy(far, {"estimate": np.zeros((1, plant.n))})[0] == -1.0
+
+
+def test_greedy_brings_late_states_to_rest_and_is_refused_where_no_input_moves_them():
+    late, prompt = cascade(None, input_delay=1), cascade(None)
+    K = {}
+    for name, env in {"late": late, "prompt": prompt}.items():
+        policy = controller("greedy", env, Fallback.of_gain(np.zeros((1, env.plant.n))), 0)
+        states = 1e-3 * np.eye(env.plant.n)
+        K[name] = inputs_of(env.plant, policy(states, {"estimate": states}))[:, 0] / 1e-3
+    A, B = prompt.plant.A, prompt.plant.B
+    np.testing.assert_allclose(K["late"], K["prompt"] @ np.hstack([A, B]), atol=1e-9)
+    still = NCSEnv(plant=replace(prompt.plant, A=np.diag([0.9, 0.9]), box=[[0.2, 0.0]]), channel=Channel())
+    with pytest.raises(ValueError, match="no input moves what the task asks for"):
+        controller("greedy", still, Fallback.of_gain(np.zeros((1, 2))), 0)
 
 
 @pytest.mark.parametrize("name", ["governor", "governor:20", "mpc", "mpc:20"])

@@ -14,6 +14,7 @@ from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter, synthesize
 from tests.certificates import certificate_of
+from tests.plants import delayed
 from tests.shields.polytope.limits import PLANTS
 from tests.shields.polytope.limits import certificate as limited
 
@@ -108,6 +109,27 @@ def test_margin_moves_the_estimate_away_from_the_edge_of_the_safe_set():
     ]
     assert pushed[0] > 0.9
     assert pushed[1] <= 0.8
+
+
+def test_margin_is_of_what_states_are_off_by_and_not_of_past_inputs():
+    plant = delayed(2)
+    certificate, rng, angles = certificate_of(plant), np.random.default_rng(0), np.arange(0.0, 7.0, 0.05)
+    estimates = rng.uniform(0.5, 1.0, (400, 1)) * certificate.safe_set.sample_boundary(rng, 400)
+    off = np.linalg.cholesky(certificate.L[:2, :2]) @ [np.cos(angles), np.sin(angles)]
+    off = 0.1 * np.vstack([off, np.zeros((2, len(angles)))])
+
+    def level(u):
+        """The largest x'Mx of the next state, with the margin around it, of each estimate."""
+        places = (plant.A @ estimates.T + plant.B @ u.T)[:, :, None] + off[:, None]
+        return np.einsum("isk,ij,jsk->sk", places, certificate.M, places).max(axis=1)
+
+    bearable = np.min([level(np.full((400, 1), u)) for u in np.linspace(-0.8, 0.8, 41)], axis=0) < 0.98
+    largest = {}
+    for name in ("trusting", "trusting:10"):
+        for proposed in (np.full((400, 1), -0.8), np.full((400, 1), 0.8)):
+            u = FILTERS[name](certificate, plant)(estimates, proposed, np.zeros(400, np.bool_))
+            largest[name] = max(largest.get(name, 0.0), level(u)[bearable].max())
+    assert largest["trusting:10"] <= 1.0 + 1e-9 < largest["trusting"]
 
 
 @pytest.mark.parametrize("name", FILTERS)
