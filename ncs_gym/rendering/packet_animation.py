@@ -24,9 +24,10 @@ def draw_packets(canvas: Canvas, frame: FrameRecord, start: float, end: float) -
     _draw_endpoint(canvas, start, "sensor", 1.0, active=sent)
     _draw_endpoint(canvas, end, "controller", 0.0, active=arrived)
     in_flight, labeled, middle = [], [], 0.5 * (start + end)
+    has_room = not (frame.broken_elsewhere or frame.missing_inputs)  # what the header says of them takes the line above
     for packet in frame.packets:
         if packet.arrival is None:
-            _draw_lost(canvas, middle, frame.step - packet.stamp)
+            _draw_lost(canvas, middle, frame.step - packet.stamp, labeled=has_room)
             labeled += [middle] * (frame.step == packet.stamp)
         elif frame.step <= packet.arrival:
             length = end - start - _DEPARTURE_GAP - _ARRIVAL_GAP
@@ -36,7 +37,7 @@ def draw_packets(canvas: Canvas, frame: FrameRecord, start: float, end: float) -
         canvas.line([(start + 10, y), (x, y)], theme.blend(_color(age), theme.PAPER, 0.6), 2.5)
     for age, x in in_flight:
         _draw_envelope(canvas, (x, y), _color(age))
-        if age and all(abs(x - other) > _LABEL_SPACING for other in labeled):
+        if age and has_room and all(abs(x - other) > _LABEL_SPACING for other in labeled):
             text = f"{counted(age, 'step')} late"
             canvas.text(text, (x, y - 18), theme.INK, align=0.5, bold=True)
             labeled.append(x)
@@ -61,14 +62,14 @@ def _draw_envelope(canvas: Canvas, center: tuple[float, float], color: theme.Col
     canvas.line([(x - w + 2, y - h + 2.5), (x, y + 1), (x + w - 2, y - h + 2.5)], theme.PAPER, 1.25)
 
 
-def _draw_lost(canvas: Canvas, middle: float, age: int) -> None:
+def _draw_lost(canvas: Canvas, middle: float, age: int, *, labeled: bool) -> None:
     """Draws a lost packet that fades while it drifts on."""
     if age > _FADE_STEPS:
         return
     center, fading = (middle + _DRIFT * age, theme.PACKET_LINE), 0.3 * age
     _draw_envelope(canvas, center, theme.blend(theme.FAINT, theme.MIST, fading), 0.9)
     canvas.cross(center, 8.0, theme.blend(theme.DANGER, theme.MIST, fading), 3.0)
-    if age == 0:
+    if age == 0 and labeled:
         canvas.text("lost", (middle, theme.PACKET_LINE - 18), theme.DANGER, align=0.5, bold=True)
 
 

@@ -454,6 +454,23 @@ def test_labels_of_packets_do_not_lie_on_each_other(written):
     assert seen == {"lost", "1 step late", "2 steps late"}
 
 
+def test_packets_have_no_labels_where_a_broken_limit_is_named(written):
+    plant = LinearPlant(
+        A=[[0.95, 0.1], [0.0, 0.9]], B=[[0.0], [0.1]], dt=0.1, box=[1.0, 2.0], u_max=1.0, du_max=0.1,
+        disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.01,
+    )  # fmt: skip
+    env = NCSEnv(plant, channel=Channel(delay=2, loss=0.5), render_mode="rgb_array", terminate_on_violation=False)
+    env.reset(seed=0)
+    lines = {True: set(), False: set()}
+    for k in range(30):
+        env.step(np.full(1, k % 5 == 0, np.float32))
+        written.clear()
+        env.render()
+        is_named = any(text.startswith("broken") for text, _, _ in written)
+        lines[is_named] |= {text for text, _, y in written if y == theme.PACKET_LINE - 18}
+    assert lines == {True: set(), False: {"lost", "1 step late", "2 steps late"}}
+
+
 def test_packets_are_lost_and_late_as_the_channel_says():
     def packets(channel, steps=12):
         env = make(channel=channel).unwrapped
