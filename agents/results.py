@@ -10,6 +10,7 @@ from math import nan
 import numpy as np
 
 from agents.loop import LoopConfig
+from ncs_gym.validation import counted
 
 # File beside a checkpoint with the totals of its training.
 HISTORY_FILE = "history.json"
@@ -115,7 +116,7 @@ class Trajectory:
     arrivals: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """The finished episodes of an evaluation.
 
@@ -128,3 +129,13 @@ class Evaluation:
     loop: LoopConfig
     episodes: list[Episode]
     trajectory: Trajectory
+
+    def __repr__(self) -> str:
+        """Short, in place of all episodes."""
+        steps = sum(episode.steps for episode in self.episodes)
+        violating = sum(episode.violation_steps > 0 for episode in self.episodes)
+        mean = np.mean([episode.episode_return for episode in self.episodes])
+        return (
+            f"<Evaluation: {counted(len(self.episodes), 'episode')} of {counted(steps, 'step')} in all, {violating:,} "
+            f"with a violation, mean return {mean:.4g}>"
+        )

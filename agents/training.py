@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from math import isnan
 from pathlib import Path
@@ -44,7 +44,7 @@ class TrainingResult:
     """
 
     agent: Agent
-    history: list[TrainingPoint]
+    history: list[TrainingPoint] = field(repr=False)
     steps: int
     violation_steps: int
     interventions: int
