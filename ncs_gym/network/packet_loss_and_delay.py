@@ -18,7 +18,8 @@ class LossState(NamedTuple):
     """The loss process of one channel (numbers) or of N (arrays of shape (N,)).
 
     Attributes:
-        bad: Whether the Gilbert-Elliott chain is in its bad state; of a `TraceChannel` the number of the next sample.
+        bad: Whether the Gilbert-Elliott chain is in its bad state; of a `TraceChannel` the number of the next sample
+            (of N channels with some of either 1 or 0 for the chains).
         consecutive: Number of packets that were lost in a row so far; counted where the channel limits it.
     """
 
@@ -41,11 +42,17 @@ class StackedChannels:
 
     Args:
         channels: N of them.
+
+    Attributes:
+        replays: The records that are replayed, each with the indices of its channels.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
-        if any(isinstance(each, TraceChannel) for each in channels):
-            raise ValueError("a TraceChannel stands beside equal ones alone, since each replays its own record")
+        of_records: dict[int, tuple[TraceChannel, list[int]]] = {}
+        for e, each in enumerate(channels):
+            if isinstance(each, TraceChannel):
+                of_records.setdefault(id(each), (each, []))[1].append(e)
+        self.replays = [(trace, np.array(rows)) for trace, rows in of_records.values()]
         self.on_request = channels[0].on_request  # of all, as environments require
 
         def stacked(*names: str) -> list[np.ndarray]:
@@ -90,6 +97,10 @@ def first_loss_state(
         bad = rng.random(size) < channel.loss.stationary_bad
     else:
         bad = False if size is None else np.zeros(size, np.bool_)
+    if isinstance(channel, StackedChannels) and channel.replays:
+        bad = np.asarray(bad, np.int64)
+        for trace, rows in channel.replays:
+            bad[rows] = rng.integers(len(trace.trace), size=len(rows))
     return LossState(bad, 0 if size is None else np.zeros(size, np.int64))
 
 
@@ -113,6 +124,22 @@ def transmit(
         delay = np.where(sends, channel.delays[bad], -1)
         following = (bad + sends) % len(channel.trace)
         return LossState(following, consecutive), int(delay) if size is None else delay
+    if isinstance(channel, StackedChannels) and channel.replays:
+        moved, delay = _transmit_by_chance(channel, rng, state, sends)
+        following, delay = moved.bad.astype(np.int64), delay.astype(np.int64)
+        for trace, rows in channel.replays:
+            at, sent = bad[rows], sends[rows]
+            following[rows], delay[rows] = (at + sent) % len(trace.trace), np.where(sent, trace.delays[at], -1)
+        return LossState(following, moved.consecutive), delay
+    return _transmit_by_chance(channel, rng, state, sends)
+
+
+def _transmit_by_chance(
+    channel: Channel | StackedChannels, rng: np.random.Generator, state: LossState, sends: Any
+) -> tuple[LossState, Any]:
+    """Does what `transmit` does for all channels but those that replay a record."""
+    size = sends.shape if isinstance(sends, np.ndarray) else None
+    bad, consecutive = state
     loss: Any = channel.loss
     if isinstance(loss, (GilbertElliott, StackedBursts)):
         bad = bad != (rng.random(size) < loss.p_good_to_bad + (loss.p_bad_to_good - loss.p_good_to_bad) * bad)
@@ -208,8 +235,10 @@ class VectorChannelState:
         if channels is not None:
             self.channel, begun = side_by_side(channels), side_by_side([channels[e] for e in rows.tolist()])
             self._delays += [np.full(self._size, -1) for _ in range(self.channel.longest_delay + 1 - len(self._delays))]
-        for kept, first in zip(self._loss_state, first_loss_state(begun, rng, len(rows)), strict=True):
-            kept[rows] = first
+        first, (bad, consecutive) = first_loss_state(begun, rng, len(rows)), self._loss_state
+        bad = bad.astype(np.result_type(bad, first.bad))  # numbers of samples, where records are replayed
+        bad[rows], consecutive[rows] = first
+        self._loss_state = LossState(bad, consecutive)
         for delays in self._delays:
             delays[rows] = -1
 

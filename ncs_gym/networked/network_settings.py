@@ -22,7 +22,10 @@ from ncs_gym.networked.observations import Entries, has_floats, parts_of, snapsh
 from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, counted, setting, shown, warn_caller
 
 # Keys of infos that are the network's own.
-INFOS = "measurement_age", "packet_arrived", "action_age", "action_applied", "packets"
+INFOS = (
+    *("measurement_age", "packet_arrived", "action_age", "action_applied", "packets"),
+    *("channel_loss", "channel_delay", "downlink_loss", "downlink_delay"),
+)
 LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
 # What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
 Predictor = Callable[[Any, Any, Any], Any]
@@ -136,9 +139,11 @@ class NetworkSettings:
     def _memory(self) -> int:
         """Returns how many actions the newest sample may lack: what the contracts allow, or without any the delays."""
         ages = [largest_age(contract_of(each), each.longest_delay + each.send_period - 1) for each in self.channels]
-        if self.downlink is not None:
-            return max(max(ages) + downlink_protocol(self.downlink, None).input_delay, 1)
-        return max(*ages, 1)
+        if self.downlink is None:
+            return max(*ages, 1)
+        # In a queue what takes longest waits for those that have overtaken it, but for one that arrives after it.
+        waits = max(self.downlink.longest_delay - self.downlink.delay - 1, 0) if self.late == "queue" else 0
+        return max(max(ages) + downlink_protocol(self.downlink, None).input_delay + waits, 1)
 
 
 class ReadNetwork(AroundEnvironment):
@@ -224,7 +229,7 @@ def require_no_restarts(env: Any) -> None:
 
 
 def require_no_network(info: Mapping[str, Any]) -> None:
-    """Raises ValueError if infos of the environment, at a reset, have keys that are those of the network."""
+    """Raises ValueError if infos of the environment have keys that are those of the network."""
     if taken := [key for key in INFOS if key in info]:
         raise ValueError(
             f"infos of the environment inside have the key {taken[0]!r}, which is the network's: call it otherwise, or "

@@ -84,7 +84,7 @@ def quantized(channel: Any, space: spaces.Space, sample: Any) -> Any:
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
         numbers = np.asarray(sample, dtype=np.float64)  # in a coarser type the number of steps would overflow
         rounded = channel.quantize(numbers.T).T  # the last axis is that of environments
-        return np.clip(rounded, space.low, space.high).astype(space.dtype)
+        return np.asarray(np.clip(rounded, space.low, space.high), space.dtype)  # of shape () no scalar
     return sample
 
 
@@ -192,7 +192,8 @@ class Entries:
             observation: What is seen of the environment, of N environments a batch.
             age: Of the newest sample of each part, shape (parts,) or (N, parts) [steps].
             arrived: Whether one arrived, likewise.
-            pending: The pending actions, oldest first, shape (pending, ...) or (N, pending, ...).
+            pending: The pending actions, oldest first, shape (pending, ...) or (N, pending, ...); None where they are
+                not asked for.
         """
         if not self.names:
             return observation

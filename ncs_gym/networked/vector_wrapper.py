@@ -103,7 +103,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         self._uplinks, self._downlinks = settings.uplinks(self.num_envs), settings.downlinks(self.num_envs)
         self._rng = None
         self._nothing = settings.neutral if settings.neutral is not None else nothing(env.single_action_space)
-        self._keeps_actions = bool(settings.entries.names) or callable(settings.fill)
+        self._keeps_actions = "pending_actions" in settings.entries.names or callable(settings.fill)
         self._started = False
 
     @property
@@ -141,6 +141,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
         own, count = dict(options or {}), self.num_envs
         chosen = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
+        own |= {"reset_mask": chosen} if "reset_mask" in own else {}
         if not self._started:
             chosen = np.ones(count, np.bool_)
         sources = self._settings.sources(own, self._uplinks)
@@ -248,8 +249,9 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             self._begin(rows, sample, anew=True)
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             info = info | {"final_obs": _listed(self.observation_space, self._seen(), done)}
-            if isinstance(info.get("final_info"), dict):
-                info["final_info"] = info["final_info"] | self._with_network({})
+            ended = info.get("final_info")
+            ended = ended if isinstance(ended, dict) else {}
+            info |= {"final_info": self._with_network(ended), "_final_info": info.get("_final_info", done)}
             self._begin(np.flatnonzero(done), snapshot(observations), anew=True)
         self._over = done
         return self._seen(), rewards, terminated, truncated, self._with_network(info)
@@ -264,7 +266,9 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         elif callable(settings.fill):
             ages = self._steps - arrivals[0].stamp
             settings.warn_of_lacking_actions(int(ages.max()))
-            seen = [_where(ages == 0, seen[0], settings.fill(seen[0], ages, self._decided.copy()))]
+            predicted = settings.fill(snapshot(seen[0]), ages, self._decided.copy())
+            _require_batch(predicted, seen[0])
+            seen = [_where(ages == 0, seen[0], predicted)]
         if not settings.entries.names:
             return joined(settings.parts, seen)
         ages = np.stack([self._steps - each.stamp for each in arrivals], axis=1)
@@ -273,6 +277,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
 
     def _with_network(self, info: dict[str, Any]) -> dict[str, Any]:
         """Returns the environments' infos with those of the networks."""
+        require_no_network(info)
         keys = [part.key for part in self._settings.parts]
         ages = [self._steps - each.stamp for each in self._arrivals]
         arrived = [each.arrived.copy() for each in self._arrivals]
@@ -415,7 +420,22 @@ def _where(chosen: np.ndarray, there: Any, elsewhere: Any) -> Any:
         return tuple(_where(chosen, each, other) for each, other in zip(there, elsewhere, strict=True))
     there, elsewhere = np.asarray(there), np.asarray(elsewhere)
     ndim = max(there.ndim, elsewhere.ndim)
-    return np.where(chosen.reshape(-1, *[1] * (ndim - 1)), there, elsewhere).astype(elsewhere.dtype, copy=False)
+    return np.where(chosen.reshape(-1, *[1] * (ndim - 1)), there, elsewhere)
+
+
+def _require_batch(predicted: Any, samples: Any) -> None:
+    """Raises ValueError unless predictions are a batch as samples are, one for each environment."""
+    if isinstance(samples, dict):
+        for key, each in samples.items():
+            _require_batch(predicted[key], each)
+    elif isinstance(samples, tuple):
+        for one, each in zip(predicted, samples, strict=True):
+            _require_batch(one, each)
+    elif np.shape(predicted) != np.shape(samples):
+        raise ValueError(
+            "fill must return the observations of all environments, whose first axis is the environment: expected "
+            f"{np.shape(samples)}, got {np.shape(predicted)}"
+        )
 
 
 def _merged(done: np.ndarray, final: Any, observations: Any) -> Any:

@@ -67,19 +67,21 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             arrive at once. Ideal by default.
         downlink: The network of the actions (loss, delay, jitter and `max_consecutive_losses`); ideal by default.
         observe: Entries that are added to observations: "age" of the newest sample [steps, at most 1,000], "arrived",
-            and "pending_actions", the last ones decided. A flat observation of floats becomes longer, a `Dict` gets
-            keys and a `Tuple` entries of these names; another one becomes a `Dict` with the key "observation".
+            and "pending_actions", the last ones decided, within their limits. A flat observation of floats becomes
+            longer, a `Dict` gets keys and a `Tuple` entries of these names; another one becomes a `Dict` with the key
+            "observation".
         fill: What is seen where nothing new arrived: "last", the newest sample that did, or "zero". Or a function
             (last, age, actions) -> observation that predicts the present one wherever the newest sample is older: it
-            is given that sample, its age and the last `pending` actions decided, oldest first, of which those of the
-            last `age` steps came after the sample. What it returns is passed on as it is, also out of the space.
+            is given that sample, its age and the last `pending` actions decided, oldest first (a list where actions are
+            no arrays), of which those of the last `age` steps came after the sample. What it returns is passed on as it
+            is, also out of the space.
         late: "apply" lets the newest command that has arrived act. "drop" does not wait for commands that take longer
             than `downlink.delay`. "queue" lets all commands act in the order of their arrival, one in each step.
         idle: What acts where no command arrived: "hold", the one before, or "neutral".
         neutral: The action before the first command arrives; the zero of the actions by default, and needed behind a
             downlink where they have none.
         pending: How many of the last actions are kept; by default as many as the contracts of both channels allow the
-            newest sample to lack, or the delays where there is no contract.
+            newest sample to lack, or the delays where there is no contract (in a "queue" with what commands wait).
         delay_reward: Whether rewards travel with samples: the agent gets what was earned until the newest one was
             taken, and at the end of an episode the rest. A `TimeLimit` belongs inside: of an end outside nobody knows.
 
@@ -132,7 +134,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         self._arrivals = [_Arrivals() for _ in settings.parts]
         self._keys = [part.key for part in settings.parts] if settings.parts[0].key is not None else None
         self._sees_newest = self._keys is None and settings.fill == "last" and not settings.entries.names
-        self._keeps_actions = bool(settings.entries.names) or callable(settings.fill)
+        self._observes_actions = "pending_actions" in settings.entries.names
+        self._keeps_actions = self._observes_actions or callable(settings.fill)
 
     @property
     def np_random(self) -> np.random.Generator:
@@ -173,7 +176,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         rng, every = self.np_random, (*self._uplinks, self._downlinks)
         read = [links.drawn(each, rng) for links, each in zip(every, (*sources, downlink), strict=True)]
         observation, info = self.env.reset(seed=seed, options=own or None)
-        require_no_network(info)
+        require_no_network(info)  # before anything changes
         for links, given in zip(every, read, strict=True):
             links.give(given)
             links.begin(rng)
@@ -273,16 +276,19 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
         elif callable(settings.fill) and (age := step - self._arrivals[0].stamp):
             settings.warn_of_lacking_actions(age)
-            seen = [settings.fill(seen[0], age, np.array(self._decided))]
+            actions = [snapshot(each) for each in self._decided]
+            seen = [settings.fill(seen[0], age, actions if self.action_space.shape is None else np.array(actions))]
         observation = joined(settings.parts, seen)
         if not settings.entries.names:
             return observation
         ages = np.array([step - arrivals.stamp for arrivals in self._arrivals])
         arrived = np.array([arrivals.arrived for arrivals in self._arrivals])
-        return settings.entries.added_to(observation, ages, arrived, np.array(self._decided))
+        pending = np.array(self._decided) if self._observes_actions else None
+        return settings.entries.added_to(observation, ages, arrived, pending)
 
     def _with_network(self, info: dict[str, Any], applied: Any, action_age: int) -> dict[str, Any]:
         """Returns the environment's infos with those of the network."""
+        require_no_network(info)
         step, arrivals = self._step, self._arrivals
         if self._keys is None:
             age, arrived = step - arrivals[0].stamp, arrivals[0].arrived

@@ -51,7 +51,6 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.envs.env import RenderModeError, ncs_env
-from ncs_gym.network.packet_loss_and_delay import side_by_side
 from ncs_gym.network.wire import Kind, Message, Wire
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
@@ -301,7 +300,6 @@ CHANNELS = [
     (lambda: RandomChannel(NCSEnv(HEAVY), lambda rng: 0.3).reset(), "what was drawn must be a Channel"),
     (lambda: TraceChannel(trace=(0, -1), loss=0.1), "loss of a TraceChannel"),
     (TraceChannel, "trace"),
-    (lambda: side_by_side([TraceChannel(trace=(0, 1)), TraceChannel(trace=(0, 2))]), "stands beside equal ones"),
     (lambda: Actuator(input_delay=2, inputs=1).start(episode=0.5), "episode must be a whole number >= 0"),
     *called(
         Actuator(input_delay=2, inputs=1).apply,

@@ -73,3 +73,12 @@ class Sampled(gym.Env):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.given.append(self.observation_space.sample() if self.seen is None else self.seen)
         return self.given[-1], 0.0, False, False, {}
+
+
+def ages_of_trace(delays, steps):
+    """Ages of the newest sample at steps 0..steps, by going through all packets at each; sample k is sent at step k."""
+    ages = []
+    for now in range(steps + 1):
+        arrived = [s for s in range(1, now + 1) if delays[s - 1] >= 0 and s + delays[s - 1] <= now]
+        ages.append(now - max(arrived, default=0))
+    return ages

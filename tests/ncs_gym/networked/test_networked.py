@@ -25,7 +25,7 @@ from ncs_gym import (
     VectorNetworked,
     VectorRandomChannel,
 )
-from tests.ncs_gym.networked.environments import Counter, Sampled
+from tests.ncs_gym.networked.environments import Counter, Sampled, ages_of_trace
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 LATE = Channel(loss=0.3, delay=1, jitter=2)
@@ -47,15 +47,6 @@ def run(env, steps, seed=0):
 
 def counts(returned):
     return [int(each[0][0]) for each in returned]
-
-
-def ages_of_trace(delays, steps):
-    """Ages of the newest sample at steps 0..steps, by going through all packets at each; sample k is sent at step k."""
-    ages = []
-    for now in range(steps + 1):
-        arrived = [s for s in range(1, now + 1) if delays[s - 1] >= 0 and s + delays[s - 1] <= now]
-        ages.append(now - max(arrived, default=0))
-    return ages
 
 
 @pytest.mark.parametrize("trace", [(0,), (2,), (0, 3, -1, 1, -1, -1, 0), (5, 0, 0, 4, -1, 2, 2)])
@@ -320,6 +311,79 @@ def test_actions_on_their_way_stay_as_they_are(kind):
         told.append(env.step(action)[-1]["action_applied"])
     assert acted == [0.0, 0.0, 1.0, 2.0, 3.0, 4.0]
     assert [float(np.ravel(each["a"] if kind == "dict" else each[0])[0]) for each in told] == acted
+
+
+class Echo(gym.Env):
+    """Shows the action that acts, which is the number of its step."""
+
+    observation_space = action_space = spaces.Box(-1.0, 1e6, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.array(action, np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.cases(1)
+@pytest.mark.parametrize("late", ["apply", "queue"])
+@pytest.mark.parametrize(
+    "downlink",
+    [
+        {"jitter": 1}, {"jitter": 3}, {"delay": 1, "jitter": 2}, {"delay": 3},
+        {"jitter": 3, "loss": 0.3, "max_consecutive_losses": 2},
+    ],
+)  # fmt: skip
+def test_actions_that_act_are_among_those_pending(late, downlink):
+    env = Networked(Echo(), downlink=Channel(**downlink), late=late, neutral=[-1.0], observe="pending_actions")
+    observation, _ = env.reset(seed=0)
+    oldest = 0
+    for k in range(3000):
+        pending = observation[1:]
+        observation, *_, info = env.step(np.array([k], np.float32))
+        action = float(info["action_applied"][0])
+        assert action in {-1.0, k, *pending.tolist()}
+        oldest = max(oldest, info["action_age"])
+    assert oldest == env.pending
+
+
+def test_actions_of_several_parts_need_not_be_told():
+    class Hybrid(Echo):
+        action_space = spaces.Tuple([spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))])
+
+        def step(self, action):
+            return np.array([action[1][0]], np.float32), 0.0, False, False, {}
+
+    given = []
+
+    def predictor(last, age, actions):
+        given.append(actions)
+        return last
+
+    neutral = 0, np.zeros(2, np.float32)
+    for options in ({"observe": ("age", "arrived")}, {"fill": predictor, "pending": 2}):
+        env = Networked(Hybrid(), Channel(delay=1), Channel(delay=1), neutral=neutral, **options)
+        env.reset(seed=0)
+        for _ in range(3):
+            action = env.action_space.sample()
+            env.step(action)
+    assert [len(each) for each in given] == [2] * 3
+    assert given[-1][-1][0] == action[0]
+    np.testing.assert_array_equal(given[-1][-1][1], action[1])
+
+
+@pytest.mark.parametrize("key", ["packets", "channel_loss"])
+def test_infos_of_the_environment_that_are_the_network_s_are_refused_also_in_steps(key):
+    class Telling(Echo):
+        def step(self, action):
+            return (*super().step(action)[:-1], {key: 0.9})
+
+    one, many = Networked(Telling()), VectorNetworked(SyncVectorEnv([Telling]))
+    for env, action in ((one, np.ones(1)), (many, np.ones((1, 1)))):
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=f"the key '{key}', which is the network's"):
+            env.step(action)
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "Taxi-v4", "Blackjack-v1"])

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import iterate
+from gymnasium.wrappers import TimeLimit
 
 from ncs_gym import Channel, GilbertElliott, Networked, TraceChannel, VectorNetworked, VectorRandomChannel
-from tests.ncs_gym.networked.environments import Counter
+from tests.ncs_gym.networked.environments import Counter, ages_of_trace
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 LATE = Channel(loss=0.4, delay=1, jitter=2)
@@ -148,6 +149,82 @@ def test_of_dictionaries_and_tuples_only_those_that_ended_have_a_last_observatio
     many.step(np.zeros((2, 1)))
     first, last = many.step(np.zeros((2, 1)))[-1]["final_obs"]
     assert (first["count"], last) == (1.0, None)
+
+
+def marked(last, age, actions):
+    return np.full(np.shape(last), -1)
+
+
+def written_over(last, age, actions):
+    last[...] = 7.5
+    return last
+
+
+@pytest.mark.parametrize("fill", [marked, written_over])
+def test_predictions_change_no_fresh_observation(fill):
+    """Whatever numbers they are of, and also where they are written into what was given."""
+    many = VectorNetworked(SyncVectorEnv([lambda: gym.make("CartPole-v1")]), Channel(loss=0.3), fill=fill)
+    one, ages = Networked(gym.make("CartPole-v1"), Channel(loss=0.3), fill=fill), []
+    one.reset(seed=0)
+    many.reset(seed=0)
+    for _ in range(8):
+        seen, *_ = one.step(1)
+        (seen_by_many,), *_, infos = many.step(np.array([1]))
+        np.testing.assert_array_equal(seen_by_many, seen)
+        ages.append(int(infos["measurement_age"][0]))
+        if ages[-1] == 0:
+            np.testing.assert_array_equal(seen, np.float32(one.unwrapped.state))
+    assert {0, 1} <= set(ages)
+
+
+def test_a_prediction_for_one_environment_is_none_for_all():
+    pendulums = SyncVectorEnv([lambda: gym.make("Pendulum-v1")] * 3)
+    envs = VectorNetworked(pendulums, Channel(delay=1), fill=lambda last, age, actions: last[0])
+    with pytest.raises(ValueError, match=r"whose first axis is the environment: expected \(3, 3\), got \(3,\)"):
+        envs.reset(seed=0)
+
+
+def test_last_infos_are_told_beside_environments_that_have_none():
+    class Bare(SyncVectorEnv):
+        def step(self, actions):
+            *rest, info = super().step(actions)
+            return (*rest, {key: each for key, each in info.items() if "final_info" not in key})
+
+    envs = VectorNetworked(Bare([lambda: TimeLimit(Counter(), 5)] * 2, autoreset_mode="SameStep"), Channel(delay=2))
+    envs.reset(seed=0)
+    for _ in range(5):
+        *_, truncated, info = envs.step(np.ones((2, 1)))
+    assert truncated.all()
+    assert info["final_info"]["packets"].tolist() == [5, 5]
+    assert info["final_info"]["measurement_age"].tolist() == [2, 2]
+    assert info["_final_info"].tolist() == [True, True]
+    assert info["packets"].tolist() == [0, 0]
+
+
+def test_records_are_replayed_beside_each_other_and_beside_chance():
+    """Each environment has another channel in every episode."""
+    records = [TraceChannel(trace=(0, -1, 0, 2, -1)), TraceChannel(trace=(1, 1, 0, -1, -1, -1, 0))]
+    others = [Channel(loss=BURSTS, delay=3), Channel(loss=0.5, delay=4)]
+    envs = VectorNetworked(SyncVectorEnv([lambda: TimeLimit(Counter(), 40)] * 30), Channel(jitter=5), observe="age")
+    envs = VectorRandomChannel(envs, [*records, *others])
+    envs.reset(seed=0)
+    channels, episodes, over, seen = envs.env.episode_channels, [[] for _ in range(30)], np.zeros(30, np.bool_), set()
+    for _ in range(300):
+        *_, truncated, info = envs.step(np.ones((30, 1)))
+        for e in range(30):
+            if over[e]:
+                episodes[e] = []
+            else:
+                episodes[e].append(int(info["measurement_age"][e]))
+        for e in np.flatnonzero(truncated):
+            channel = channels[e]
+            seen.add(channel)
+            if isinstance(channel, TraceChannel):
+                starts = [channel.trace[k:] + channel.trace[:k] for k in range(len(channel.trace))]
+                assert episodes[e] in [ages_of_trace(each * 40, 40)[1:] for each in starts]
+        over = truncated
+        channels = envs.env.episode_channels
+    assert seen == {*records, *others}
 
 
 def test_networks_of_a_batch_are_independent_and_have_the_rate_asked_for():
