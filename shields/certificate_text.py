@@ -35,8 +35,8 @@ def size_of(certificate: Certificate) -> str:
     shares = (
         _text(polytope_share, polytope, 100.0)
         + _text(recorded.get("share_of_box"), of_box, 100.0)
-        + _text(recorded.get("share_of_box_at_rest"), at_rest, 100.0),
-        f"an unknown share of the safe box ({unknown})" if isinstance(unknown, str) else "",
+        + _text(recorded.get("share_of_box_at_rest"), at_rest, 100.0)
+        + (f"an unknown share of the safe box ({unknown})" if isinstance(unknown, str) else ""),
         _text(recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the largest ellipsoid in the box", 100.0),
     )
     return ", ".join(filter(None, shares))

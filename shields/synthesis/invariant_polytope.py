@@ -42,6 +42,8 @@ _LEAST_PRUNED = 0.9
 _DIGITS = 10
 # Points at which the share of the box is counted: the third digit is right.
 _POINTS_LOG2 = 16
+# Of fewer of them within all limits no share is said.
+_LEAST_POINTS = 4000
 # Steps after which it must be known which points a gain keeps in the box.
 _MOST_STEPS = 3000
 
@@ -206,14 +208,20 @@ def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object]
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
     """Returns the share of the safe box's volume that a polytope fills, to about three digits.
 
-    None where the box is no product of intervals; where the last states are past inputs (`LinearPlant.from_statespace`)
+    None where a state has no limits of its own; where the last states are past inputs (`LinearPlant.from_statespace`)
     of the others, with past inputs at the operating one.
     """
-    points = points_of_box(plant, _POINTS_LOG2)
-    if points is None:
+    points, past = points_of_box(plant, _POINTS_LOG2), inputs_under_way(plant)
+    if points is not None:
+        points[:, plant.n - past :] = 0.0
+        return float((polytope.gauge(points) <= 1.0).mean())
+    low, high = plant.own_limits  # of the box that these make, further limits leave a part
+    if not np.isfinite(plant.own_limits).all():
         return None
-    points[:, plant.n - inputs_under_way(plant) :] = 0.0
-    return float((polytope.gauge(points) <= 1.0).mean())
+    points = low + (high - low) * qmc.Sobol(plant.n, scramble=False).random_base2(_POINTS_LOG2)
+    points[:, plant.n - past :] = 0.0
+    points = points[(plant.constraint_values(points.T) <= 0.0).all(axis=0)]
+    return float((polytope.gauge(points) <= 1.0).mean()) if len(points) >= _LEAST_POINTS else None
 
 
 def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
@@ -230,9 +238,10 @@ def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
 
 
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
-    """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n); None as for `share_in_polytope`.
+    """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n).
 
-    Past inputs are within their limits, not in the wider rows that the box has for them.
+    None where the box is no product of intervals. Past inputs are within their limits, not in the wider rows that the
+    box has for them.
     """
     rows, past = plant.box, inputs_under_way(plant)
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n and rows.any(axis=0).all()

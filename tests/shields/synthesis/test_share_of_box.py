@@ -74,15 +74,32 @@ def test_unbounded_box_is_the_reason():
 
 
 def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
-    """A limit that cuts off nothing of the box, which is no product by it."""
+    """States have no limits of their own: no points are drawn in between them."""
     plant = LinearPlant(
-        A=[[0.9, 0.2], [-0.1, 0.9]], B=[[0.0], [0.3]], dt=0.1, box=[1.0, 1.0], u_max=1.0,
-        output_limits=[([1.0, 1.0], -2.5, 2.5)], disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
+        A=[[0.9, 0.2], [-0.1, 0.9]], B=[[0.0], [0.3]], dt=0.1, box=[[1.0, 0.5], [-0.5, 1.0]], u_max=1.0,
+        disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
     )  # fmt: skip
     certificate = synthesize(plant)
     share = 100.0 * certificate.provenance["share_of_box"]
     size = f"a share of the safe box that is not computed; the ellipsoid {share:.4g} % of the safe box's volume"
     assert size in " ".join(str(certificate).split())
+
+
+@pytest.mark.parametrize("limit", [([1.0, 1.0], -2.5, 2.5), ([1.0, 1.0], -1.1, 1.0)])
+def test_share_of_a_polytope_is_of_what_further_limits_leave_of_the_box(limit):
+    plant = LinearPlant(
+        A=[[0.9, 0.4], [-0.3, 0.9]], B=[[0.0], [0.1]], dt=0.1, state_limits=([-1.0, -0.5], [0.8, 1.0]), u_max=0.5,
+        output_limits=[limit], disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
+    )  # fmt: skip
+    certificate = synthesize(plant)
+    drawn = np.random.default_rng(0).uniform([-1.0, -0.5], [0.8, 1.0], (400_000, 2))
+    inside = drawn[(limit[1] <= drawn.sum(axis=1)) & (drawn.sum(axis=1) <= limit[2])]
+    share = np.mean(certificate.polytope.gauge(inside) <= 1.0)
+    assert 0.3 < share < 0.95
+    assert certificate.provenance["polytope_share_of_box"] == pytest.approx(share, abs=4e-3)
+    said = " ".join(str(certificate).split())
+    assert f"size {100.0 * certificate.provenance['polytope_share_of_box']:.3g} % of the safe box's volume" in said
+    assert "the ellipsoid an unknown share of the safe box" in said
 
 
 @pytest.mark.parametrize("steps", [1, pytest.param(2, marks=pytest.mark.slow)])
