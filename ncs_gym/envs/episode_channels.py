@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorWrapper
+from gymnasium.vector import VectorEnv, VectorWrapper
 
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel, require_duration
@@ -203,6 +203,9 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
 
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self)
+        if not isinstance(env, gym.Env):
+            hint = ": VectorRandomChannel is for vector environments" if isinstance(env, VectorEnv) else ""
+            raise ValueError(f"RandomChannel takes an environment, as gym.make returns it, got {shown(env)}{hint}")
         gym.Wrapper.__init__(self, env)
         if not env.has_wrapper_attr("episode_channel"):
             raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")

@@ -26,7 +26,7 @@ from ncs_gym.networked.network_settings import (
     require_no_restarts,
 )
 from ncs_gym.networked.observations import is_batched, joined, quantized, snapshot, zero_of
-from ncs_gym.networked.wrapper import NETWORK_STREAM, network_infos, nothing
+from ncs_gym.networked.wrapper import network_infos, network_rng, nothing
 from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 
@@ -147,7 +147,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
         if first is not None:
-            self._rng = np.random.default_rng(np.random.SeedSequence(first, spawn_key=(NETWORK_STREAM,)))
+            self._rng = network_rng(first)
         every, rows = (*self._uplinks, self._downlinks), np.flatnonzero(chosen).tolist()
         given = zip(every, (*sources, downlink), strict=True)
         read = [links.drawn(each, self.np_random, rows) for links, each in given]

@@ -24,7 +24,7 @@ from ncs_gym.networked.network_settings import (
     require_no_restarts,
 )
 from ncs_gym.networked.observations import OLDEST_OBSERVED, joined, quantized, snapshot, zero_of
-from ncs_gym.validation import shown, warn_caller
+from ncs_gym.validation import as_count, shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
 PATIENCE = 10
@@ -172,7 +172,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         sources = self._settings.sources(own, self._uplinks)
         downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
         if seed is not None:
-            self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NETWORK_STREAM,)))
+            self._rng = network_rng(seed)
         rng, every = self.np_random, (*self._uplinks, self._downlinks)
         read = [links.drawn(each, rng) for links, each in zip(every, (*sources, downlink), strict=True)]
         observation, info = self.env.reset(seed=seed, options=own or None)
@@ -307,6 +307,12 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
     def _by_part(self, values: list[Any]) -> Any:
         return values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
+
+
+def network_rng(seed: Any) -> np.random.Generator:
+    """Returns what a network draws from; raises ValueError for what is no seed."""
+    number = as_count(seed, "seed", low=0, high=2**64)
+    return np.random.default_rng(np.random.SeedSequence(number, spawn_key=(NETWORK_STREAM,)))
 
 
 def network_infos(

@@ -313,6 +313,18 @@ def test_actions_on_their_way_stay_as_they_are(kind):
     assert [float(np.ravel(each["a"] if kind == "dict" else each[0])[0]) for each in told] == acted
 
 
+@pytest.mark.parametrize("seed", [-1, 1.5, "3"])
+def test_what_is_no_seed_is_refused(seed):
+    for env in (Networked(Counter()), VectorNetworked(SyncVectorEnv([Counter]))):
+        with pytest.raises(ValueError, match="seed must be a whole number >= 0"):
+            env.reset(seed=seed)
+
+
+def test_random_channels_of_vector_environments_are_another_wrapper_s():
+    with pytest.raises(ValueError, match="VectorRandomChannel is for vector environments"):
+        RandomChannel(VectorNetworked(SyncVectorEnv([Counter])), [Channel()])
+
+
 class Echo(gym.Env):
     """Shows the action that acts, which is the number of its step."""
 
