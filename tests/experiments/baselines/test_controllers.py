@@ -313,6 +313,18 @@ def test_greedy_inputs_reach_the_target_as_soon_as_they_reach_the_output(task, l
     assert policy(far, {"estimate": np.zeros((1, plant.n))})[0] == -1.0
 
 
+def test_greedy_takes_no_rounding_for_an_effect():
+    plant = LinearPlant(
+        A=np.diag([0.9, 0.8]), B=[[0.1 * 3, 0.1], [0.3, 0.0]], dt=1.0, box=[5.0, 5.0], u_max=1.0,
+        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
+    )  # fmt: skip
+    assert plant.B[0, 0] != plant.B[1, 0]
+    env = NCSEnv(plant, task=SetpointTracking(output=np.array([1.0, -1.0]), reach=0.05, width=0.05))
+    policy = controller("greedy", env, Fallback.of_gain(np.zeros((2, 2))), 0)
+    (u,) = policy(np.array([[0.0, 0.0, 0.05]], np.float32), {"estimate": np.zeros((1, 2))})
+    np.testing.assert_allclose(u, [0.0, 0.5], atol=1e-7)
+
+
 def test_greedy_brings_late_states_to_rest_and_is_refused_where_no_input_moves_them():
     late, prompt = cascade(None, input_delay=1), cascade(None)
     K = {}

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, GilbertElliott
+from ncs_gym import Channel, GilbertElliott, TraceChannel
 from ncs_gym.network import packet_loss_and_delay
-from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 
 BURSTS = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.2)
 
@@ -119,3 +119,42 @@ def test_random_draws_do_not_depend_on_the_measurement():
     # Paired arms rely on it: the same seed gives the same arrivals whatever the plant does.
     channel = Channel(loss=0.5, jitter=2, send_period=2)
     assert transmit(channel, 200) == transmit(channel, 200, value=1e6)
+
+
+class Starting:
+    """Draws the same number always."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def integers(self, high, size=None):
+        return self.number
+
+
+def sent_and_arrived(trace, start, steps):
+    """Pairs (step, age) at which a replay from a sample on delivers samples."""
+    link, found = ChannelState(trace, Starting(start)), []
+    for step in range(steps):
+        packet = step if link.sends_at(step) else None
+        found += [(step, step - stamp) for stamp in link.carry(None, step, packet)]
+    return sorted(found)
+
+
+def test_records_are_replayed_beside_each_other_and_beside_channels_that_lose_by_chance():
+    traces = [TraceChannel(trace=(0, -1, 0, 2, -1)), TraceChannel(trace=(1, 1, -1, 0), send_period=2)]
+    chance = Channel(loss=GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)), Channel(loss=0.5, jitter=1)
+    rng, steps = np.random.default_rng(0), 400
+    links = VectorChannelState([*chance, *chance], rng, 4)
+    for step in range(7):
+        links.send(rng, np.full(4, step))
+    links.begin(rng, np.array([0, 1]), [*traces, *chance])
+    found = [[] for _ in range(4)]
+    for step in range(steps):
+        links.send(rng, np.full(4, step))
+        for age, arrives in links.arrivals():
+            for e in np.flatnonzero(arrives):
+                found[e].append((step, age))
+    for trace, of_row in zip(traces, found, strict=False):
+        assert sorted(of_row) in [sent_and_arrived(trace, k, steps) for k in range(len(trace.trace))]
+    assert len(found[2]) == pytest.approx(steps * (1.0 - chance[0].mean_loss), rel=0.15)
+    assert len(found[3]) == pytest.approx(steps * 0.5, rel=0.15)
