@@ -157,4 +157,5 @@ def _first_trajectory(infos: list[dict[str, np.ndarray]], input_delay: int) -> T
         proposed=proposed,
         intervened=intervened,
         arrivals=np.array([info["packet_arrived"][0] for info in steps], dtype=np.bool_),
+        violated=np.array([info["cost"][0] > 0.0 for info in steps], dtype=np.bool_),
     )

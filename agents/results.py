@@ -106,6 +106,7 @@ class Trajectory:
             first steps, for which there is no proposal.
         intervened: Whether the shield intervened, or would have in mode "monitor", when they were decided, shape (T,).
         arrivals: Whether a packet arrived after each step, shape (T,).
+        violated: Whether each step cost something, shape (T,): of any limit, also of inputs and between two samples.
     """
 
     states: np.ndarray
@@ -114,6 +115,7 @@ class Trajectory:
     proposed: np.ndarray
     intervened: np.ndarray
     arrivals: np.ndarray
+    violated: np.ndarray
 
 
 @dataclass(frozen=True, repr=False)

@@ -15,7 +15,7 @@ from typing import Any
 import clarabel
 import numpy as np
 from scipy.linalg import block_diag, solve_discrete_are, sqrtm
-from scipy.sparse import bmat, csc_matrix
+from scipy.sparse import csc_matrix
 
 from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
@@ -246,15 +246,11 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     # Variables are the inputs, and by how much each step leaves the box.
     leaving, nothing = np.repeat(np.eye(steps), len(rows) + len(between), axis=0), np.zeros((steps * m, steps))
     P = csc_matrix(block_diag(2.0 * np.triu(effect.T @ effect), np.zeros((steps, steps))))
-    inequalities = bmat(
-        [
-            [felt, -leaving],
-            [-felt, -leaving],
-            [np.eye(steps * m), nothing],
-            [-np.eye(steps * m), nothing],
-            [nothing.T, -np.eye(steps)],
-        ],
-        format="csc",
+    every = np.eye(steps * m)
+    inequalities = csc_matrix(
+        np.block(
+            [[felt, -leaving], [-felt, -leaving], [every, nothing], [-every, nothing], [nothing.T, -np.eye(steps)]]
+        )
     )
     settings = _clarabel.DefaultSettings()
     settings.verbose = settings.presolve_enable = False

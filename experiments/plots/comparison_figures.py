@@ -220,8 +220,9 @@ def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
     paths = {name: arms[name][0].trajectory for name in _shown_arms(list(arms))}
     caption = (
         f"Time series: the first evaluation episode of the first run, {' and '.join(paths)}, with common random"
-        " numbers. Above, how close true state and estimate come to the limits: one beyond 1 violates a limit. Below,"
-        " the applied inputs. Ticks mark packet arrivals and interventions; a monitor's are what the shield would have"
+        " numbers. Above, how close true state and estimate come to the limits: one beyond 1 violates a limit. Crosses"
+        " mark violations, also of limits of inputs and between two samples, which the curve does not show. Below, the"
+        " applied inputs. Ticks mark packet arrivals and interventions; a monitor's are what the shield would have"
         " done."
         " An episode that is shorter ended at its first violation."
     )
@@ -249,13 +250,19 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
         true, estimated = (1.0 + plant.constraint_values(x.T).max(axis=0) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
         (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_INK, lw=1.1, ls=":", zorder=3)
-        if (true > 1.0).any():
-            (cross,) = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
-            handles["violation of the true state"] = cross
+        if (violating := _violating(path, plant)).any():
+            (cross,) = axis.plot(time[violating], true[violating], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
+            handles["violation"] = cross
     handles["limit"] = axis.axhline(1.0, **_LIMIT)
     label(axis, "", "closest limit", "First evaluation episode of the first run")
     axis.set_ylim(0.0, max(1.12, axis.get_ylim()[1]))
     return handles
+
+
+def _violating(path: Trajectory, plant: LinearPlant) -> np.ndarray:
+    """Returns which states are outside of a limit, or are those after a step that broke one, shape (T + 1,)."""
+    outside = plant.constraint_values(path.states.T).max(axis=0) > 0.0
+    return outside | np.concatenate([[False], path.violated])
 
 
 def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i: int) -> dict[str, Artist]:
@@ -330,7 +337,7 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
                 if outline is not None:
                     (handles[prefix + title],) = panel.plot(*outline.T, color=_INK, lw=1.2, ls=line)
             for result in results:
-                handles |= _draw_path(panel, plant, result.trajectory.states, plane, name, len(results))
+                handles |= _draw_path(panel, plant, result.trajectory, plane, name, len(results))
             lowest = at + columns >= len(arms)  # of its column, though perhaps not in the last row
             label(panel, x if lowest else "", y if at % columns == 0 else "", name)
             panel.tick_params(labelbottom=lowest)
@@ -356,16 +363,15 @@ def plane_of(certificate: Certificate, states: np.ndarray, own: int) -> tuple[in
 
 
 def _draw_path(
-    axis: Axes, plant: LinearPlant, states: np.ndarray, plane: tuple[int, int], arm: str, count: int
+    axis: Axes, plant: LinearPlant, path: Trajectory, plane: tuple[int, int], arm: str, count: int
 ) -> dict[str, Artist]:
-    x, y = states[:, plane].T
+    x, y = path.states[:, plane].T
     axis.plot(x, y, color=ArmStyle.of(arm).color, lw=0.9, alpha=max(0.8 - 0.05 * count, 0.3))
     (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=_INK, mew=1.0)
     handles: dict[str, Artist] = {"start": start}
-    outside = plant.constraint_values(states.T).max(axis=0) > 0.0
-    if outside.any():
-        (cross,) = axis.plot(x[outside], y[outside], "x", color=_INK, ms=4.5, mew=1.0)
-        handles["violation of the true state"] = cross
+    if (violating := _violating(path, plant)).any():
+        (cross,) = axis.plot(x[violating], y[violating], "x", color=_INK, ms=4.5, mew=1.0)
+        handles["violation"] = cross
     return handles
 
 

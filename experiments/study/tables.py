@@ -91,7 +91,8 @@ def margins_table(summary: dict[str, Any]) -> str:
     """Returns the smallest margin of each family without a violating episode, and what it costs.
 
     That is as trained and under attack. What it costs is said of the margin that is enough under attack, or else of the
-    other: its return less that of the arm with a proof, and what it loses on an ideal channel, where none is needed.
+    other: its return less that of the arm with a proof, and on an ideal channel less that of the margin of its kind
+    that returns most there.
     """
     rows = [["margin without a violation", "as trained", "attacked", "return", "lost, ideal"]]
     for title, env in summary["environments"].items():

@@ -7,7 +7,7 @@ from gymnasium.vector import VectorWrapper
 
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
-from ncs_gym import Channel
+from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.env import ncs_env
 from shields import certificate_for
 from shields.synthesis.polytope_certificates import with_polytope
@@ -35,6 +35,20 @@ def scalar(monkeypatch):
     spec.id, spec.vector_entry_point = "Scalar-v0", None
     monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
     return LoopConfig(env="Scalar-v0")
+
+
+def test_steps_of_its_trajectory_that_cost_are_told():
+    plant = LinearPlant(
+        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], dt=0.1, box=[1.0, 1.0], u_max=0.3, du_max=0.5,
+        disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001,
+    )  # fmt: skip
+    loop = LoopConfig(env="ncs_gym/LinearNCS-v0", kwargs={"plant": plant, "max_episode_steps": 40})
+    alternating = iter(np.where(np.arange(50) % 7 == 0, 1.0, -1.0))
+    played = evaluate(loop, lambda seen, _: np.full((len(seen), 1), next(alternating), np.float32), 1, 0)
+    path = played.trajectory
+    before = np.concatenate([[0.0], path.inputs[:-1, 0]])
+    np.testing.assert_array_equal(path.violated, np.abs(path.inputs[:, 0] - before) > 0.5)
+    assert path.violated.sum() == played.episodes[0].violation_steps > 5
 
 
 def test_it_is_printed_as_one_line():

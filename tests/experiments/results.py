@@ -35,13 +35,19 @@ LONG_CAMPAIGN = SafetyCounts(
 )
 
 
-def trajectory(states: np.ndarray, m: int = 1, intervened: tuple[int, ...] = (), arrivals: tuple[int, ...] = ()):
+def trajectory(
+    states: np.ndarray,
+    m: int = 1,
+    intervened: tuple[int, ...] = (),
+    arrivals: tuple[int, ...] = (),
+    violated: tuple[int, ...] = (),
+):
     """A trajectory through states (T + 1, n) whose proposed inputs differ from the applied where it intervened."""
     steps = len(states) - 1
-    acted, arrived = np.zeros(steps, bool), np.zeros(steps, bool)
-    acted[list(intervened)], arrived[list(arrivals)] = True, True
+    acted, arrived, broken = np.zeros((3, steps), bool)
+    acted[list(intervened)], arrived[list(arrivals)], broken[list(violated)] = True, True, True
     inputs = np.full((steps, m), 0.5)
-    return Trajectory(states, states + 0.01, inputs, inputs + acted[:, None], acted, arrived)
+    return Trajectory(states, states + 0.01, inputs, inputs + acted[:, None], acted, arrived, broken)
 
 
 def history(*steps: int, scale: float = 1.0) -> list[TrainingPoint]:

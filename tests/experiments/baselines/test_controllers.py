@@ -147,6 +147,15 @@ def test_regulation_needs_no_target_and_the_others_their_gain():
     assert not controller("zero input", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates}).any()
 
 
+@pytest.mark.parametrize("name", ["lqr", "mpc", "mpc:20"])
+def test_plant_of_one_state_and_one_limit_is_regulated(name):
+    bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.02}
+    env = NCSEnv(LinearPlant(A=[[0.8]], B=[[0.4]], dt=1.0, box=[1.0], u_max=0.1, **bounds))
+    policy = controller(name, env, Fallback.of_gain(np.zeros((1, 1))), 0)
+    (u,) = policy(np.array([[0.9]]), {"estimate": np.array([[0.9]])})
+    assert -1.0 <= u[0] < -0.5
+
+
 def test_random_inputs_depend_on_the_seed_alone():
     env, estimates = env_of("ncs_gym/BatchReactor-v0"), np.zeros((500, 4))
     one, again, other = (controller("random", env, Fallback.of_gain(np.zeros((2, 4))), seed) for seed in (1, 1, 2))

@@ -281,7 +281,21 @@ def test_violations_of_the_limit_are_marked_and_only_then_in_the_legend():
         path = trajectory(np.linspace(0.0, reach, 11)[:, None] * np.ones(2))
         figure = episode_figure(plant, arms("unshielded", trajectory=path))
         assert any(line.get_marker() == "x" for line in figure.axes[0].get_lines()) is marked
-        assert ("violation of the true state" in texts(figure)) is marked
+        assert ("violation" in texts(figure)) is marked
+
+
+def test_violations_of_limits_that_states_do_not_show_are_marked_too():
+    """Of inputs and their changes, and between two samples: what the infos of the steps counted."""
+    plant = random_plant(1, 2, 1)
+    path = trajectory(np.zeros((11, 2)), violated=(2, 7))
+    (crosses,) = [
+        line for line in episode_figure(plant, arms("unshielded", trajectory=path)).axes[0].get_lines()
+        if line.get_marker() == "x"
+    ]  # fmt: skip
+    np.testing.assert_allclose(crosses.get_xdata(), plant.dt * np.array([3, 8]))
+    figure = phase_figure(plant, BALL, arms("unshielded", trajectory=path))
+    marked = [line for line in figure.axes[0].get_lines() if line.get_marker() == "x"]
+    assert {len(line.get_xdata()) for line in marked} == {2}
 
 
 def test_an_episode_that_ended_early_stands_beside_a_longer_one():
