@@ -118,8 +118,8 @@ def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float)
     given = np.concatenate([A, B], axis=1)
     if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
         raise ValueError(
-            "between_samples needs the model in continuous time that A and B were sampled from, and continuous_model "
-            "is another one: make the plant by LinearPlant.from_statespace"
+            "continuous_model is not the one that A and B were sampled from: make the plant by "
+            "LinearPlant.from_statespace, or give continuous_model=None"
         )
 
 

@@ -369,12 +369,13 @@ def _residual_of_equilibrium(
 
 
 def require_given_once(arguments: dict[str, Any]) -> None:
-    """Raises ValueError if ends are given beside published limits that they follow from."""
-    for ends, others in (("box_ends", ("state_limits",)), ("input_ends", ("u_max", "input_limits"))):
+    """Raises ValueError if a field is given beside a published argument that it follows from."""
+    follows = {"box_ends": ("state_limits",), "input_ends": ("u_max", "input_limits"), "step_offset": ("offset",)}
+    for ends, others in follows.items():
         if arguments.get(ends) is not None:
             for other in others:
                 if arguments.get(other) is not None:
-                    raise ValueError(f"{ends} follow from {other}: give these alone")
+                    raise ValueError(f"give {ends} or {other}, not both")
 
 
 def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -400,7 +401,8 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     _require_operating_input(arguments, state)
     lacking = np.zeros(n)
     if given["offset"] is not None:
-        lacking = _residual_of_equilibrium(A, B, as_vector(given["offset"], n, "offset"), state, applied)
+        fields["step_offset"] = as_vector(given["offset"], n, "offset")
+        lacking = _residual_of_equilibrium(A, B, fields["step_offset"], state, applied)
     fields |= _input_fields(given, applied)
     fields = _row_fields(fields, given, state)
     fields = _mixed_fields(fields, given["mixed_limits"], state, applied)
@@ -536,11 +538,6 @@ def _around_middle_of_disturbance(
     declared = as_bound((E, half), n, name)
     if not middle.any():
         return {name: _with_residual(declared, lacking, as_box_rows(fields["box"], n))}
-    if fields.get("between_samples") not in (None, 1):
-        raise ValueError(
-            f"{name}: with between_samples its ends must be symmetric: how much of a disturbance's middle has come by "
-            "a time within a step is not known"
-        )
     rows = as_box_rows(fields["box"], n)
     ends = as_row_ends(fields.get("box_ends"), len(rows))
     inputs = as_input_ends(fields["input_ends"], m)
@@ -587,4 +584,5 @@ def _around_middle_of_disturbance(
         "input_ends": inputs,
         "operating_state": point[0] + x,
         "operating_input": point[1] + u,
+        "step_offset": as_operating_point(fields.get("step_offset"), n, "step_offset") + exact.product(E, middle),
     } | mixed

@@ -43,6 +43,7 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     yield flag("between samples: the certificate has the plant's grid", claimed)
     if rows is None or model is None or points is None or not claimed:
         return
+    yield flag("between samples: no constant disturbance holds the operating point", not plant.step_offset.any())
     (k, n), m = plant.box.shape, plant.m
     fits = rows.state.shape == (points, k, n) and rows.input.shape == (points, k, m) and model.shape == (n, n + m)
     fits = fits and rows.remainder.shape == (k,) and bool(np.isfinite(rows.remainder).all())

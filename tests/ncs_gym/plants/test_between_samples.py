@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ncs_gym import LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym import Channel, LinearPlant, batch_reactor, cart_pole, register_plant, truck_trailer
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANTS = {
@@ -162,3 +162,57 @@ def test_registered_environments_count_between_samples_if_they_are_told_so(make)
     assert env.plant.fingerprint == own.fingerprint
     assert env.contract == make("ncs_gym/CSTR-v0").unwrapped.contract
     assert make("ncs_gym/CSTR-v0", between_samples=1).unwrapped.plant.between_samples is None
+
+
+PUSHED = {"box": [1.0, 2.0], "u_max": 1.0, "sensor_bound": 0.01, "initial_bound": 0.01}
+OSCILLATOR = ([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1)))
+
+
+def pushed(**more):
+    """An oscillator pushed to one side within each step, at rest under the middle of that."""
+    bound = {"disturbance_bound": ([[0.0], [0.6]], [0.0], [1.0])}
+    return LinearPlant.from_statespace(OSCILLATOR, dt=1.5, **PUSHED | bound | more)
+
+
+def held(**more):
+    """The same with a constant of its model in absolute coordinates."""
+    A = exponentials(pushed(), [1.5])[0][:, :2]
+    point = np.linalg.solve(np.eye(2) - A, [0.0, 0.3])
+    bound = {"disturbance_bound": 0.05, "offset": [0.0, 0.3], "operating_state": point, "operating_input": 0.0}
+    return LinearPlant.from_statespace(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
+
+
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+@pytest.mark.parametrize("make", [pushed, held])
+def test_constant_disturbance_is_refused_beside_between_samples_at_every_entrance(make):
+    plant = make()
+    np.testing.assert_allclose(plant.step_offset, [0.0, 0.3])
+    document = plant.document
+    (edited := document | {"plant": dict(document["plant"])})["plant"]["between_samples"] = 8
+    env_id = "Pushed/Oscillator-v0"
+    register_plant(env_id, plant, channel=Channel())
+    entrances = [
+        lambda: make(between_samples=8),
+        lambda: replace(plant, between_samples=8),
+        lambda: LinearPlant.read(edited),
+        lambda: gym.make("ncs_gym/LinearNCS-v0", plant=plant, between_samples=8),
+        lambda: gym.make("ncs_gym/LinearNCS-v0", plant=edited),
+        lambda: gym.make_vec("ncs_gym/LinearNCS-v0", 2, plant=plant, between_samples=8),
+        lambda: gym.make(env_id, between_samples=24),
+        lambda: replace(plant.resampled(1.0), between_samples=8),
+    ]
+    try:
+        for entrance in entrances:
+            with pytest.raises(ValueError, match="rests without a constant disturbance"):
+                entrance()
+    finally:
+        del gym.registry[env_id]
+    assert make(between_samples=1).fingerprint == LinearPlant.read(document).fingerprint == plant.fingerprint
+
+
+def test_model_in_continuous_time_is_the_one_that_was_sampled():
+    plant = truck_trailer()
+    for change in ({"A": 0.9 * plant.A}, {"dt": 1.0}, {"continuous_model": 1.1 * plant.continuous_model}):
+        with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
+            replace(plant, **change)
+    assert replace(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None

@@ -79,7 +79,7 @@ REGISTERED = {
 def test_registered_plants_keep_their_fingerprints(make):
     plant = make()
     assert plant.fingerprint.startswith(REGISTERED[make])
-    assert replace(plant, dt=2.0 * plant.dt, remainder=None).fingerprint != plant.fingerprint
+    assert replace(plant, dt=2.0 * plant.dt, continuous_model=None, remainder=None).fingerprint != plant.fingerprint
 
 
 @pytest.mark.parametrize("name", BY_NAME)
