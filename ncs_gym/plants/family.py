@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -22,7 +22,6 @@ from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.family import Family, entry_name, matrices_of
-from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import as_flag, as_names, as_number, shown
 
@@ -38,10 +37,12 @@ ROUNDING, ROOM = 1e-9, 1e-12
 GRID = 256
 MOST_PARAMETERS = 6
 # In what members may differ; the plant of the middle has no model in continuous time.
-_OWN = ("A", "B", "continuous_model")
+_OWN = ("A", "B", "continuous_model", "step_offset")
 # What is the same of all members, but was rounded around other operating points, agrees to this, relatively.
 _ROUNDED = ("box", "box_ends", "input_ends", "mixed_rows", "mixed_ends")
 SAME = 1e-9
+# Bounds of disturbances that hold this rounding agree to this, in limits of the states.
+SAME_BOUND = 1e-10
 
 
 def plant_of_middle(
@@ -69,24 +70,38 @@ def plant_of_middle(
         )
     if rest_matters or family.members[..., -1].any():
         basis += ", each being at rest at its operating point (given)"
-    moved = [_around_center(each, _center_of(plants)) for each in plants]
-    first = moved[0]
+    first = _around_center(plants[0], _center_of(plants))
     middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
-    middle[:, -1] = 0.0
-    off = np.abs(family.members - middle)
-    if family.interval is not None:
-        off = np.abs(family.interval - middle).max(axis=0, keepdims=True)
-    # Past inputs keep the limits of inputs only where they are that for every member.
-    reach = np.append(np.max([each.reach for each in moved], axis=0), 1.0)
-    bound = _around(first, _largest(reach, off, first.state_names))
     return replace(
         first,
         A=middle[:, : first.n],
         B=middle[:, first.n : -1],
         continuous_model=None,
-        disturbance_bound=_covering([each.disturbance_bound for each in plants], first),
-        remainder=Remainder(bound, True, basis, family),
+        disturbance_bound=_covering(plants),
+        remainder=replace(family, basis=basis),
     )
+
+
+def bound_of_family(plant: LinearPlant, family: Family) -> Ellipsoid:
+    """Returns what the plant leaves out of every member of a family, shape (n, n).
+
+    Past inputs keep the limits of inputs only where they are that for every member, and undisturbed.
+
+    Raises:
+        ValueError: If members are of another size, or differ in what an unlimited state does.
+    """
+    n, size = plant.n, (plant.n, plant.n + plant.m + 1)
+    if family.members.shape[1:] != size:
+        raise ValueError(f"the members of the family must be [A, B, s] of shape {size}, got {family.members.shape[1:]}")
+    listed = family.members if family.interval is None else family.interval
+    off = np.abs(listed - np.column_stack([plant.A, plant.B, np.zeros(n)]))
+    if family.interval is not None:
+        off = off.max(axis=0, keepdims=True)
+    disturbed = off.any(axis=(0, 2)) | (plant.gamma > 0.0) | (plant.process_noise_cov.diagonal() > 0.0)
+    if plant.disturbance_bound is not None:
+        disturbed |= plant.disturbance_bound.shape_matrix.diagonal() > 0.0
+    reach = np.append(plant.reach_with(inputs_under_way(plant, disturbed)), 1.0)
+    return _around(plant, _largest(reach, off, plant.state_names))
 
 
 def _rest_matters(family: Family, plants: list[P]) -> bool:
@@ -130,22 +145,42 @@ def _around_center(plant: P, center: np.ndarray) -> P:
     )
 
 
-def _covering(bounds: list[Ellipsoid | None], plant: LinearPlant) -> Ellipsoid | None:
-    """Returns an ellipsoid around all bounds of the disturbance, the first one if all are the same.
+def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
+    """Returns a bound of the disturbances of all members, the one of the first if all have the same.
 
-    They differ by the rounding of operating points, which each holds: P_i <= P_0 + diag(row sums of |P_i - P_0|).
-
-    Raises:
-        ValueError: If they differ by more.
+    What members that rest at different points lack of an equilibrium by rounding is part of their bounds, and is less
+    than SAME_BOUND of the limits. P_i <= P_0 + diag(row sums of |P_i - P_0|), which `_require_covered` compares.
     """
-    shapes = np.array([np.zeros((plant.n, plant.n)) if each is None else each.shape_matrix for each in bounds])
-    if not (off := np.abs(shapes - shapes[0])).any():
-        return bounds[0]
-    widths = np.where(np.isfinite(plant.reach[: plant.n]), plant.reach[: plant.n], 1.0)
-    excess = (off / (widths * widths[:, None])).sum(axis=2).max(axis=0)
-    if excess.max() > SAME:
-        raise ValueError("the members of a family may differ in A and B alone, and one has another disturbance_bound")
-    return Ellipsoid(shapes[0] + np.diag((1.0 + ROUNDING) * excess * widths**2))
+    first = plants[0]
+    shape = _disturbance_shape(first)
+    if all(np.array_equal(shape, _disturbance_shape(each)) for each in plants):
+        return first.disturbance_bound
+    widths = _finite_widths(first)
+    size = np.sqrt((np.abs(shape) / (widths * widths[:, None])).sum(axis=1))
+    return Ellipsoid(shape + np.diag((2.0 * size + SAME_BOUND) * SAME_BOUND * widths**2))
+
+
+def _require_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearPlant, name: str) -> None:
+    """Raises ValueError unless the bound of a member's disturbance is inside of the bound of the family's."""
+    off = np.abs(_disturbance_shape(plant) - _disturbance_shape(first))
+    widths = _finite_widths(first)
+    excess = (off / (widths * widths[:, None])).sum(axis=1) * widths**2
+    room = np.zeros(first.n) if cover is None else np.diag(cover.shape_matrix - _disturbance_shape(first))
+    if (excess > room).any():
+        raise ValueError(
+            f"the members of a family may differ in A and B alone, and {name} has another disturbance_bound"
+        )
+
+
+def _disturbance_shape(plant: LinearPlant) -> np.ndarray:
+    bound = plant.disturbance_bound
+    return np.zeros((plant.n, plant.n)) if bound is None else bound.shape_matrix
+
+
+def _finite_widths(plant: LinearPlant) -> np.ndarray:
+    """Returns the largest |x_j| in the safe box, shape (n,); 1 for a free state."""
+    reach = plant.reach[: plant.n]
+    return np.where(np.isfinite(reach), reach, 1.0)
 
 
 def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:
@@ -184,6 +219,7 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     room = ROOM * (varies * np.abs(matrices[..., :-1]).max(axis=(0, 2)))[:, None] * np.isfinite(reach)
     room = np.column_stack([room, ROOM * _terms_of_step(plants, matrices)])
     interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
+    first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
     family = Family(
         names=names,
         parameters=np.array(corners),
@@ -191,6 +227,7 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
         function=function,
         interval=interval,
         center=_center_of(plants),
+        check=partial(_require_shared, kind, first, cover, "another one"),
     )
     checked = _check_monotone(family, room)
     shown_ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(names, ends, strict=True))
@@ -226,26 +263,43 @@ def _ends(name: str, value: Any) -> tuple[float, float]:
 def _require_alike(kind: type[P], plants: list[P]) -> None:
     """Raises ValueError unless all are plants that differ in A and B alone, and in where they rest."""
     for each in plants:
-        if not isinstance(each, kind):
-            raise ValueError(f"the members of a family must be of type {kind.__name__}, got {shown(each)}")
-        if each.remainder is not None:
+        _require_member(kind, plants[0], each)
+    first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
+    for number, each in enumerate(plants):
+        _require_shared(kind, first, cover, f"member {number}", each)
+
+
+def _require_member(kind: type[P], first: P, plant: Any) -> None:
+    """Raises ValueError unless a plant can be a member of a family, and has the sizes of its first one."""
+    if not isinstance(plant, kind):
+        raise ValueError(f"the members of a family must be of type {kind.__name__}, got {shown(plant)}")
+    if plant.remainder is not None:
+        raise ValueError("a member of a family has a remainder of its own, for which no bound of the family is proved")
+    if plant.between_samples is not None:
+        raise ValueError("between_samples is not proved for a family: give its members without it")
+    matrices_of(plant, (first.n, first.n + first.m + 1), np.zeros(plant.n + plant.m))
+
+
+def _require_shared(kind: type[P], first: P, cover: Ellipsoid | None, name: str, plant: Any) -> None:
+    """Raises ValueError unless a plant, counted from where the first one is, has all that members share.
+
+    Args:
+        kind: Class of the plants.
+        first: The first member.
+        cover: The family's bound of disturbances.
+        name: What the message calls the plant.
+        plant: The plant.
+    """
+    _require_member(kind, first, plant)
+    moved = _around_center(plant, _resting_points([first])[0])
+    for entry in fields(moved):
+        one, other = getattr(first, entry.name), getattr(moved, entry.name)
+        tolerance = SAME if entry.name in _ROUNDED else 0.0
+        if entry.name not in (*_OWN, "disturbance_bound") and not _is_same(one, other, tolerance):
             raise ValueError(
-                "a member of a family has a remainder of its own, for which no bound of the family is proved"
+                f"the members of a family may differ in A and B alone, and {name} has another {entry.name}"
             )
-        if each.between_samples is not None:
-            raise ValueError("between_samples is not proved for a family: give its members without it")
-        matrices_of(each, (plants[0].n, plants[0].n + plants[0].m + 1), np.zeros(each.n + each.m))
-    center = _center_of(plants)
-    first, *others = (_around_center(each, center) for each in plants)
-    for number, each in enumerate(others, 1):
-        for entry in fields(each):
-            one, other = getattr(first, entry.name), getattr(each, entry.name)
-            tolerance = SAME if entry.name in _ROUNDED else 0.0
-            if entry.name not in (*_OWN, "disturbance_bound") and not _is_same(one, other, tolerance):
-                raise ValueError(
-                    f"the members of a family may differ in A and B alone, and member {number} has another {entry.name}"
-                )
-    _covering([each.disturbance_bound for each in plants], first)
+    _require_covered(first, cover, plant, name)
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:

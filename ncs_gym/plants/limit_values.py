@@ -94,12 +94,15 @@ class LimitValues(ReadOnlyArrays):
 
         Of states that are past inputs those are the inputs' limits, which they never leave.
         """
+        return self.reach_with(inputs_under_way(cast("LinearPlant", self)))
+
+    def reach_with(self, past: int) -> np.ndarray:
+        """Returns what `reach` is if so many of the last states are past inputs."""
         two_ends = np.isfinite(self.box_ends).all(axis=0)
         limited, reach = self.box[two_ends].any(axis=0), np.full(self.n, np.inf)
         with suppress(ZeroDivisionError):  # rows that limit a sum alone
             reach[limited] = between_samples.widest(self.box[:, limited], self.box_ends)
         reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
-        past = inputs_under_way(cast("LinearPlant", self))
         reach[self.n - past :] = np.tile(self.largest_input, past // self.m)
         return read_only(np.concatenate([reach, self.largest_input]))
 

@@ -19,7 +19,7 @@ from ncs_gym import exact
 from ncs_gym.plants import between_samples, limits, plant_file, statespace
 from ncs_gym.plants.assumptions import assumptions_of, warn_of_no_noise
 from ncs_gym.plants.description import described
-from ncs_gym.plants.family import plant_of_middle
+from ncs_gym.plants.family import bound_of_family, plant_of_middle
 from ncs_gym.plants.hard_bounds import HardBounds
 from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import inputs_under_way, storing, with_past_inputs
@@ -171,6 +171,9 @@ class LinearPlant(LimitValues, HardBounds):
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
         operating_input: Input that deviations are counted from, shape (m,).
+        step_offset: What the operating point rests under in every step beside A and B, shape (n,): `offset` and the
+            middle of a disturbance with two ends. It is zero with `between_samples`, since how much of it has come by a
+            time within a step is not known.
         state_names: Names of the states, for tables and figures.
         state_units: Units of the states.
         input_names: Names of the inputs.
@@ -204,6 +207,7 @@ class LinearPlant(LimitValues, HardBounds):
     error_gain: np.ndarray | None = None
     operating_state: np.ndarray = FILLED_IN_LATER
     operating_input: np.ndarray = FILLED_IN_LATER
+    step_offset: np.ndarray = FILLED_IN_LATER
     state_names: Sequence[str] = field(default=())
     state_units: Sequence[str] = field(default=())
     input_names: Sequence[str] = field(default=())
@@ -245,6 +249,7 @@ class LinearPlant(LimitValues, HardBounds):
             error_gain: ArrayLike | None = None,
             operating_state: ArrayLike | None = None,
             operating_input: ArrayLike | None = None,
+            step_offset: ArrayLike | None = None,
             state_names: Sequence[str] = (),
             state_units: Sequence[str] = (),
             input_names: Sequence[str] = (),
@@ -268,6 +273,7 @@ class LinearPlant(LimitValues, HardBounds):
         is_given = self._check_declared()
         if self.error_gain is not None:
             self._set("error_gain", as_matrix(self.error_gain, (self.m, n), "error_gain"))
+        self._set("step_offset", limits.as_operating_point(self.step_offset, n, "step_offset"))
         self._check_between_samples()
         for name, size, letter in (("state", n, "x"), ("input", self.m, "u")):
             center = f"operating_{name}"
@@ -299,21 +305,27 @@ class LinearPlant(LimitValues, HardBounds):
             if (value := getattr(self, bound)) is not None:
                 self._set(bound, as_bound(value, size, bound))
         if self.remainder is not None:
-            if not isinstance(self.remainder, Remainder):
-                raise ValueError(f"remainder must be a Remainder, got {shown(self.remainder)}")
-            as_bound(self.remainder.bound, self.n, "remainder")
-            model = {name: getattr(self, name) for name in ("A", "B")}
-            model |= {"box": np.vstack([self.box.T, self.box_ends]), "u_max": self.input_ends, "dt": self.dt}
-            if self.members is not None:  # how far states reach depends on whether past inputs are disturbed
-                model["disturbance_bound"] = np.array(inputs_under_way(self))
-            self._set("remainder", self.remainder.of_model(model))
+            self._set("remainder", self._own_remainder(self.remainder))
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
+
+    def _own_remainder(self, given: Any) -> Remainder:
+        """Returns the remainder of this model; the bound of a family's is worked out from its members."""
+        family = given.family if isinstance(given, Remainder) else given
+        if isinstance(family, Family):
+            return Remainder(bound_of_family(self, family), True, family.basis, family)
+        if not isinstance(given, Remainder):
+            raise ValueError(f"remainder must be a Remainder or a Family, got {shown(given)}")
+        as_bound(given.bound, self.n, "remainder")
+        model = {name: getattr(self, name) for name in ("A", "B")}
+        model |= {"box": np.vstack([self.box.T, self.box_ends]), "u_max": self.input_ends, "dt": self.dt}
+        return given.of_model(model)
 
     def _check_between_samples(self) -> None:
         """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
         if self.continuous_model is not None:
             shape = (self.n, self.n + self.m)
             self._set("continuous_model", as_matrix(self.continuous_model, shape, "continuous_model"))
+            between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt)
         if self.between_samples is None:
             return
         points = as_count(self.between_samples, "between_samples", low=1, high=between_samples.MOST_POINTS)
@@ -329,9 +341,13 @@ class LinearPlant(LimitValues, HardBounds):
             raise ValueError(
                 "between_samples is for a plant without a remainder, which says nothing of the times between samples"
             )
+        if self.step_offset.any():
+            raise ValueError(
+                "between_samples is for an operating point that rests without a constant disturbance: how much of "
+                f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
+            )
         if np.linalg.matrix_rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
             raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
-        between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt)
 
     @classmethod
     @own_error_state
@@ -430,6 +446,7 @@ class LinearPlant(LimitValues, HardBounds):
             gamma=0.0,
             disturbance_bound=Ellipsoid(_symmetric_product(G, bound.shape_matrix)),
             process_noise_cov=_symmetric_product(G, self.process_noise_cov),
+            step_offset=exact.product(G, self.step_offset),
         )
 
     @own_error_state
@@ -577,7 +594,7 @@ class LinearPlant(LimitValues, HardBounds):
             self._require_symmetric("box_ends and input_ends")
         u_max = np.minimum(-self.input_low, self.input_high)
         given = self.remainder  # bounded for more states and inputs than are left
-        remainder = given and Remainder(given.bound, given.proved, given.basis, given.family)
+        remainder = given and (given.family or Remainder(given.bound, given.proved, given.basis))
         limits = {"box": self.symmetric_box, "box_ends": None, "input_ends": (-u_max, u_max)}
         return replace(self, **limits, remainder=remainder)
 
@@ -623,7 +640,8 @@ class LinearPlant(LimitValues, HardBounds):
                 digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         if self.error_gain is not None:
             digest.update(self.error_gain.astype("<f8").tobytes())
-        for name in ("disturbance_bound", "sensor_bound", "initial_bound", "operating_state", "operating_input"):
+        bounds = "disturbance_bound", "sensor_bound", "initial_bound"
+        for name in (*bounds, "operating_state", "operating_input", "step_offset"):
             value = getattr(self, name)
             array = value.shape_matrix if isinstance(value, Ellipsoid) else value
             if array is not None and np.any(array):  # a plant without them keeps the fingerprint it always had

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import as_count, counted
 
 if TYPE_CHECKING:
@@ -22,14 +23,19 @@ STORED_INPUT_REACH = 4.0
 LONGEST_INPUT_DELAY = 100
 
 
-def inputs_under_way(plant: LinearPlant) -> int:
+def inputs_under_way(plant: LinearPlant, disturbed: np.ndarray | None = None) -> int:
     """Returns how many of the last states are past inputs, of an `input_delay` or limits of rates; 0 of most plants.
 
     These are states (u_{k-d}, .., u_{k-1}), of which the input is the newest one in the next step. What is disturbed on
     its way is none: it may be beyond the limits of inputs.
+
+    Args:
+        plant: The plant.
+        disturbed: Which states are disturbed, shape (n,); by default what is declared of the plant.
     """
     n, m = plant.n, plant.m
-    disturbed = plant.nominal_disturbance.shape_matrix.diagonal() > 0.0
+    if disturbed is None:
+        disturbed = plant.nominal_disturbance.shape_matrix.diagonal() > 0.0
     if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B[-m:], np.eye(m)) or disturbed[-m:].any():
         return 0
     stored = m
@@ -121,7 +127,8 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
     if remainder is not None:
         if plant.members is not None:
             raise ValueError("inputs become states of the plants of a family one by one: give du_max to its members")
-        remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored))))
+        padded = Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored)))
+        remainder = Remainder(padded, remainder.proved, remainder.basis)
     return replace(
         plant,
         A=A,
@@ -140,6 +147,7 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
         continuous_model=None,
         error_gain=None if plant.error_gain is None else np.pad(plant.error_gain, ((0, 0), (0, stored))),
         operating_state=np.concatenate([plant.operating_state, np.tile(plant.operating_input, stored_inputs)]),
+        step_offset=np.pad(plant.step_offset, (0, stored)),
         state_names=[*plant.state_names, *(f"{name} of {age}" for age in ages for name in plant.input_names)],
         state_units=[*plant.state_units, *tuple(plant.input_units) * stored_inputs],
     )

@@ -21,12 +21,14 @@ if TYPE_CHECKING:
 
 _FORMAT = "ncs-gym plant 1"
 # What of a remainder, and of the family that it is about, stands in a file.
-_OF_REMAINDER, _OF_FAMILY = ("bound", "proved", "basis"), ("names", "parameters", "members")
+_OF_REMAINDER, _OF_FAMILY = ("bound", "proved", "basis"), ("names", "parameters", "members", "interval", "basis")
 
 
 def document_of(plant: LinearPlant) -> dict[str, Any]:
     """Returns what a file of the plant holds, as JSON values: all that it was made with."""
     content = {entry.name: _as_json(getattr(plant, entry.name)) for entry in fields(plant)}
+    if not plant.step_offset.any():
+        del content["step_offset"]
     if not len(plant.mixed_rows):
         del content["mixed_rows"], content["mixed_ends"]
     else:
@@ -65,8 +67,9 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, Ellipsoid):
         return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
-        given = {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
-        return given if value.family is not None else {name: given[name] for name in _OF_REMAINDER}
+        if value.family is not None:  # the bound follows from it
+            return _as_json(value.family)
+        return {name: _as_json(getattr(value, name)) for name in _OF_REMAINDER}
     if isinstance(value, Family):
         return {name: _as_json(getattr(value, name)) for name in _OF_FAMILY}
     if isinstance(value, tuple):
@@ -80,7 +83,7 @@ def _from_json(value: Any) -> Any:
         return value
     if set(value) == {*_OF_FAMILY}:
         return Family(**value)
-    if set(value) - {"family"} == {*_OF_REMAINDER}:
+    if set(value) == {*_OF_REMAINDER}:
         return Remainder(**{name: _from_json(each) for name, each in value.items()})
     if set(value) != {"shape"}:
         raise ValueError(

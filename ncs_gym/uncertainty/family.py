@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_numbers, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_numbers, read_only, require_short_text, shown
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -32,6 +32,8 @@ class Family(ReadOnlyArrays):
         interval: The low and the high entries of [A, B, s] of all that the function returns, shape (2, n, n + m + 1);
             None without one.
         center: State and input that deviations are counted from, shape (n + m,); None is zero.
+        basis: Which plants the bound of a family is for, in a phrase.
+        check: Raises ValueError unless a plant that the function returned differs from the others in [A, B, s] alone.
 
     Raises:
         ValueError: If a shape is wrong.
@@ -43,6 +45,8 @@ class Family(ReadOnlyArrays):
     function: Callable[..., LinearPlant] | None = None
     interval: np.ndarray | None = None
     center: np.ndarray | None = None
+    basis: str = ""
+    check: Callable[[LinearPlant], None] | None = None
 
     def __post_init__(self) -> None:
         members = as_numbers(self.members)
@@ -55,6 +59,14 @@ class Family(ReadOnlyArrays):
         object.__setattr__(self, "names", as_names(self.names, default, "the names of parameters"))
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "members", np.array(members))
+        if self.interval is not None:
+            interval = as_numbers(self.interval)
+            if interval is None or interval.shape != (2, *members.shape[1:]):
+                raise ValueError(f"the interval of a family must have shape {(2, *members.shape[1:])}")
+            if not ((interval[0] <= members) & (members <= interval[1])).all():
+                raise ValueError("the members of a family must lie in its interval")
+            object.__setattr__(self, "interval", np.array(interval))
+        require_short_text(self.basis, "the basis of a family")
         self._make_arrays_read_only()
 
     @cached_property
@@ -131,12 +143,18 @@ class Family(ReadOnlyArrays):
         return matrices
 
     def of_function(self, parameters: np.ndarray) -> np.ndarray:
-        """Returns [A, B, s] of the plant that the function returns, shape (n, n + m + 1), whatever it is."""
+        """Returns [A, B, s] of the plant that the function returns, shape (n, n + m + 1), within the ranges or not.
+
+        Raises:
+            ValueError: If that plant is no member by `check`.
+        """
         assert self.function is not None
         shape = self.members.shape[1:]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # those at the corners of the ranges were shown
             plant = self.function(**dict(zip(self.names, parameters.tolist(), strict=True)))
+        if self.check is not None:
+            self.check(plant)
         return matrices_of(plant, shape, np.zeros(shape[1] - 1) if self.center is None else self.center)
 
     def _fitting(self, fixed: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -19,7 +19,8 @@ class Remainder:
     """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits.
 
     The remainder that a plant keeps knows the model, the box and the limits of that plant, and no plant of others takes
-    it over.
+    it over. Whether its bound is proved has to be said again with `dataclasses.replace`. Of a family, the plant that
+    keeps it works the bound out of the members itself.
 
     Attributes:
         bound: E(R) around the remainder, in units of the state.
@@ -34,15 +35,15 @@ class Remainder:
     """
 
     bound: Ellipsoid
-    proved: bool
+    proved: InitVar[bool]
     basis: str
     family: Family | None = None
     _model: ClassVar[Mapping[str, np.ndarray] | None] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, proved: bool) -> None:
         if not isinstance(self.bound, Ellipsoid):
             raise ValueError(f"the bound of a remainder must be an Ellipsoid, got {shown(self.bound)}")
-        object.__setattr__(self, "proved", as_flag(self.proved, "proved"))
+        object.__setattr__(self, "proved", as_flag(proved, "proved"))
         if not isinstance(self.basis, str):
             raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
         require_short_text(self.basis, "the basis of a remainder")
@@ -53,17 +54,11 @@ class Remainder:
         """Returns the same remainder, which from now on belongs to this model alone.
 
         Args:
-            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt; of a
-                family disturbance_bound, too.
+            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt.
 
         Raises:
-            ValueError: If it belongs to another model, or the members of its family are of another size.
+            ValueError: If it belongs to another model.
         """
-        size = len(model["A"]), len(model["A"]) + model["B"].shape[1] + 1
-        if self.family is not None and self.family.members.shape[1:] != size:
-            raise ValueError(
-                f"the members of the family must be [A, B, s] of shape {size}, got {self.family.members.shape[1:]}"
-            )
         if self._model is not None:
             others = [name for name, value in model.items() if not np.array_equal(value, self._model[name])]
             if others:
