@@ -33,6 +33,7 @@ from shields.certificate import Certificate
 from shields.certificate_text import contract_text, size_of, table
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
+    ALARM,
     LATE_INPUT,
     NOT_CONFIRMED,
     NOT_FINITE,
@@ -166,8 +167,11 @@ class SafeLoop(CopiedWhole):
             self._requests = Requests(channel, assumed, self._input_delay)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
-        # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
-        self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
+        # Samples of the last steps of this episode by stamp, and whether one is no numbers, or there are two of one.
+        self._samples: dict[int, np.ndarray] = {}
+        self._damaged = self._contradicted = False
+        # Inputs, the newest first, from which with samples the state is to be found; None once it is known.
+        self._unknown: tuple[np.ndarray, ...] | None = None
         self._oldest_sought = STEPS_PER_STATE * plant.n + self._estimator.buffer
         self._discarded, self._told_of = DiscardedPackets(), frozenset[str]()
         self._phase = _Phase.STOPPED
@@ -230,7 +234,8 @@ class SafeLoop(CopiedWhole):
         self._applied.start()
         if self._requests is not None:
             self._requests.begin()
-        self._unknown = None if known else ({}, ())
+        self._samples, self._damaged, self._contradicted = {}, False, False
+        self._unknown = None if known else ()
         self._begin(inside)
         self._phase = _Phase.STARTED
         self._lost.begin()
@@ -244,10 +249,12 @@ class SafeLoop(CopiedWhole):
 
         At step 0 it is the first estimate: packets from before the first step are of no use, nor is a later sample of
         step 0, which a known first estimate stands for. Nothing compares the two.
+        Whether the start is known or not, two values of one sample, and one that is no finite numbers, end the
+        guarantee of the episode.
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
-                are sorted out. Two values of one sample end the guarantee.
+                are sorted out.
             applied: What the actuator applied since the last decision, shape (m,), if that may be something else than
                 was decided for this time. If it is, the estimate follows it and the guarantee ends; if it is no finite
                 input, the estimate follows the decision.
@@ -276,6 +283,7 @@ class SafeLoop(CopiedWhole):
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
         self._phase = _Phase.STOPPED
+        self._take_in(arrived, self.steps + (phase is _Phase.DECIDED))
         if phase is _Phase.DECIDED:
             decided, due = np.array(self._monitored.decided), self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
@@ -283,14 +291,11 @@ class SafeLoop(CopiedWhole):
             self._applied.add(due)
             self._estimator.advance(taken, arrived)
             self._monitored.advance(told, True, self._report(), decided)
-            if self._unknown is not None:
-                samples, inputs = self._unknown
-                self._unknown = samples, (taken, *inputs[: self._oldest_sought])
-                if told is None:  # samples of before tell nothing of a state that an unknown input moved
-                    self._unknown = {}, ()
+            if self._unknown is not None:  # samples of before tell nothing of a state that an unknown input moved
+                self._unknown = () if told is None else (taken, *self._unknown[: self._oldest_sought])
         self._applied.compare(heard, self.steps, self.episode)
         if self._unknown is not None:
-            self._find(arrived)
+            self._find(self._unknown)
         before, oldest = self._discarded, self._estimator.channel.longest_delay
         self._discarded = before.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
@@ -386,9 +391,10 @@ class SafeLoop(CopiedWhole):
             return NOT_STARTED
         if self._applied.is_other:
             return LATE_INPUT if self._input_delay else OTHER_INPUT
+        if self._damaged or self._contradicted:
+            return NOT_FINITE if self._damaged else ALARM
         if self._unknown is not None:
-            is_finite = all(np.isfinite(y).all() for y in self._unknown[0].values())
-            return UNKNOWN_START if is_finite else NOT_FINITE
+            return UNKNOWN_START
         if self._monitored.reason or self._applied.is_confirmed(self.steps):
             return self._monitored.reason
         return OTHER_EPISODE if self._applied.hears_of_others(self.steps) else NOT_CONFIRMED
@@ -406,7 +412,8 @@ class SafeLoop(CopiedWhole):
         another input than the decided one is applied; then it is 0. It takes for granted that what is decided is
         applied, also where no echo has confirmed that for long.
         """
-        unknown = self._phase is _Phase.STOPPED or self._unknown is not None or self._applied.is_other
+        is_proved = not (self._applied.is_other or self._damaged or self._contradicted)
+        unknown = self._phase is _Phase.STOPPED or self._unknown is not None or not is_proved
         return 0 if unknown else self._monitored.safe_steps
 
     @property
@@ -487,17 +494,21 @@ class SafeLoop(CopiedWhole):
         earlier = [LoopObservation(mean, errors.one(table, number), False) for mean, number in ahead]
         self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
 
-    def _find(self, packets: Iterable[Packet]) -> None:
-        """Takes in samples of a state that is not known, and begins anew where they prove where it is."""
-        assert self._unknown is not None
-        (samples, inputs), step, plant = self._unknown, self.steps, self._filter.plant
+    def _take_in(self, packets: Iterable[Packet], step: int) -> None:
+        """Keeps the samples of this episode that arrive by a step, and notes what no sensor sends."""
         for packet in packets:
-            if packet.episode == self.episode and packet.stamp >= 0:
-                samples = {packet.stamp: packet.measurement} | samples
-        samples = {stamp: y for stamp, y in samples.items() if 0 <= step - stamp <= len(inputs)}
-        self._unknown = samples, inputs
+            if packet.episode == self.episode and 0 <= packet.stamp <= step <= packet.stamp + self._oldest_sought:
+                before = self._samples.setdefault(packet.stamp, packet.measurement)
+                self._damaged |= not np.isfinite(packet.measurement).all()
+                self._contradicted |= before.tolist() != packet.measurement.tolist()
+        self._samples = {stamp: y for stamp, y in self._samples.items() if step <= stamp + self._oldest_sought}
+
+    def _find(self, inputs: tuple[np.ndarray, ...]) -> None:
+        """Begins anew where samples prove the state that is not known; inputs of shape (m,), the newest first."""
+        step, plant = self.steps, self._filter.plant
         noise = plant.sensor_error_with(self._estimator.channel.quantization_step).shape_matrix
-        usable = {stamp: y for stamp, y in samples.items() if np.isfinite(y).all()}
+        recent = {stamp: y for stamp, y in self._samples.items() if step - stamp <= len(inputs)}
+        usable = {stamp: y for stamp, y in recent.items() if np.isfinite(y).all()}
         # As of the newest sample: those that are on their way can then be used, and the contract counts on them.
         newest = max(usable, default=step)
         by_age, since = {newest - stamp: y for stamp, y in usable.items()}, step - newest
@@ -512,7 +523,8 @@ class SafeLoop(CopiedWhole):
         estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
         errors = self._monitored.errors.one(estimator.table, number)
         stays = estimator.table.is_certified(number)
-        return LoopObservation(estimate, errors, estimator.alarm, estimator.age, estimator.damaged, stays)
+        alarm, damaged = estimator.alarm or self._contradicted, estimator.damaged or self._damaged
+        return LoopObservation(estimate, errors, alarm, estimator.age, damaged, stays)
 
     @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:

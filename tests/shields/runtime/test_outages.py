@@ -20,7 +20,15 @@ from ncs_gym import (
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.processes import nonlinear_cart_pole
 from shields import SafeLoop
-from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT, UNKNOWN_START
+from shields.runtime.guarantee import (
+    ALARM,
+    LATE_INPUT,
+    NOT_CONFIRMED,
+    NOT_FINITE,
+    OTHER_EPISODE,
+    OTHER_INPUT,
+    UNKNOWN_START,
+)
 from tests.certificates import certificate_of
 
 PLANT = cart_pole()
@@ -270,6 +278,39 @@ def test_state_that_many_samples_tell_is_found_on_a_channel_of_any_delay(delay, 
         x = plant.A @ x + plant.B @ u + rng.uniform(-1.0, 1.0, 2) * [0.01, 0.002]
     assert not proved[0]
     assert any(proved)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("apart", [0, 1, 3])
+@pytest.mark.parametrize("first", [0, 2])
+def test_two_values_of_one_sample_end_the_guarantee_whether_the_start_is_known_or_not(known, apart, first):
+    plant = truck_trailer(mass=4000.0)
+    loop = SafeLoop(certificate_of(plant), plant, Channel(delay=4), on_unproved="ignore")
+    loop.start(np.zeros(2), known=known)
+    proved, arrivals = [], {}
+    arrivals.setdefault(first + 1, []).append(Packet(first, np.zeros(2), loop.episode))
+    arrivals.setdefault(first + 1 + apart, []).append(Packet(first, np.array([1.3, 0.0]), loop.episode))
+    for step in range(12):
+        usual = [Packet(step - 1, np.zeros(2), loop.episode)] if step > first + 1 + apart else []
+        loop.receive(arrivals.get(step, []) + usual)
+        proved.append(loop.guaranteed)
+        loop.decide(np.zeros(1))
+    assert not any(proved[first + 1 + apart :])
+    assert loop.reason == ALARM
+    loop.start(np.zeros(2))
+    assert loop.guaranteed
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_sample_that_is_no_number_ends_the_guarantee_whether_the_start_is_known_or_not(known):
+    plant = truck_trailer(mass=4000.0)
+    loop = SafeLoop(certificate_of(plant), plant, Channel(delay=1), on_unproved="ignore")
+    loop.start(np.zeros(2), known=known)
+    for step in range(9):
+        loop.receive([Packet(step - 1, np.full(2, np.nan if step == 2 else 0.0), loop.episode)] if step else [])
+        assert step < 2 or not loop.guaranteed
+        loop.decide(np.zeros(1))
+    assert loop.reason == NOT_FINITE
 
 
 def test_samples_of_before_an_unknown_input_tell_nothing_of_where_the_state_is():
