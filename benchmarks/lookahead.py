@@ -65,7 +65,7 @@ def admitted(safe_set: SafeSet = "polytope", situations: int = 2000) -> None:
         shares = [np.mean(certificate.safe_set.gauge(states) <= 1.0)]
         for shield in (SafetyFilter(certificate, plant), SafetyFilter(certificate, plant, "lookahead", horizon)):
             decided = (shield.decide(x_hat, shape, u) for x_hat, u in zip(estimates, proposed, strict=True))
-            shares.append(np.mean([each.passed for each in decided]))
+            shares.append(np.mean([each.proved for each in decided]))
         shares.append(_kept_by_some_input(plant, estimates, shape))
         show(name, horizon, *(f"{share:.1%}" for share in shares))
 

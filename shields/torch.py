@@ -105,8 +105,8 @@ class _Projected(torch.autograd.Function):
         proposals = half * numbers + middle
         decided = shield.decide_many(estimates, shapes, proposals)
         safe = np.where(decided.intervened[:, None], (decided.input - middle) / half, numbers)
-        jacobians = decided.passed[:, None, None] * np.eye(len(half))
-        moved = np.flatnonzero(decided.passed & decided.intervened)
+        jacobians = decided.proved[:, None, None] * np.eye(len(half))
+        moved = np.flatnonzero(decided.proved & decided.intervened)
         if moved.size and ctx.needs_input_grad[0]:
             chosen = shapes if shapes.ndim == 2 else shapes[moved]
             jacobians[moved] = projection_jacobians(shield, estimates[moved], chosen, proposals[moved])

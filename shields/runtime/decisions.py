@@ -20,9 +20,10 @@ class Decision(NamedTuple):
 
     Attributes:
         input: Input to apply, shape (m,), within the limits; u_max times a float32 action if not the proposed one.
-        intervened: Whether it differs from the proposed one; in mode "monitor": whether that of "switch" would.
-        passed: Whether it meets the one-step test, so that x+ is in S even if x is not, or begins a certified plan, so
-            that x+ is in the box and what is left of the plan keeps it there.
+        intervened: Whether it differs from the proposed one, so that `~intervened` is a mask of proposals that may act;
+            in mode "monitor": whether that of "switch" would differ.
+        proved: Whether the input to apply, not the proposed one, meets the one-step test, so that x+ is in S even if x
+            is not, or begins a certified plan, so that x+ is in the box and what is left of the plan keeps it there.
         fallback: Whether it is K x_hat, so that x+ is in S if x is and Sigma_k lies inside the certificate's Sigma.
         margin: 1 - h - |A x_hat + B u|_M at the input to apply, where h is the farthest that error and disturbance
             move x+, measured by |.|_M. Positive only if the test is met; the test is sharper and admits some inputs
@@ -40,7 +41,7 @@ class Decision(NamedTuple):
 
     input: np.ndarray
     intervened: Any
-    passed: Any
+    proved: Any
     fallback: Any
     margin: Any
     reason: Any

@@ -184,7 +184,7 @@ class GuaranteeMonitor:
             broken = _first(broken, _not(same_input), OTHER_INPUT)
         if on_time is not True:
             broken = _first(broken, _not(on_time), LATE_INPUT)
-        inside = decision.passed
+        inside = decision.proved
         if inside is not True and not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)

@@ -210,8 +210,8 @@ class SafetyFilter(ReadOnlyArrays):
         decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
         self.lookahead.keep(decided, valid, estimates, errors, stored)
         if self.mode in ("project", "lookahead"):
-            self._project(decided, np.flatnonzero(~decided.passed & valid), sets)
-        self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
+            self._project(decided, np.flatnonzero(~decided.proved & valid), sets)
+        self._fall_back(decided, np.flatnonzero(~decided.proved), sets, estimates, valid)
         self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
@@ -280,7 +280,7 @@ class SafetyFilter(ReadOnlyArrays):
         if not self.lookahead.horizon:
             return self._no_plan
         first = self.decide(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
-        return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
+        return np.concatenate([first.input[None], first.plan]) if first.proved else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
         """Returns what is known of one error shape, (n, n), without a last axis, read-only; itself if it is that.
@@ -340,7 +340,7 @@ class SafetyFilter(ReadOnlyArrays):
             found = test_margin >= MARGIN
             some = some[found]
             decided.input[:, some], decided.margin[some] = closest[:, found], margin[found]
-            decided.passed[some], decided.reason[some] = True, PROJECTED
+            decided.proved[some], decided.reason[some] = True, PROJECTED
 
     def _fall_back(
         self, decided: Decision, some: np.ndarray, sets: ReachableSets, estimates: np.ndarray, valid: np.ndarray
@@ -354,7 +354,7 @@ class SafetyFilter(ReadOnlyArrays):
             applied = np.where(valid, proposed, gained) if self.mode == "monitor" else gained
             test_margin, margin = sets.margins(applied)
             decided.input[:, some], decided.margin[some] = applied, margin
-            decided.intervened[some], decided.passed[some] = differs, test_margin >= MARGIN
+            decided.intervened[some], decided.proved[some] = differs, test_margin >= MARGIN
             unsafe = (applied != gained).any(axis=0)
             decided.fallback[some] = exists & ~unsafe
             reason = np.where(unsafe, UNSAFE, FALLBACK)

@@ -133,7 +133,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         self._report = self._observed(self._inner.known)
         nothing, none = np.zeros((self._filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
-        kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
+        kept = idle._replace(proved=self._state.inside)  # environments left alone keep what is proved of them
         kept_state = self._monitor.advance(self._state, kept, unmoved, ~none, self._report)
         self._state = kept_state._replace(wait=np.maximum(kept_state.wait, self._state.wait))  # no step has passed
         self._stored[..., ~unmoved] = np.nan

@@ -266,7 +266,7 @@ def test_a_passed_test_does_not_prove_a_step_that_began_where_nothing_did():
     loop.receive()
     assert not loop.guaranteed
     decision = loop.decide(-4.0)
-    assert decision.passed
+    assert decision.proved
     G = np.concatenate([plant.continuous_model, np.zeros((1, 3))])
     joint = np.concatenate([x, decision.input])
     times = np.linspace(0.0, plant.dt, 401)

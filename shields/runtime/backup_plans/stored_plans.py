@@ -78,7 +78,7 @@ class Lookahead:
 
         Of these decisions `input` is the proposed one, and `plan` is all NaN.
         """
-        some = np.flatnonzero(valid if self.least else valid & ~decided.passed)
+        some = np.flatnonzero(valid if self.least else valid & ~decided.proved)
         if some.size:
             known = self._rows(some, estimates, errors, decided.input, stored)
             found = self.planner.beginning_with(*known, self.planner.enough)
@@ -111,7 +111,7 @@ class Lookahead:
         if some.size:
             decided.intervened[some] = (decided.input[:, some] != proposed[:, some]).any(axis=0)
             test_margin, decided.margin[some] = sets.some(some).margins(decided.input[:, some])
-            decided.passed[some] = (test_margin >= self._margin) | (decided.reason[some] == PLANNED)
+            decided.proved[some] = (test_margin >= self._margin) | (decided.reason[some] == PLANNED)
 
     def _plan(
         self,
@@ -160,7 +160,7 @@ class Lookahead:
         some = some[begun]
         decided.input[:, some] = inputs[:, 0].T
         decided.plan[:-1, :, some] = np.where(kept[..., None], inputs[:, 1:], np.nan).transpose(1, 2, 0)
-        decided.passed[some], decided.fallback[some], decided.reason[some] = True, False, PLANNED
+        decided.proved[some], decided.fallback[some], decided.reason[some] = True, False, PLANNED
         return begun
 
     def knows_in_box(self, estimate: np.ndarray, errors: PredictedErrors) -> bool:

@@ -81,7 +81,7 @@ def test_input_applied_is_as_close_to_the_proposal_as_an_independent_solver_gets
         decision = shield.decide(x_hat, shape, proposed)
         reasons.append(decision.reason)
         best = min(best_distance(shield, x_hat, shape, proposed, length) for length in (1, shield.horizon))
-        if decision.passed:
+        if decision.proved:
             distance = np.linalg.norm(decision.input - proposed)
             assert distance <= best + 1e-3 * shield.plant.u_max[0]
             apart.append(distance)
@@ -140,7 +140,7 @@ def test_nothing_certified_means_the_next_stored_input_and_without_any_the_gain(
         decision = shield.decide(far, shape, plant.u_max, stored)
         assert decision.reason == "stored"
         assert decision.stored
-        assert not decision.passed
+        assert not decision.proved
         assert not decision.fallback
         assert decision.intervened
         np.testing.assert_array_equal(decision.input, stored[0])
@@ -265,7 +265,7 @@ def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, m
         except TypeError:  # it needed a batch
             continue
         decided += 1
-        assert (one.intervened, one.passed, one.fallback, one.stored) == (False, True, False, False)
+        assert (one.intervened, one.proved, one.fallback, one.stored) == (False, True, False, False)
         np.testing.assert_array_equal(one.input, proposed)
         np.testing.assert_array_equal(one.plan, expected.plan)
     assert decided > 0.6 * len(kept) > 0

@@ -38,7 +38,7 @@ def test_what_passes_leaves_enough_or_as_much_as_anything_that_is_tried():
     enough = lengths >= least
     assert 0.1 < enough.mean() < 0.9
     # Nothing is refused to somebody who asks for no steps in order to keep what cannot be kept.
-    assert (decided.passed == usual.passed).all()
+    assert (decided.proved == usual.proved).all()
     passes = enough & ~decided.intervened
     assert 20 < np.count_nonzero(passes) < np.count_nonzero(~usual.intervened)
     np.testing.assert_array_equal(decided.input[passes], proposals[passes])

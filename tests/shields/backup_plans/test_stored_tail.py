@@ -97,7 +97,7 @@ def test_a_tail_that_ends_in_silence_ends_in_the_safe_set_and_the_fallback_prove
         for _ in range(8):
             decision, loop = world.step(heard=False), world.loop
             assert decision.fallback
-            is_known = bool(decision.passed or loop.filter.knows_inside(loop.estimate, loop.error_shape))
+            is_known = bool(decision.proved or loop.filter.knows_inside(loop.estimate, loop.error_shape))
             assert loop.reason == (OLD_SAMPLE if is_known else NOT_KNOWN_INSIDE)
             proved.add(is_known)
     assert False in proved

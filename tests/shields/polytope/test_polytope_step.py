@@ -106,7 +106,7 @@ def test_what_is_not_usable_ends_in_the_fallback(value):
     shape = certificate.Sigma
     estimate = np.zeros(plant.n)
     decision = shield.decide(np.full(plant.n, value), shape, np.zeros(1))
-    assert not decision.passed
+    assert not decision.proved
     assert shield.decide(estimate, np.full_like(shape, value), np.zeros(1)).reason != "safe"
     assert shield.decide(estimate, shape, np.full(1, value)).reason == "invalid"
     assert shield.decide(estimate, -shape, np.zeros(1)).reason != "safe"

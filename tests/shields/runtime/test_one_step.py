@@ -272,5 +272,5 @@ def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
     sets = shield.test.reachable(still, shield.errors_of(shape).batch())
     np.testing.assert_array_equal([sets.radius, *sets.margins(u[:, None])], 0.0)
     assert shield.decide(still[:, 0], shape, u).reason == "fallback"
-    assert not shield.decide(still[:, 0], shape, u).passed
-    assert shield.decide(still[:, 0], 0.9 * shape, u).passed
+    assert not shield.decide(still[:, 0], shape, u).proved
+    assert shield.decide(still[:, 0], 0.9 * shape, u).proved

@@ -97,7 +97,7 @@ def test_passed_means_inside_for_thin_safe_sets(ratio):
     for _ in range(300):
         x, shape = 1.2 * certificate.safe_set.sample(rng), 1e-12 * certificate.Sigma
         decision = shield.decide(x, shape, rng.uniform(-1, 1, 1))
-        if decision.passed:
+        if decision.proved:
             passed += 1
             d = worst_disturbance(certificate, plant, x, decision.input)
             assert exact_level(certificate, plant, x, decision.input, d) <= 0.0

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant
+from ncs_gym import LinearPlant, truck_trailer
 from shields import SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
@@ -55,7 +55,7 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
         if decision.reason != "projected":
             continue
         checked += 1
-        assert (decision.intervened, decision.passed, decision.fallback) == (True, True, False)
+        assert (decision.intervened, decision.proved, decision.fallback) == (True, True, False)
         action = (decision.input / plant.u_max).astype(np.float32)
         np.testing.assert_array_equal(plant.u_max * action.astype(np.float64), decision.input)
         # No random admissible input is closer by more than the rounding.
@@ -93,7 +93,7 @@ def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
 def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estimate):
     decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, np.ones(1))
     assert decision.reason == "invalid"
-    assert not decision.passed
+    assert not decision.proved
     assert not decision.fallback
     assert (decision.input == 0.0).all()
 
@@ -117,7 +117,7 @@ def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded,
     decision = SafetyFilter(certificate, loaded, mode).decide(estimate, shape, np.ones(1))
     assert decision.reason == "invalid"
     assert decision.intervened
-    assert not decision.passed
+    assert not decision.proved
     assert decision.fallback is (mode != "monitor")
     np.testing.assert_allclose(decision.input, np.ones(1) if mode == "monitor" else certificate.K @ estimate, atol=1e-6)
 
@@ -143,7 +143,7 @@ def test_huge_estimates_never_give_a_nan_input(size, plant):
     for signs in product((-1.0, 1.0), repeat=plant.n):
         decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(plant.n), np.zeros(plant.m))
         assert np.isfinite(decision.input).all()
-        assert not decision.passed
+        assert not decision.proved
 
 
 def test_decide_takes_numbers_where_there_is_one_state_or_one_input():
@@ -252,7 +252,7 @@ def test_monitor_never_changes_the_input_and_counts_what_switch_would_do(case):
         counted += watched.intervened
         if watched.intervened:
             assert watched.reason == "unsafe"
-            assert not watched.passed
+            assert not watched.proved
             assert not watched.fallback
     assert 5 < counted < 195
 
@@ -395,3 +395,16 @@ def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
             np.testing.assert_array_equal(
                 known.many(table, numbers).radius, shield.errors_of_many(growing[::-1]).radius
             )
+
+
+def test_mask_of_proposals_is_what_is_not_intervened():
+    plant = truck_trailer(mass=4000.0)
+    certificate = certificate_of(plant)
+    shield, switched = SafetyFilter(certificate, plant), SafetyFilter(certificate, plant, mode="switch")
+    x_hat, shape, candidates = np.array([1.6, 0.5]), 1e-4 * np.eye(2), np.linspace(-4.0, 4.0, 9)[:, None]
+    decided = shield.decide_many(np.tile(x_hat, (9, 1)), shape, candidates)
+    mask = ~decided.intervened
+    np.testing.assert_array_equal(mask, (decided.input == candidates).all(axis=1))
+    assert mask.tolist() == [switched.decide(x_hat, shape, each).reason == "safe" for each in candidates]
+    assert 0 < mask.sum() < 9
+    assert decided.proved.all()  # which is about the inputs to apply
