@@ -17,12 +17,13 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 LOWEST := $(VENV)-lowest
+NEWEST := $(VENV)-newest
 
 # The project's public address, written into pyproject.toml, CITATION.cff, README.md, the notebook and the site by `make address`.
 ADDRESS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare study pretrained test test-other-processor test-lowest coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
+.PHONY: help compare study pretrained test test-other-processor test-lowest test-newest coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
 	example-times docs words audit dist address clean
 
 help: ## this list
@@ -52,6 +53,11 @@ test-other-processor: $(INSTALLED) ## what proves and decides, as on another pro
 
 test-lowest: $(LOWEST)/.installed ## the tests, with the lowest versions of dependencies that pyproject.toml allows
 	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal
+
+# What calls a solver, or shows that nothing is printed by one.
+NEWEST_TESTS ?= tests/shields/synthesis tests/ncs_gym/plants
+test-newest: $(NEWEST)/.installed ## what calls solvers, with the newest versions of dependencies that pyproject.toml allows
+	$(NEWEST)/bin/python -m pytest -n auto --dist worksteal $(NEWEST_TESTS)
 
 # The suite, and the share of lines and branches it runs, by package. Tracing takes half as much time again.
 coverage: $(INSTALLED) ## the tests, and what share of the code they run
@@ -138,6 +144,12 @@ $(LOWEST)/.installed: pyproject.toml
 	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt uv
 	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct "$$(grep '^torch==' constraints.txt)" \
 		-e '.[train,contrib,render,video,zmq,live,dev]'
+	touch $@
+
+# Without torch and what else only agents need.
+$(NEWEST)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(NEWEST)
+	$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -e . pytest pytest-xdist hypothesis
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)

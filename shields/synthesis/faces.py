@@ -52,6 +52,14 @@ class Faces(NamedTuple):
         return np.array_equal(-self.low, self.high)
 
 
+class _SilentHighs(highspy.Highs):
+    """A solver that prints nothing, not even its banner when it is made."""
+
+    def enableCallbacks(self) -> None:
+        self.silent()
+        super().enableCallbacks()
+
+
 class Extremes:
     """The least and the largest values that rows take in a polytope.
 
@@ -67,7 +75,7 @@ class Extremes:
         """
         self._faces, self._n = Faces(*(part.copy() for part in faces)), faces.rows.shape[1]
         self._columns = np.arange(self._n, dtype=np.int32)
-        self._solver = highspy.Highs()
+        self._solver = _SilentHighs()
         for name, value in _SOLVER.items():
             self._solver.setOptionValue(name, value)
         self._solver.addVars(self._n, np.full(self._n, -math.inf), np.full(self._n, math.inf))
