@@ -6,7 +6,6 @@ changes in place, which what many estimators share must not; `Estimator.as_filte
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from math import ceil, isfinite, log2
 from typing import NamedTuple
 
@@ -125,33 +124,31 @@ class ErrorRecursion:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
 
         It is the first gain whose ellipsoid lies inside the certified set of age 0: the Kalman gain, the set-membership
-        one, that of the way back, which reaches least far out of the set, and under a contract the certified one of the
-        estimate's age, which (C2) maps into the set. After an outage no ellipsoid lies inside at first, and the way
-        back is taken. Without a contract the sample must not be used then, which None says.
+        one, under a contract the certified one of the estimate's age, which (C2) maps into the set, and that of the way
+        back, which reaches least far out of the set. The certified one comes before that since its shapes recur. After
+        an outage no ellipsoid lies inside at first, and the way back is taken. Without a contract the sample must not
+        be used then, which None says.
         """
         covariance, shape, age, _ = statistics
         certified = self.error_set
         newest = certified.shape_at(0)
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
-        for gain, updated in self._updates(shape, None if kalman is None else kalman[0]):
+        gains = [self.sets.gain(shape)] if kalman is None else [kalman[0], self.sets.gain(shape)]
+        for gain in gains:
+            updated = self.sets.updated(shape, gain)
             if is_inside(updated, newest):
                 return gain, ErrorStatistics(covariance, updated, 0, True)
-        if certified.contract is None:
+        if certified.contract is not None:
+            assert age > 0  # every update follows a prediction
+            last = min(age, certified.oldest)  # whatever lies in a set is led back by its gain
+            if is_inside(shape, certified.shapes[last]):
+                return certified.gains[last - 1], ErrorStatistics(covariance, newest, 0, True)  # by (C2)
+        gain, updated = self.sets.on_the_way_back(shape)
+        inside = is_inside(updated, newest)
+        if certified.contract is None and not inside:
             return None
-        assert age > 0  # every update follows a prediction
-        last = min(age, certified.oldest)  # whatever lies in a set is led back by its gain
-        if is_inside(shape, certified.shapes[last]):
-            return certified.gains[last - 1], ErrorStatistics(covariance, newest, 0, True)  # by (C2)
-        return gain, ErrorStatistics(covariance, updated, 0, False)
-
-    def _updates(self, shape: np.ndarray, kalman_gain: np.ndarray | None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yields gains, (n, p), and the shape after an update with each, (n, n), in the order in which to try them."""
-        if kalman_gain is not None:
-            yield kalman_gain, self.sets.updated(shape, kalman_gain)
-        gain = self.sets.gain(shape)
-        yield gain, self.sets.updated(shape, gain)
-        yield self.sets.on_the_way_back(shape)
+        return gain, ErrorStatistics(covariance, updated, 0, inside)
 
     def prefers(self, replayed: ErrorStatistics, present: ErrorStatistics) -> bool:
         """Returns whether a replayed history is better than the present one.
