@@ -167,9 +167,9 @@ class SafeLoop(CopiedWhole):
             self._requests = Requests(channel, assumed, self._input_delay)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
-        # Samples of the last steps of this episode by stamp, and whether one is no numbers, or there are two of one.
+        # Samples of the last steps of this episode by stamp, and whether there were two values of one.
         self._samples: dict[int, np.ndarray] = {}
-        self._damaged = self._contradicted = False
+        self._contradicted = False
         # Inputs, the newest first, from which with samples the state is to be found; None once it is known.
         self._unknown: tuple[np.ndarray, ...] | None = None
         self._oldest_sought = STEPS_PER_STATE * plant.n + self._estimator.buffer
@@ -234,7 +234,7 @@ class SafeLoop(CopiedWhole):
         self._applied.start()
         if self._requests is not None:
             self._requests.begin()
-        self._samples, self._damaged, self._contradicted = {}, False, False
+        self._samples, self._contradicted = {}, False
         self._unknown = None if known else ()
         self._begin(inside)
         self._phase = _Phase.STARTED
@@ -249,8 +249,7 @@ class SafeLoop(CopiedWhole):
 
         At step 0 it is the first estimate: packets from before the first step are of no use, nor is a later sample of
         step 0, which a known first estimate stands for. Nothing compares the two.
-        Whether the start is known or not, two values of one sample, and one that is no finite numbers, end the
-        guarantee of the episode.
+        Whether the start is known or not, two values of one sample end the guarantee of the episode.
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
@@ -391,10 +390,11 @@ class SafeLoop(CopiedWhole):
             return NOT_STARTED
         if self._applied.is_other:
             return LATE_INPUT if self._input_delay else OTHER_INPUT
-        if self._damaged or self._contradicted:
-            return NOT_FINITE if self._damaged else ALARM
+        if self._contradicted:
+            return ALARM
         if self._unknown is not None:
-            return UNKNOWN_START
+            is_finite = all(np.isfinite(y).all() for y in self._recent(self._unknown).values())
+            return UNKNOWN_START if is_finite else NOT_FINITE
         if self._monitored.reason or self._applied.is_confirmed(self.steps):
             return self._monitored.reason
         return OTHER_EPISODE if self._applied.hears_of_others(self.steps) else NOT_CONFIRMED
@@ -412,8 +412,8 @@ class SafeLoop(CopiedWhole):
         another input than the decided one is applied; then it is 0. It takes for granted that what is decided is
         applied, also where no echo has confirmed that for long.
         """
-        is_proved = not (self._applied.is_other or self._damaged or self._contradicted)
-        unknown = self._phase is _Phase.STOPPED or self._unknown is not None or not is_proved
+        unknown = self._phase is _Phase.STOPPED or self._unknown is not None
+        unknown = unknown or self._applied.is_other or self._contradicted
         return 0 if unknown else self._monitored.safe_steps
 
     @property
@@ -495,20 +495,22 @@ class SafeLoop(CopiedWhole):
         self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
 
     def _take_in(self, packets: Iterable[Packet], step: int) -> None:
-        """Keeps the samples of this episode that arrive by a step, and notes what no sensor sends."""
+        """Keeps the samples of this episode that arrive by a step, and notes two values of one."""
         for packet in packets:
             if packet.episode == self.episode and 0 <= packet.stamp <= step <= packet.stamp + self._oldest_sought:
                 before = self._samples.setdefault(packet.stamp, packet.measurement)
-                self._damaged |= not np.isfinite(packet.measurement).all()
-                self._contradicted |= before.tolist() != packet.measurement.tolist()
+                self._contradicted |= not np.array_equal(before, packet.measurement, equal_nan=True)
         self._samples = {stamp: y for stamp, y in self._samples.items() if step <= stamp + self._oldest_sought}
+
+    def _recent(self, inputs: tuple[np.ndarray, ...]) -> dict[int, np.ndarray]:
+        """Returns the samples, shape (p,), by stamp, since which all inputs are known."""
+        return {stamp: y for stamp, y in self._samples.items() if self.steps - stamp <= len(inputs)}
 
     def _find(self, inputs: tuple[np.ndarray, ...]) -> None:
         """Begins anew where samples prove the state that is not known; inputs of shape (m,), the newest first."""
         step, plant = self.steps, self._filter.plant
         noise = plant.sensor_error_with(self._estimator.channel.quantization_step).shape_matrix
-        recent = {stamp: y for stamp, y in self._samples.items() if step - stamp <= len(inputs)}
-        usable = {stamp: y for stamp, y in recent.items() if np.isfinite(y).all()}
+        usable = {stamp: y for stamp, y in self._recent(inputs).items() if np.isfinite(y).all()}
         # As of the newest sample: those that are on their way can then be used, and the contract counts on them.
         newest = max(usable, default=step)
         by_age, since = {newest - stamp: y for stamp, y in usable.items()}, step - newest
@@ -523,8 +525,8 @@ class SafeLoop(CopiedWhole):
         estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
         errors = self._monitored.errors.one(estimator.table, number)
         stays = estimator.table.is_certified(number)
-        alarm, damaged = estimator.alarm or self._contradicted, estimator.damaged or self._damaged
-        return LoopObservation(estimate, errors, alarm, estimator.age, damaged, stays)
+        alarm = estimator.alarm or self._contradicted
+        return LoopObservation(estimate, errors, alarm, estimator.age, estimator.damaged, stays)
 
     @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:

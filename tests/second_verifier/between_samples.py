@@ -34,6 +34,8 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     yield is_so("between samples: the certificate has the plant's grid", is_claimed)
     if grid is None or plant.continuous_model is None or points is None or not is_claimed:
         return
+    held = any(number(entry) != 0 for entry in plant.step_offset)
+    yield is_so("between samples: no constant disturbance holds the operating point", not held)
     (k, n), m, polytope = plant.box.shape, plant.m, certificate.polytope
     kept = (grid.state.shape, grid.input.shape, grid.remainder.shape) == ((points, k, n), (points, k, m), (k,))
     if kept:

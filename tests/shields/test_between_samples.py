@@ -286,7 +286,7 @@ def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
     large = safety_filter.errors_of(np.diag([0.16, 9.0]))
     seen = LoopObservation(np.zeros(2), small, False, stays=True)
     passed = Decision(np.zeros(1), False, True, False, 1.0, "", np.empty((0, 1)))
-    fallback = passed._replace(passed=False, fallback=True)
+    fallback = passed._replace(proved=False, fallback=True)
     state = monitor.cover(monitor.start(True, True, seen), [(True, seen)])
     held = []
     for decision, errors in ((passed, large), (fallback, small), (passed, small), (passed, small), (passed, small)):

@@ -200,15 +200,14 @@ def test_an_update_may_enlarge_what_later_steps_shrink():
     assert np.mean(traces[100:]) < 0.05 * np.vdot(plant.weight, certified_error_set(plant).Sigma)
 
 
-def test_under_a_contract_gains_that_are_tried_leave_smaller_bounds_than_the_certified_one():
+def test_under_a_contract_the_certified_gain_comes_before_the_way_back_so_that_shapes_recur():
     env = gym.make("ncs_gym/BatchReactor-v0").unwrapped
     recursion = ErrorRecursion(env.plant, 0.0, env.error_set)
     known = recursion.first
     for _ in range(30):
         _, known = recursion.updated(recursion.predicted(known))
         assert known.certified
-    bounds, certified = np.sqrt(known.shape.diagonal()), np.sqrt(env.error_set.shape_at(0).diagonal())
-    assert (bounds < 0.9 * certified).all(), bounds / certified
+    np.testing.assert_array_equal(known.shape, env.error_set.shape_at(0))
 
 
 def test_updates_shrink_the_running_ellipsoid():
@@ -402,7 +401,7 @@ def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bo
         ("TruckTrailer", "Kalman", 1.0),
         ("TruckTrailerCruise", "Kalman", 1.0),
         ("CartPole", "set-membership", 0.99),
-        ("BatchReactor", "way back", 0.95),
+        ("BatchReactor", "certified", 0.95),
     ],
 )
 def test_gain_taken_is_the_kalman_gain_on_the_trucks_and_almost_never_on_the_unstable_plants(name, kind, least):

@@ -31,7 +31,7 @@ def decided_alike(
     plans = [()] * len(estimates) if stored is None else [plan[~np.isnan(plan[:, 0])] for plan in stored]
     ones = [shield.decide(*each) for each in zip(estimates, shapes, proposals, plans, strict=True)]
     assert {type(value) for value in ones[0]} == {np.ndarray, bool, float, str}
-    for name in ("reason", "intervened", "passed", "fallback", "stored"):
+    for name in ("reason", "intervened", "proved", "fallback", "stored"):
         np.testing.assert_array_equal(getattr(many, name), [getattr(one, name) for one in ones], name)
     applied, margins = np.array([one.input for one in ones]), np.array([one.margin for one in ones])
     np.testing.assert_allclose(many.input, applied, rtol=2.0**-23)

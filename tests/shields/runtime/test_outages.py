@@ -24,7 +24,6 @@ from shields.runtime.guarantee import (
     ALARM,
     LATE_INPUT,
     NOT_CONFIRMED,
-    NOT_FINITE,
     OTHER_EPISODE,
     OTHER_INPUT,
     UNKNOWN_START,
@@ -299,18 +298,6 @@ def test_two_values_of_one_sample_end_the_guarantee_whether_the_start_is_known_o
     assert loop.reason == ALARM
     loop.start(np.zeros(2))
     assert loop.guaranteed
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_a_sample_that_is_no_number_ends_the_guarantee_whether_the_start_is_known_or_not(known):
-    plant = truck_trailer(mass=4000.0)
-    loop = SafeLoop(certificate_of(plant), plant, Channel(delay=1), on_unproved="ignore")
-    loop.start(np.zeros(2), known=known)
-    for step in range(9):
-        loop.receive([Packet(step - 1, np.full(2, np.nan if step == 2 else 0.0), loop.episode)] if step else [])
-        assert step < 2 or not loop.guaranteed
-        loop.decide(np.zeros(1))
-    assert loop.reason == NOT_FINITE
 
 
 def test_samples_of_before_an_unknown_input_tell_nothing_of_where_the_state_is():

@@ -284,6 +284,7 @@ OF_PLANT = [
     ("remainder", "r0:", lambda p: replaced(p, initial_bound=larger(p.initial_bound, 1.001))),
     ("between samples", "D: the plant's", lambda p: replaced(p, disturbance_bound=larger(p.disturbance_bound, 1.001))),
     ("between samples", "N:", lambda p: replaced(p, sensor_bound=larger(p.sensor_bound, 1.001))),
+    ("between samples", "between samples: no constant", lambda p: replaced(p, step_offset=np.array([0.0, 1e-9]))),
     ("between samples, ellipsoid", "(B)", lambda p: with_grid(p, remainder=0.5 + p.grid_rows.remainder)),
     ("between samples, ellipsoid", "(G)", lambda p: with_grid(p, state=one_entry(p.grid_rows.state, (2, 0, 0), 0.98))),
     ("between samples, ellipsoid", "(G)", lambda p: with_grid(p, input=one_entry(p.grid_rows.input, (2, 1, 0), 0.9))),
