@@ -102,6 +102,7 @@ RUNS = {
         [],
         [rf"full throttle: \[{NUMBER} {NUMBER}\]; {re.escape('violating steps: [0.0, 0.0]')}"],
     ),
+    "torch_tensors.py": ([], [r"update 100: mean action applied 0\.\d+, [1-4]\d\d of 500 pass as they are"]),
     "torchrl_rollout.py": ([], [rf"return of 200 random steps: {NUMBER}; violating steps: 0\b"]),
     "unstable_plant_loop.py": (
         [],
@@ -151,7 +152,7 @@ def test_every_example_says_how_long_it_takes():
 
 def test_examples_that_train_compute_with_one_thread():
     """Those that take their environments from `agents` do so by that; where others train, a line says it."""
-    for name in TRAINING | {"single_file_ppo.py"}:
+    for name in TRAINING | {"single_file_ppo.py", "torch_tensors.py"}:
         text = (ROOT / "examples" / name).read_text()
         assert ("from agents import" in text) != ("torch.set_num_threads(1)" in text), name
 
