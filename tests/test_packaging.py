@@ -45,7 +45,7 @@ LAYERS = {
         {"verification", "paper", "synthesis"},
         {"packaged_certificates"},
         {"runtime"},
-        {"nodes", "silence"},
+        {"silence"},
     ),
     "agents": (
         {"hyperparams", "pickled_data", "step_info"},
@@ -59,7 +59,7 @@ LAYERS = {
         {"errors", "json_values", "terminal"},
         {"settings", "baselines"},
         {"runs"},
-        {"backends", "analysis", "network_loop", "plots"},
+        {"backends", "analysis", "plots"},
         {"report", "attack", "paper"},
         {"commands", "published"},
         {"study"},

@@ -1,4 +1,4 @@
-"""What shields, filters, loops and nodes refuse, with the words that say why: a new refusal is a new row."""
+"""What shields, filters and loops refuse, with the words that say why: a new refusal is a new row."""
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
@@ -34,16 +34,13 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.network.wire import Wire
 from shields import (
     CertificateError,
-    ControllerNode,
     SafeLoop,
     SafetyFilter,
     SafetyShield,
     VectorSafetyShield,
 )
-from shields.nodes import StepClock
 from shields.paper import synthesize as paper_synthesis
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import certified_root
@@ -102,12 +99,6 @@ def acted(shield: Any, value: float) -> None:
     made = shield(CERTIFICATE)
     made.reset(seed=0)
     made.step(np.full(made.action_space.shape, value))
-
-
-def node_of(**settings) -> ControllerNode:
-    """A controller of a loop with these settings."""
-    loop = SafeLoop(OF_CART, CART, Channel(), **settings)
-    return ControllerNode(loop, Wire(CART, 4, bytes(32)), None, StepClock(0.02), np.zeros(4), known=True)  # type: ignore[arg-type]
 
 
 INNER = {
@@ -243,8 +234,6 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         ValueError,
         "as many requests or none",
     ),
-    (lambda: node_of(downlink=Channel(delay=1)), ValueError, "downlink=Channel"),
-    (lambda: node_of(echo_age=5), ValueError, "downlink=Channel"),
 ]
 
 
@@ -323,7 +312,6 @@ def test_what_is_refused_elsewhere_is_taken_where_it_belongs():
     assert SafeLoop(OF_CART, CART, KEPT).contract == CONTRACT
     Estimator(CART, KEPT, error_set=certified_error_set(CART, CONTRACT))
     assert SafetyShield(gym.Wrapper(SCALAR), CERTIFICATE.document).filter.mode == "project"
-    node_of(downlink=Channel(delay=1), echo_age=5)
 
 
 @pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved", "channel"])
