@@ -191,7 +191,7 @@ def _steps(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple
     loop = SafeLoop(certificate, plant, channel, mode, 6 if mode == "lookahead" else None, **settings)
     rng = np.random.default_rng(0)
     actuator = Actuator(loop.input_delay, plant.m)
-    ways = ChannelState(on_air, rng), ChannelState(on_air, rng)
+    up, back = ChannelState(on_air, rng), ChannelState(on_air, rng)
     state, packets, echoes, began = np.zeros(plant.n), [], [], 0.0
     taken = np.ones((2, steps))  # in memory from now on
     loop.start(state)
@@ -209,9 +209,8 @@ def _steps(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple
         actuator.receive([command])
         y = plant.H @ state + plant.sensor_noise.bound.sample_boundary(rng)
         u = actuator.apply(step)
-        packets, echoes = (
-            way.carry(rng, step, each) for way, each in zip(ways, (Packet(step, y), actuator.echo), strict=True)
-        )
+        packets = up.carry(rng, step, Packet(step, y))
+        echoes = back.carry(rng, step, actuator.echo)
         state = plant.A @ state + plant.B @ u + plant.nominal_disturbance.sample_boundary(rng)
     assert loop.guaranteed, loop.reason
     return 1e6 * taken, resident() - began
