@@ -48,7 +48,7 @@ pretrained: $(INSTALLED) ## the small agents of the package, trained again
 test-other-processor: $(INSTALLED) ## what proves and decides, as on another processor
 	OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES='$(WIDE)' $(BIN)/python -m pytest -n auto --dist worksteal \
 		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/uncertainty tests/shields tests/hardening \
-		--ignore=tests/shields/nodes --ignore=tests/shields/paper --ignore=tests/hardening/test_bounded_inputs.py \
+		--ignore=tests/shields/paper --ignore=tests/hardening/test_bounded_inputs.py \
 		--ignore=tests/hardening/test_result_folders.py
 
 test-lowest: $(LOWEST)/.installed ## the tests, with the lowest versions of dependencies that pyproject.toml allows
@@ -134,7 +134,7 @@ address: $(INSTALLED) ## writes the public address everywhere (ADDRESS=https://.
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[train,contrib,render,video,zmq,live,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[train,contrib,render,video,dev]'
 	touch $@
 
 # Torch is the one of constraints.txt: it takes the longest to fetch.
@@ -143,7 +143,7 @@ $(LOWEST)/.installed: pyproject.toml
 	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
 	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt uv
 	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct "$$(grep '^torch==' constraints.txt)" \
-		-e '.[train,contrib,render,video,zmq,live,dev]'
+		-e '.[train,contrib,render,video,dev]'
 	touch $@
 
 # Without torch and what else only agents need.

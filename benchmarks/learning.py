@@ -1,6 +1,6 @@
 """How good agents are, and the searches for their settings: `python -m benchmarks.learning COMMAND`.
 
-Commands: tune, tuned, pretrained, tune-arms, safe-layer.
+Commands: tune, tuned, pretrained, tune-arms.
 
 Behind the same shield (mode project), agents are compared with what needs no training: the best linear controller of a
 grid, action = clip((gain x_hat + task_gain y) / u_max), where y is the task's entry of the observation. Seeds are those
@@ -21,15 +21,10 @@ from zlib import crc32
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from agents import (
     Agent,
-    AppliedActionBuffer,
     LoopConfig,
-    SB3VecEnv,
     ShieldSettings,
     evaluate,
     train,
@@ -39,7 +34,7 @@ from agents import (
 from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
-from benchmarks.commands import run, some_of, table
+from benchmarks.commands import run, some_of
 from benchmarks.timing import timed
 from experiments.analysis.statistics import mean_interval
 from experiments.baselines import RegulatorWeights, controller
@@ -52,8 +47,7 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.registration import registered_ids
 from ncs_gym.tasks.base_task import Task
-from shields import Certificate, VectorSafetyShield, certificate_for
-from shields.torch import SafeLayer
+from shields import Certificate, certificate_for
 
 ROOT = Path(__file__).resolve().parent.parent
 SEARCH_SEED, TABLE_SEED, PACKAGE_SEED = 1_000_000, 2_000_000, 3_000_000
@@ -510,105 +504,7 @@ def _trained_arm(loop: LoopConfig, arm: str, certificate: Certificate, tried: di
     return mean_return(evaluated, trained(training, hyperparams, TRAINING_STEPS, SEARCH_SEED), SEARCH_SEED, episodes)
 
 
-class SafePPOPolicy(ActorCriticPolicy):
-    """A Gaussian whose mean is projected at the estimate, the first entries of the observation."""
-
-    def __init__(self, *arguments: Any, layer: SafeLayer, **keywords: Any) -> None:
-        self.layer_of = [layer]  # in a list it is no module of this one, before the base class is ready
-        super().__init__(*arguments, **keywords)
-
-    def extract_features(self, obs: Any, features_extractor: Any = None) -> Any:
-        """Returns features, and remembers the observations."""
-        self.seen = obs
-        return super().extract_features(obs, features_extractor)
-
-    def get_distribution(self, obs: Any) -> Any:
-        """Returns the distribution of actions."""
-        self.seen = obs
-        return super().get_distribution(obs)
-
-    def _get_action_dist_from_latent(self, latent_pi: Any) -> Any:
-        (layer,) = self.layer_of
-        mean = layer(self.action_net(latent_pi), self.seen[:, : layer.filter.plant.n])
-        return self.action_dist.proba_distribution(mean, self.log_std)
-
-
-class SafeActor(Actor):
-    """SAC's actor with a projection behind it."""
-
-    layer: SafeLayer
-
-    def action_log_prob(self, obs: Any) -> Any:
-        """Returns projected actions, and the logarithm of the density of the proposed ones."""
-        actions, log_prob = super().action_log_prob(obs)
-        return self.layer(actions, obs[:, : self.layer.filter.plant.n]), log_prob
-
-
-class SafeSACPolicy(SACPolicy):
-    """SAC's policy with that actor."""
-
-    def __init__(self, *arguments: Any, layer: SafeLayer, **keywords: Any) -> None:
-        self.layer_of = [layer]
-        super().__init__(*arguments, **keywords)
-
-    def make_actor(self, features_extractor: Any = None) -> Actor:
-        """Returns the actor."""
-        actor = SafeActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
-        actor.layer = self.layer_of[0]
-        return actor
-
-
-def safe_layer(steps: Sequence[int] = (100_000, 20_000), seeds: int = 3) -> None:
-    """Does it pay to train through the shield? PPO and SAC, with and without `shields.torch.SafeLayer` in the policy.
-
-    Both act behind the same shield, in training and in evaluation. With the layer, PPO's Gaussian is centered at the
-    projected mean; SAC's actor and target see projected actions, and its replay buffer holds what was applied. Prints a
-    line per environment, algorithm and arm: means over seeds of return and overridden steps in 64 evaluation episodes.
-    --steps are those of PPO and of SAC.
-    """
-    show = table("environment", "algorithm", "layer", "return", "overridden", "violating steps", first=32, width=18)
-    for env_id in ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"):
-        single = ncs_env(gym.make(env_id))
-        certificate = certificate_for(single.plant, single.certificate_contract)
-        layer = SafeLayer(certificate, single.plant)
-        for algorithm, count in zip(("PPO", "SAC"), steps, strict=True):
-            for name, each in {"without": None, "with": layer}.items():
-                models = (_layered(env_id, certificate, algorithm, each, seed, count) for seed in range(seeds))
-                rows = np.array([_played(env_id, certificate, model) for model in models])
-                score = f"{rows[:, 0].mean():.2f} +- {rows[:, 0].std():.2f}"
-                show(env_id, algorithm, name, score, f"{rows[:, 1].mean():.1%}", f"{rows[:, 2].sum():.0f}")
-
-
-def _layered(
-    env_id: str, certificate: Certificate, algorithm: str, layer: SafeLayer | None, seed: int, steps: int
-) -> Any:
-    """Returns a model trained behind the shield, with the layer or without one."""
-    envs = SB3VecEnv(VectorSafetyShield(gym.make_vec(env_id, num_envs=32), certificate))
-    own = {} if layer is None else {"layer": layer}
-    if algorithm == "PPO":
-        settings = {"n_steps": 32, "batch_size": 256, "n_epochs": 5, "gamma": 0.9, "gae_lambda": 0.98}
-        kwargs = {"policy_kwargs": own | {"log_std_init": -1.0}, "seed": seed, "device": "cpu", "learning_rate": 1e-3}
-        return PPO("MlpPolicy" if layer is None else SafePPOPolicy, envs, **settings, **kwargs).learn(steps)
-    kwargs = {"gamma": 0.9, "learning_rate": 1e-3, "learning_starts": 1000, "gradient_steps": 8, "device": "cpu"}
-    if layer is not None:
-        kwargs |= {"replay_buffer_class": AppliedActionBuffer}
-    policy = own | {"net_arch": [64, 64]}
-    model = SAC("MlpPolicy" if layer is None else SafeSACPolicy, envs, seed=seed, policy_kwargs=policy, **kwargs)
-    return model.learn(steps)
-
-
-def _played(env_id: str, certificate: Certificate, model: Any) -> tuple[float, float, float]:
-    """Returns mean return, share of overridden steps and violating steps of 64 episodes."""
-    shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=64), certificate)
-    observations, infos = shield.reset(seed=1)
-    total = np.zeros(64)
-    for _ in range(200):
-        observations, rewards, _, _, infos = shield.step(model.predict(observations, deterministic=True)[0])
-        total += rewards
-    return total.mean(), infos["episode_interventions"].mean() / 200, infos["episode_violations"].sum()
-
-
-COMMANDS = (tune, tuned, pretrained, tune_arms, safe_layer)
+COMMANDS = (tune, tuned, pretrained, tune_arms)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

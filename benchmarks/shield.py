@@ -25,16 +25,15 @@ from ncs_gym import (
     Actuator,
     Channel,
     ChannelContract,
-    Echo,
     LinearPlant,
     NCSEnv,
+    Packet,
     batch_reactor,
     cart_pole,
     truck_trailer,
 )
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.network.wire import Kind, Message, Wire
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
 from ncs_gym.uncertainty.shape_matrices import outer_sum
@@ -159,7 +158,7 @@ def loop(
     plants: Annotated[Sequence[str], some_of(tuple(PLANTS))] = tuple(PLANTS),
     modes: Annotated[Sequence[str], some_of(MODES)] = MODES,
 ) -> None:
-    """How long a step of a controller node takes, by mode: decode what arrived, receive, decide, encode what is sent.
+    """How long a step of a `SafeLoop` behind a downlink takes, by mode: receive, decide, command.
 
     Median, 99.9 % and largest in microseconds, of the thread's own time on the processor and, whatever else the machine
     does, on the clock; and by how much the resident memory has grown since a tenth of the steps. The loop meets every
@@ -177,13 +176,13 @@ def loop(
         for mode in modes:
             gc.collect()
             gc.freeze()
-            taken, grown = _node(certificate, plant, mode, steps)
+            taken, grown = _steps(certificate, plant, mode, steps)
             for row, part in ((name, taken), ("  second half", taken[:, steps // 2 :])):
                 quantiles = np.quantile(part, [0.5, 0.999, 1.0], axis=1).T.ravel()
                 show(row, mode, *(f"{each:.0f}" for each in quantiles), f"{grown:.1f}")
 
 
-def _node(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple[np.ndarray, float]:
+def _steps(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple[np.ndarray, float]:
     """Microseconds of each step on the processor and on the clock, shape (2, steps), and the growth of memory [MB]."""
     channel = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2)
     on_air = replace(channel, delay=0)  # what arrives is received at the next step
@@ -191,9 +190,9 @@ def _node(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple[
     settings = {"downlink": downlink, "echo_age": 10, "on_unproved": "ignore"}
     loop = SafeLoop(certificate, plant, channel, mode, 6 if mode == "lookahead" else None, **settings)
     rng = np.random.default_rng(0)
-    wire, actuator = Wire(plant, loop.input_delay, bytes(32)), Actuator(loop.input_delay, plant.m)
-    ways = ChannelState(on_air, rng), ChannelState(on_air, rng)
-    state, arrived, began = np.zeros(plant.n), [], 0.0
+    actuator = Actuator(loop.input_delay, plant.m)
+    up, back = ChannelState(on_air, rng), ChannelState(on_air, rng)
+    state, packets, echoes, began = np.zeros(plant.n), [], [], 0.0
     taken = np.ones((2, steps))  # in memory from now on
     loop.start(state)
     for step in range(steps):
@@ -203,23 +202,15 @@ def _node(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple[
         if mode == "monitor":  # which lets it pass: it must not lead out of the box
             proposed = certificate.K @ loop.estimate
         start = np.array([time.thread_time(), time.perf_counter()])
-        messages = [wire.decode(data) for data in arrived]
-        echoes = [Echo(each.stamp, each.missing, each.digest) for each in messages if each.kind is Kind.ECHO]
-        samples: list[Any] = [(each.stamp, each.values) for each in messages if each.kind is Kind.SAMPLE]
-        loop.receive(samples, echoes=echoes)
+        loop.receive(packets, echoes=echoes)
         loop.decide(proposed)
         command = loop.command()
-        wire.encode(Message(kind=Kind.COMMAND, episode=1, stamp=step, values=command.inputs))
-        requests = (True,) * len(command.inputs)
-        wire.encode(Message(kind=Kind.BEACON, episode=1, stamp=step, requests=requests))
         taken[:, step] = np.array([time.thread_time(), time.perf_counter()]) - start
         actuator.receive([command])
         y = plant.H @ state + plant.sensor_noise.bound.sample_boundary(rng)
-        u, said = actuator.apply(step), actuator.echo
-        echo = Message(kind=Kind.ECHO, episode=1, stamp=said.steps, missing=said.missing, digest=said.digest)
-        sample = Message(kind=Kind.SAMPLE, episode=1, stamp=step, values=y)
-        sent = zip(ways, (sample, echo), strict=True)
-        arrived = [data for way, each in sent for data in way.carry(rng, step, wire.encode(each))]
+        u = actuator.apply(step)
+        packets = up.carry(rng, step, Packet(step, y))
+        echoes = back.carry(rng, step, actuator.echo)
         state = plant.A @ state + plant.B @ u + plant.nominal_disturbance.sample_boundary(rng)
     assert loop.guaranteed, loop.reason
     return 1e6 * taken, resident() - began

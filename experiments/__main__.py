@@ -38,7 +38,6 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "evaluate": ("EvaluateSettings", "experiments.commands.evaluate:evaluate", _TRAINING),
     "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", _TRAINING),
     "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
-    "loop": ("LoopSettings", "experiments.commands.loop:loop", {}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
     "channel": ("ChannelSettings", "experiments.commands.channel:channel", {}),

@@ -1,7 +1,7 @@
 """Reads what comes from outside: regular files of a bounded size, and JSON of a bounded number of values.
 
 The limits of all readers of files stand here (SECURITY.md), and are checked before anything is read, unpacked or
-expanded. Those of messages are the sizes in `ncs_gym.network.wire`.
+expanded.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
 LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
 # Bytes of a `model.zip`, of all that it unpacks to, and files in it.
 LARGEST_MODEL, MOST_MEMBERS = 256 << 20, 1000
-# Bytes of a key, and of a line in a log of `ncs loop`.
-LARGEST_KEY, LARGEST_LINE = 4096, 64 << 10
 # Bytes of a file of recorded packets, lines in it, packets of a log with those that were lost, and control steps that
 # they span.
 LARGEST_LOG, MOST_LINES, MOST_PACKETS, MOST_STEPS = 256 << 20, 6_000_000, 2_000_000, 10_000_000

@@ -16,7 +16,6 @@ from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, Vect
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
-    from shields.nodes import ActuatorNode, ControllerNode, SensorNode
     from shields.silence import Silence, silence_of
     from shields.synthesis import (
         Network,
@@ -30,11 +29,9 @@ if TYPE_CHECKING:
 __distribution__ = "ncs-gym"
 
 __all__ = [
-    "ActuatorNode",
     "Certificate",
     "CertificateError",
     "Condition",
-    "ControllerNode",
     "Decision",
     "GuaranteeLostError",
     "GuaranteeLostWarning",
@@ -49,7 +46,6 @@ __all__ = [
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
-    "SensorNode",
     "Silence",
     "Updates",
     "VectorSafetyShield",
@@ -62,14 +58,13 @@ __all__ = [
 ]
 
 
-# Imported at first use: these need the solver, or asyncio.
+# Imported at first use: these need the solver.
 _NAMES = {
     "synthesis": (
         *("Network", "Requirement", "Requirements"),
         *("certify", "requirements", "synthesize"),
     ),
     "silence": ("Silence", "silence_of"),
-    "nodes": ("ActuatorNode", "ControllerNode", "SensorNode"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 

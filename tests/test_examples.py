@@ -47,14 +47,6 @@ RUNS = {
         [],
         [r"monitor: outside the box in [1-9]\d* steps", r"project: outside the box in 0 steps, [1-9].* in 300 of 300"],
     ),
-    "mpc_over_udp.py": (  # what a busy machine does to it is the machine's affair, but for a wrong measurement
-        [],
-        [
-            r"closest to the limit: \d+\.\d+ .* proved: \d+ of 120",
-            "proved now: (?!False a measurement)",
-            r"inputs that did not arrive in time: \d+;",
-        ],
-    ),
     "own_plant.py": (
         ["--steps", "12800"],
         ["largest angle in the safe set: 0.500 rad", "without a violation: 64 of 64"],
@@ -102,7 +94,15 @@ RUNS = {
         [],
         [rf"full throttle: \[{NUMBER} {NUMBER}\]; {re.escape('violating steps: [0.0, 0.0]')}"],
     ),
+    "torch_tensors.py": ([], [r"update 100: mean action applied 0\.\d+, [1-4]\d\d of 500 pass as they are"]),
     "torchrl_rollout.py": ([], [rf"return of 200 random steps: {NUMBER}; violating steps: 0\b"]),
+    "udp_loop.py": (
+        [],
+        [
+            r"no command in time: [1-9]\d* steps",
+            r"proved: \d+ of 140 steps; now: False, the downlink broke its contract: an input decided earlier",
+        ],
+    ),
     "unstable_plant_loop.py": (
         [],
         ["oldest sample in use: 4 steps, allowed: 4", r"closest to the limit: 0\.\d+", "proved: 5000 of 5000 steps"],
@@ -151,7 +151,7 @@ def test_every_example_says_how_long_it_takes():
 
 def test_examples_that_train_compute_with_one_thread():
     """Those that take their environments from `agents` do so by that; where others train, a line says it."""
-    for name in TRAINING | {"single_file_ppo.py"}:
+    for name in TRAINING | {"single_file_ppo.py", "torch_tensors.py"}:
         text = (ROOT / "examples" / name).read_text()
         assert ("from agents import" in text) != ("torch.set_num_threads(1)" in text), name
 

@@ -45,7 +45,7 @@ LAYERS = {
         {"verification", "paper", "synthesis"},
         {"packaged_certificates"},
         {"runtime"},
-        {"nodes", "silence", "torch"},
+        {"silence"},
     ),
     "agents": (
         {"hyperparams", "pickled_data", "step_info"},
@@ -59,7 +59,7 @@ LAYERS = {
         {"errors", "json_values", "terminal"},
         {"settings", "baselines"},
         {"runs"},
-        {"backends", "analysis", "network_loop", "plots"},
+        {"backends", "analysis", "plots"},
         {"report", "attack", "paper"},
         {"commands", "published"},
         {"study"},
@@ -155,7 +155,7 @@ def test_only_what_solves_programs_imports_a_solver():
 def test_environment_and_shields_do_not_import_the_learners():
     for path in MODULES:
         if name_of(path).startswith(ORDER[:2]):
-            assert not imports_of(path, LEARNERS) or name_of(path) == "shields.torch", path
+            assert not imports_of(path, LEARNERS), path
 
 
 def test_nothing_is_compiled_at_first_use():

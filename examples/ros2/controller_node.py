@@ -1,72 +1,54 @@
-"""A ROS 2 node around `ControllerNode`: how the same loop runs over topics. Not tested here: it needs rclpy.
+"""A ROS 2 node around `SafeLoop`. Not tested here: it needs rclpy.
 
-Datagrams travel as they are, in `std_msgs/UInt8MultiArray`: "to_controller" from sensor and actuator, "from_controller"
-to both, each of which uses what is addressed to it. Use the profile for sensor data (best effort, volatile): a reliable
-topic would deliver old packets late, which is what a control loop has no use for. Steps come from a steady timer; ROS
-time may jump, and no stamp is taken from it.
+Messages are JSON in `std_msgs/String`, as in `examples/udp_loop.py`, whose `run_plant` is the other side: "samples" are
+[step, measurement, steps, missing, digest], the last three from the actuator's echo, "commands" [step, inputs]. Both
+sides count steps from the time `start`, by clocks that agree (PTP). Use the profile for sensor data (best effort,
+volatile): a reliable topic would deliver old packets late, which is what a control loop has no use for.
 """
 
+import json
 import time
-from collections import deque
 
 import numpy as np
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
-from std_msgs.msg import UInt8MultiArray
+from std_msgs.msg import String
 
-from ncs_gym import Channel, truck_trailer
-from ncs_gym.network.wire import LARGEST_DATAGRAM, Wire
-from shields import Certificate, ControllerNode, SafeLoop
-from shields.nodes import Datagram, StepClock
-
-
-class TopicTransport:
-    """The `Transport` of a node over two topics."""
-
-    def __init__(self, node: Node, hears: str, says: str) -> None:
-        self._waiting: deque[Datagram] = deque(maxlen=512)
-        self._publisher = node.create_publisher(UInt8MultiArray, says, qos_profile_sensor_data)
-        node.create_subscription(UInt8MultiArray, hears, self._hear, qos_profile_sensor_data)
-
-    def _hear(self, message: UInt8MultiArray) -> None:
-        self._waiting.append(Datagram(time.monotonic(), bytes(message.data[: LARGEST_DATAGRAM + 1]), None))
-
-    def send(self, data: bytes, to: object = None) -> None:
-        """Publishes a datagram."""
-        self._publisher.publish(UInt8MultiArray(data=list(data)))
-
-    def received(self) -> list[Datagram]:
-        """Returns what arrived since the last call."""
-        arrived = list(self._waiting)
-        self._waiting.clear()
-        return arrived
-
-    def close(self) -> None:
-        """Is left to rclpy."""
+from ncs_gym import Channel, Echo, Packet, truck_trailer
+from shields import Certificate, SafeLoop
 
 
 class SafeController(Node):
-    """Decides at every step of a steady timer."""
+    """Decides at every step, and makes up for those that its timer was late for."""
 
     def __init__(self) -> None:
         super().__init__("safe_controller")
-        plant = truck_trailer(mass=4000.0)
-        network = Channel(delay=1, jitter=2)
-        loop = SafeLoop(Certificate.load("truck.json"), plant, network, downlink=network, echo_age=20)
-        with open("key", "rb") as file:
-            wire = Wire(plant, loop.input_delay, file.read())
-        transport = TopicTransport(self, "to_controller", "from_controller")
-        self.node = ControllerNode(loop, wire, transport, StepClock(plant.dt), np.zeros(plant.n), known=False)
-        self.create_timer(plant.dt, self.step, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.declare_parameter("start", time.time())
+        self.begin, self.number, self.waiting = self.get_parameter("start").value, 0, []
+        self.plant, network = truck_trailer(mass=4000.0), Channel(delay=1, jitter=2)
+        self.loop = SafeLoop(Certificate.load("truck.json"), self.plant, network, downlink=network, echo_age=20)
+        self.loop.start(np.zeros(self.plant.n))  # known at step 0
+        self.commands = self.create_publisher(String, "commands", qos_profile_sensor_data)
+        self.create_subscription(String, "samples", self.hear, qos_profile_sensor_data)
+        self.create_timer(self.plant.dt / 20, self.act)
 
-    def step(self) -> None:
-        """One step; a timer that was late is noticed by the node's own clock."""
-        estimate = self.node.receive(time.monotonic())
-        if estimate is not None:
-            self.node.decide(np.array([2.0]) - estimate[:1])  # yours
-            self.get_logger().debug(self.node.loop.reason or "proved")
+    def hear(self, message: String) -> None:
+        """Keeps a sample until its step."""
+        self.waiting.append(json.loads(message.data))
+
+    def act(self) -> None:
+        """Takes all steps that have begun."""
+        while time.time() >= self.begin + self.number * self.plant.dt:
+            due = [each for each in self.waiting if each[0] <= self.number]
+            self.waiting = [each for each in self.waiting if each[0] > self.number]
+            echoes = [Echo(steps, missing, bytes.fromhex(digest)) for *_, steps, missing, digest in due]
+            estimate = self.loop.receive([Packet(stamp, y) for stamp, y, *_ in due], echoes=echoes)
+            self.loop.decide(np.array([2.0]) - estimate[:1])  # yours
+            command = self.loop.command()
+            self.commands.publish(String(data=json.dumps([command.stamp, command.inputs.tolist()])))
+            self.number += 1
+            self.get_logger().debug(self.loop.reason or "proved")
 
 
 def main() -> None:

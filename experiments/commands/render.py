@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
-from experiments.plots.loop_figure import loop_log_figure
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
@@ -30,17 +29,10 @@ _GRAY = 120
 def render(settings: RenderSettings) -> None:
     """Runs `ncs render`."""
     settings = short_version(settings, **_SMOKE)
-    plant = registered_env(settings.env).plant
+    registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
-    if settings.log is not None and settings.out.suffix != ".png":
-        raise ValueError(f"--log draws a figure: --out must end in .png, got {settings.out}")
     require_place(settings.out)
-    if settings.log is not None:
-        figure = loop_log_figure(settings.log, plant, settings.steps)
-        settings.out.write_bytes(figure.png)
-        print(f"saved to {settings.out}")
-        return
     if settings.policy not in UNTRAINED_POLICIES:
         require_extra("train", "stable_baselines3", "torch")
     if settings.out.suffix == ".mp4":

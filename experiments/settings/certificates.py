@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from experiments.settings.arguments import Assignments, StepCount, require_horizon, require_limits
+from experiments.settings.arguments import StepCount, require_horizon, require_limits
 from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA
@@ -328,8 +328,6 @@ class RenderSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         out: File to write: .gif, .mp4, or .png for the last frame alone.
-        log: Folder of the logs of `ncs loop`: draws the last steps of its newest episode, of the plant that `--env`
-            names, into a .png.
         policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
             "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
             package), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
@@ -349,7 +347,6 @@ class RenderSettings:
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Path = Path("episode.gif")
-    log: Path | None = None
     policy: str = "greedy"
     vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
@@ -368,74 +365,3 @@ class RenderSettings:
         require_limits(self, seed=0, steps=1, fps=(1, 50), scale=(1, 4), width=160)
         if self.side_by_side and self.shield == "none":
             raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopSettings:
-    """Runs a control loop over UDP: plant, network and controller as processes, in real time (docs/network_loop.md).
-
-    Attributes:
-        env: Id of an environment with a plant of its own; module:id first imports the module.
-        channel: Changes of what the network does to samples and echoes, by the names that `ncs compare` lists, such as
-            loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
-        downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
-        policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", a regulator ("lqr",
-            "governor", "mpc"), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
-        vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
-        shield: Mode of the shield.
-        horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; without
-            --horizon plans become long enough for them.
-        certificate: Certificate file to use instead of synthesizing one; both machines need the same.
-        steps: Steps of the controller.
-        speed: How much faster than the plant's own time the loop runs; below 1 for slow machines.
-        room: Steps by which samples and commands may be later than the network makes them, because the processes that
-            send and receive them are: the certificate counts them on both ways.
-        ask_age: Age from which the controller asks for a sample, where samples are on request; by default it never
-            does, and those are sent that the contract needs.
-        mischief: Share of lost datagrams that arrive corrupted, and probability that a datagram is duplicated,
-            replayed or forged.
-        worst: Lose all the datagrams in a row that the channel's promise allows, whenever one is lost.
-        seed: Of network, disturbance and controller.
-        role: What runs here: "all", or "plant" (with the network) and "controller" on two machines.
-        restarted: The plant has moved already: the controller claims nothing until samples tell where it is.
-        host: Name or address of the controller's machine.
-        port: Its UDP port; the two after it are used by the network.
-        key_file: File with the shared key, at least 16 bytes, needed on two machines; drawn anew otherwise.
-        out: Folder of the logs.
-        live: Show the loop in the terminal while it runs: "auto" where there is one.
-        smoke: A few steps only, to see that everything works.
-    """
-
-    env: str = "ncs_gym/CartPole-v0"
-    channel: Assignments = field(default_factory=dict)
-    downlink: Assignments = field(default_factory=dict)
-    policy: str = "push"
-    vec_normalize: Path | None = None
-    shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
-    horizon: int | None = None
-    least_safe_steps: int = 0
-    certificate: Path | None = None
-    steps: StepCount = 3000
-    speed: float = 1.0
-    room: int = 1
-    ask_age: int | None = None
-    mischief: float = 0.05
-    worst: bool = False
-    seed: int = 0
-    role: Literal["all", "plant", "controller"] = "all"
-    restarted: bool = False
-    host: str = "127.0.0.1"
-    port: int = 47600
-    key_file: Path | None = None
-    out: Path = Path("runs/loop")
-    live: Literal["auto", "yes", "no"] = "auto"
-    smoke: bool = False
-
-    def __post_init__(self) -> None:
-        require_horizon(self, self.shield)
-        require_limits(self, steps=1, room=(0, 100), ask_age=0, mischief=(0, 1), port=(1, 65533))
-        if not 0.0 < self.speed < math.inf:
-            raise ValueError(f"--speed must be positive, got {self.speed}")
-        if self.role != "all" and self.key_file is None:
-            raise ValueError("on two machines give both the same --key-file, as `head -c 32 /dev/urandom > FILE` makes")

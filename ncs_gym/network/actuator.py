@@ -74,7 +74,7 @@ class Actuator(CopiedWhole):
             None where the plant limits them.
 
     Attributes:
-        input_delay, inputs: c and m.
+        input_delay: c.
         missing: Whether the input applied last was zero because the committed one had not arrived.
         requested: After `apply`, whether a sensor beside the actuator takes the sample of the next step, where samples
             are on request: not if a command said so, and always where none has arrived.
@@ -87,8 +87,7 @@ class Actuator(CopiedWhole):
 
     def __init__(self, input_delay: int, inputs: int, u_max: Any = None) -> None:
         self.input_delay = as_count(input_delay, "input_delay", low=0)
-        self.inputs = as_count(inputs, "inputs", low=1)
-        self._nothing = np.zeros(self.inputs)
+        self._nothing = np.zeros(as_count(inputs, "inputs", low=1))
         self._limits = np.full_like(self._nothing, np.inf)
         if u_max is not None:
             limits = as_numbers(u_max)

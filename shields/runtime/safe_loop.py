@@ -119,7 +119,6 @@ class SafeLoop(CopiedWhole):
             that of the channel.
         input_delay: c, the number of steps from a decision to its effect; 0 without a downlink.
         channel: The channel of the samples.
-        echo_age: The largest age of an echo [steps]; None without echoes.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -130,7 +129,6 @@ class SafeLoop(CopiedWhole):
     filter: SafetyFilter = setting("filter")
     contract: ChannelContract | None = setting("contract")
     input_delay: int = setting("input_delay")
-    echo_age: int | None = setting("echo_age")
     channel: Channel = setting("channel", "_estimator.channel")
 
     @own_error_state

@@ -269,7 +269,7 @@ class SafetyFilter(ReadOnlyArrays):
                 got = f"shape {array.shape}" if array.size else shown(value)
                 warn_caller(
                     f"decide takes one {name}, numbers of shape ({size},), got {got}: {answer} "
-                    "(decide_many takes batches, shields.torch.SafeLayer tensors)",
+                    "(decide_many takes batches)",
                     UserWarning,
                 )
                 return

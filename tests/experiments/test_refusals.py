@@ -22,7 +22,7 @@ from experiments.settings import (
     StudySettings,
     SweepSettings,
 )
-from experiments.settings.certificates import AttackSettings, LoopSettings
+from experiments.settings.certificates import AttackSettings
 from experiments.study.study import quoted
 from ncs_gym import Channel, ChannelContract
 from tests.certificates import feasible_bounds_not_sought
@@ -30,7 +30,7 @@ from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
 RAY, ATTACK = partial(BackendSettings, engine="ray"), partial(AttackSettings, random_plants=1)
-CRUISE, CSTR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CSTR-v0"
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 HORIZON = "--horizon must be at least 1 and at most 50, got"
 PAGES = {"agents": "new"}
 
@@ -54,10 +54,6 @@ SETTINGS = [
     *((ChannelSettings, {"file": "f"} | given, "give --certificate and --plant, or --env")
       for given in ({"plant": "p", "env": "e"}, {"certificate": "c"}, {"certificate": "c", "plant": "p", "env": "e"})),
     (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield of --env"),
-    *((LoopSettings, given, f"--least-safe-steps {message}")
-      for given, message in [({"least_safe_steps": 50}, "must be at least 0 and at most 49"),
-                             ({"least_safe_steps": 5}, "5 is for mode lookahead, which is not asked for"),
-                             ({"least_safe_steps": 5, "shield": "lookahead", "horizon": 5}, "5 takes plans of 6")]),
     (CompareSettings, {"horizon": 6}, "--horizon 6 is for mode lookahead, which is not asked for"),
     *((StudySettings, {name: value}, f"--{name.replace('_', '-')}")
       for name, value in [("budget", 0.0), ("budget", 1.5), ("seeds", 0), ("envs", ()), ("envs", (CRUISE, CRUISE)),
@@ -122,18 +118,11 @@ USAGE = [
     ("train --horizon 6", "--horizon 6 is for mode lookahead"),
     ("train --violation-penalty 7", "--violation-penalty 7 is for an arm penalized, which is not asked for"),
     ("train --arm unshielded --intervention-penalty 5", "--intervention-penalty 5 is for an arm with +penalty"),
-    ("loop --speed 0", "--speed must be positive"),
-    ("loop --mischief 2", "--mischief must be at least 0 and at most 1"),
-    ("loop --port 70000", "--port must be at least 1 and at most 65533"),
-    ("loop --room -1", "--room must be at least 0 and at most 100"),
-    ("loop --vec-normalize s.pkl", "push needs no statistics"),
-    ("loop --role plant", "give both the same --key-file"),
     ("render --side-by-side --shield none", "--side-by-side compares with a shield"),
     ("requirements --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),
     ("requirements --losses -1", "max_consecutive_losses"),
     ("requirements --keep 0", "--keep"),
     ("requirements --delays 1 1", "different values"),
-    (f"loop --env {CSTR}", "now 5 + 1 + 0 + 1 by --channel and 5 + 1 + 0 + 1 by --downlink"),
     ("reproduce --starts 0", "--starts must be"),
     ("reproduce --steps -1", "--steps must be"),
     ("reproduce --seed -1", "--seed must be"),
@@ -187,10 +176,6 @@ ONE_SENTENCE = [
     ("attack --env ncs_gym/CSTR-v0 --noise gaussian", "noise=\"gaussian\" needs a covariance"),
     ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
     ("requirements --env nothing", "unknown environment"),
-    (f"loop --env {CRUISE} --channel lag=3", "--channel lag: a channel has no such setting"),
-    (f"loop --env {CRUISE} --downlink delay=0", "--downlink: what is sent at each step arrives at the next at best"),
-    ("loop --env ncs_gym/Nothing-v0", "ncs_gym/Nothing-v0"),
-    (f"loop --env {CRUISE} --key-file /dev/null --role plant", "not a regular file"),
 ]  # fmt: skip
 
 # Known without a certificate, which may take minutes.

@@ -6,10 +6,9 @@ import json
 import os
 import pickle
 import re
-import socket
 import tracemalloc
 import zipfile
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -525,27 +524,6 @@ def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
         Remainder(Ellipsoid(np.eye(2)), proved=False, basis=text)
 
 
-def test_key_that_is_too_short_or_too_long_is_refused(write, tmp_path):
-    from experiments.commands.loop import loop
-    from experiments.settings import LoopSettings
-
-    for key, reason in ((b"short", "at least 16 bytes"), (bytes(5000), "more than 4,096 bytes")):
-        with pytest.raises((ValueError, OSError), match=reason):
-            loop(LoopSettings(role="plant", key_file=write("key", key), out=tmp_path / "out"))
-
-
-def test_log_of_a_loop_with_one_long_line_is_read_in_pieces(write, tmp_path):
-    from experiments.network_loop.log import rows_of
-
-    write("controller-000.csv", "a,b\n1,2\n" + "1" * (40 << 20) + "\n3,4\n")
-    with little_memory(8 << 20):
-        assert list(rows_of(tmp_path, "controller")) == [{"a": "1", "b": "2"}, {"a": "3", "b": "4"}]
-    (tmp_path / "controller-000.csv").unlink()
-    os.mkfifo(tmp_path / "controller-000.csv")
-    with pytest.raises(OSError, match="not a regular file"):
-        list(rows_of(tmp_path, "controller"))
-
-
 def stiff(speed, points=64):
     """A plant with a state that follows its input so many times faster than the other."""
     model = np.array([[-1.0, 1.0], [0.0, -speed]]), np.array([[0.0], [speed]]), np.eye(2), np.zeros((2, 1))
@@ -580,61 +558,3 @@ def test_bound_between_grid_points_is_hardly_more_than_it_has_to_be(speed):
     other.__dict__["grid_rows"] = rows._replace(remainder=0.98 * rows.remainder)
     assert all(each.holds for each in grid_conditions(plant))
     assert not all(each.holds for each in grid_conditions(other))
-
-
-def test_long_datagrams_are_cut_off_and_refused():
-    import asyncio
-
-    from ncs_gym.network.wire import LARGEST_DATAGRAM, Wire, WireError
-    from shields.nodes import UdpTransport
-
-    async def sent():
-        receiver = await UdpTransport.open(local=("127.0.0.1", 0))
-        sender = await UdpTransport.open(peer=receiver.address)
-        for _ in range(100):
-            sender.send(bytes(60_000))
-            await asyncio.sleep(0.005)
-            if arrived := receiver.received():
-                break
-        sender.close()
-        receiver.close()
-        return arrived[0].data
-
-    data = asyncio.run(sent())
-    assert len(data) == LARGEST_DATAGRAM + 1
-    with pytest.raises(WireError, match=r"format|length"):
-        Wire(truck_trailer(mass=4000.0), 4, bytes(32)).decode(data)
-
-
-def test_zeromq_hears_nobody_without_the_key_and_no_long_message():
-    zmq = pytest.importorskip("zmq")
-    import asyncio
-
-    from ncs_gym.network.wire import LARGEST_DATAGRAM
-    from shields.nodes.zeromq import ZmqTransport
-
-    async def heard():
-        context = zmq.Context()
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-        controller, sizes = ZmqTransport(bytes(32), bind=address), set()
-        stranger = context.socket(zmq.DEALER)
-        stranger.setsockopt(zmq.LINGER, 0)
-        stranger.connect(address)
-        senders = [ZmqTransport(bytes(32), connect=address) for _ in range(2)]
-        other_key = ZmqTransport(bytes(31) + b"1", connect=address)
-        for _ in range(200):
-            with suppress(zmq.Again):  # it does not even come to a connection
-                stranger.send_multipart([b"stranger"] * 100, zmq.NOBLOCK)
-            other_key.send(b"other key")
-            senders[0].send(bytes(LARGEST_DATAGRAM))
-            senders[1].send(bytes(2 * LARGEST_DATAGRAM))
-            await asyncio.sleep(0.005)
-            sizes |= {len(each.data) for each in controller.received()}
-        for each in (controller, other_key, *senders):
-            each.close()
-        context.destroy(0)
-        return sizes
-
-    assert asyncio.run(heard()) == {LARGEST_DATAGRAM}

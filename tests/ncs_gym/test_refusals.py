@@ -51,7 +51,6 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.envs.env import RenderModeError, ncs_env
-from ncs_gym.network.wire import Kind, Message, Wire
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.uncertainty.declared_bound import as_bound
@@ -77,7 +76,6 @@ SLOPES = (
     [[1.0 + STEP**2 * 15.0 * np.cos(0.25), STEP, 0.0075], [STEP * 15.0 * np.cos(0.25), 1.0, 0.15]],
     [[1.0 + STEP**2 * 15.0, STEP, 0.0075], [STEP * 15.0, 1.0, 0.15]],
 )
-WIRE = Wire(batch_reactor(), 3, b"sixteen bytes or more")
 COMMAND = Command(stamp=0, inputs=np.array([[1.0], [2.0], [3.0]]))
 
 
@@ -304,15 +302,6 @@ CHANNELS = [
     *called(
         Actuator(input_delay=2, inputs=1).apply,
         *((step, "step must be a whole number >= 0") for step in (600.5, -1, None, True)),
-    ),
-    *called(
-        partial(Wire, batch_reactor(), 3), *((key, "at least 16 bytes") for key in ("sixteen letters!", b"short", None))
-    ),
-    (partial(Wire, batch_reactor(), 100, b"sixteen bytes or more"), "more than 1400 bytes"),
-    *called(
-        WIRE.encode,
-        (Message(kind=Kind.SAMPLE, episode=1, stamp=2, values=np.zeros(3)), "shape"),
-        (Message(kind=Kind.BEACON, episode=1, stamp=2), "has 4 requests"),
     ),
 ]
 PLANTS = [

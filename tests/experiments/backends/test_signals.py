@@ -139,22 +139,3 @@ def test_workers_end_when_their_parent_is_killed():
     code, errors = ended(process)
     assert code == -signal.SIGKILL
     assert "Traceback" not in errors
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
-def test_loop_over_a_network_ends_with_its_processes(number, tmp_path):
-    command = ["loop", "--env", "ncs_gym/LaneKeeping-v0", "--steps", "1000000", "--port", "47810", "--live", "no"]
-    code = (
-        f"{TAKEN}; from experiments.__main__ import main; sys.argv[1:] = {[*command, '--out', str(tmp_path)]}; main()"
-    )
-    process = started(code)
-    deadline = time.monotonic() + PATIENCE
-    while not (tmp_path / "plant-000.csv").exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    for wait in (0.3, 0.05):
-        time.sleep(wait)
-        send(process, number)
-    _, errors = ended(process)
-    for word in ("Traceback", "Exception", "leaked"):
-        assert word not in errors, errors

@@ -13,10 +13,8 @@ from experiments import settings
 from experiments.__main__ import COMMANDS
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.safety_counts import counts_table, gaussian_table
-from experiments.commands import loop, reproduce
+from experiments.commands import reproduce
 from experiments.report.text_tables import sweep_table
-from experiments.runs.loops import registered_env
-from experiments.settings import LoopSettings
 from experiments.study.study import results_tables
 from experiments.study.tables import QUOTABLE
 from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
@@ -79,31 +77,6 @@ class Shown:
 
     def render(self):
         return printed("render", "--smoke", "--side-by-side", "--out", self.folder / "a.png")
-
-    def loop(self):
-        env = registered_env(CRUISE)
-        row = {
-            "step": 12_345,
-            "margin": 0.123,
-            "age": 12,
-            "missing": 12_345,
-            "skipped": 12_345,
-            "refused": 12_345,
-            "safe_steps": 12,
-        }
-        row |= {f"x_hat_{name}": -123.4 for name in env.plant.state_names}
-        row |= {"intervened": 12_345, "guaranteed": False, "reason": "the state is not known to have stayed " * 3}
-        with pytest.MonkeyPatch.context() as patch:
-            stream = io.StringIO()
-            patch.setattr("sys.stdout", stream)
-            patch.setenv("COLUMNS", str(WIDTH))
-            with loop.LiveView(LoopSettings(env=CRUISE, live="yes"), env) as show:
-                show(row)
-        summary = {
-            "ms into the step, 50/99.9/100 %": "123.45 / 123.45 / 123.45",
-            f"not proved, {row['reason']}": 12_345,
-        }
-        return f"{stream.getvalue()}\n{loop.text_of(summary)}"
 
     def synthesize(self):
         return printed("synthesize", "--plant", self.plant, "--max-age", 2, "--out", self.folder / "c.json")

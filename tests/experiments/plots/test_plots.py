@@ -11,7 +11,6 @@ from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
 from agents.results import TrainingPoint
-from experiments.network_loop.log import StepLog
 from experiments.plots import comparison_figures as figures
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
@@ -24,7 +23,6 @@ from experiments.plots.comparison_figures import (
     training_figure,
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
-from experiments.plots.loop_figure import loop_log_figure
 from experiments.runs.arms import _arms
 from ncs_gym import Ellipsoid, LinearPlant
 from shields.polytope import Polytope
@@ -380,22 +378,3 @@ def test_a_single_state_has_no_phase_plane():
     with without_pictures():
         figures = comparison_figures(single, SimpleNamespace(L=np.eye(1), polytope=None), summary_of(shown), shown)
     assert set(figures) == {"training", "scatter", "episode"}
-
-
-def test_log_of_a_loop_has_the_ends_of_every_limit(tmp_path):
-    plant = LinearPlant(
-        A=[[0.9, 0.0], [0.1, 0.9]], B=[[0.1], [0.0]], dt=1.0, state_limits=([-0.5, -np.inf], [4.0, 2.0]),
-        input_limits=(-1.0, 3.0), disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-        operating_input=[0.5],
-    )  # fmt: skip
-    names = [*plant.state_names, *plant.input_names]
-    log = StepLog(tmp_path, "controller", ["episode", "step", "x_hat_x1", "x_hat_x2", f"u_{names[2]}", "guaranteed"])
-    for step in range(5):
-        log.write([0, step, 0.5, 0.25, 0.1, int(step != 3)])
-    log.close()
-    figure = loop_log_figure(tmp_path, plant, 5)
-    drawn = [[set(line.get_ydata()) for line in axis.lines if line.get_label() != "controller"] for axis in figure.axes]
-    assert drawn == [[{-0.5}, {4.0}], [{2.0}], [{-1.5}, {2.5}]]
-    assert figure.axes[2].get_ylabel() == "u1 - 0.5"
-    for axis in figure.axes:
-        np.testing.assert_array_equal(axis.collections[0].get_segments(), [[[3.0, 0.0], [3.0, 1.0]]])

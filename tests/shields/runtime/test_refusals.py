@@ -1,4 +1,4 @@
-"""What shields, filters, loops, layers and nodes refuse, with the words that say why: a new refusal is a new row."""
+"""What shields, filters and loops refuse, with the words that say why: a new refusal is a new row."""
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium.vector import VectorActionWrapper
 from gymnasium.wrappers import (
     Autoreset,
@@ -35,20 +34,16 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.network.wire import Wire
 from shields import (
     CertificateError,
-    ControllerNode,
     SafeLoop,
     SafetyFilter,
     SafetyShield,
     VectorSafetyShield,
 )
-from shields.nodes import StepClock
 from shields.paper import synthesize as paper_synthesis
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import certified_root
-from shields.torch import SafeLayer
 from tests import arrays
 from tests.certificates import certificate_of
 from tests.plants import small, with_remainder
@@ -61,7 +56,7 @@ SCALAR, VECTOR = gym.make(CRUISE), gym.make_vec(CRUISE, num_envs=2)
 SYNC = gym.make_vec(CRUISE, num_envs=2, vectorization_mode="sync")
 ASKED, KEPT = Channel(on_request=True), Channel(loss=0.2, delay=1, max_consecutive_losses=2)
 THIN = np.random.default_rng(0).standard_normal((6, 6)) * 10.0 ** np.linspace(-9, 0, 6)
-NONE, ONE, TWO = torch.zeros((2, 2)), torch.zeros((2, 1)), np.zeros(2)
+TWO = np.zeros(2)
 KNOWN = np.zeros((5, 2)), np.tile(CERTIFICATE.Sigma, (5, 1, 1)), np.zeros((5, 1))
 
 
@@ -106,12 +101,6 @@ def acted(shield: Any, value: float) -> None:
     made.step(np.full(made.action_space.shape, value))
 
 
-def node_of(**settings) -> ControllerNode:
-    """A controller of a loop with these settings."""
-    loop = SafeLoop(OF_CART, CART, Channel(), **settings)
-    return ControllerNode(loop, Wire(CART, 4, bytes(32)), None, StepClock(0.02), np.zeros(4), known=True)  # type: ignore[arg-type]
-
-
 INNER = {
     "ClipAction": ClipAction,
     "RescaleAction": lambda env: RescaleAction(env, np.float32(-0.5), np.float32(0.5)),
@@ -126,8 +115,6 @@ MISPLACED = r"delay is a setting of the channel: give channel=Channel\(delay=...
 NO_MODEL = r"needs an NCSEnv inside, got PendulumEnv, which has no linear model .*: docs/own_plant\.md says how"
 SHIELDS = (partial(SafetyShield, SCALAR), partial(VectorSafetyShield, VECTOR))
 THIRTEEN = small([[0.9, 0.1], [0.0, 0.8]], B=np.ones((2, 13)))
-NONSENSE = torch.full((2, 2), np.nan)
-COARSE = (torch.float16, torch.bfloat16, torch.float8_e4m3fn)
 # What is called, the error, and words of its message.
 REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Shields: what they wrap.
@@ -227,32 +214,6 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: certified_root(np.ones((2, 2))), CertificateError, "too thin"),
     (lambda: certified_root(0.5 * (THIN @ THIN.T + (THIN @ THIN.T).T)), CertificateError, "too thin"),
     (lambda: paper_synthesis(with_remainder()), ValueError, "remainder_bound"),
-    # The layer of PyTorch.
-    *[
-        (partial(lambda *given: SafeLayer(CERTIFICATE, PLANT)(*given), *given), ValueError, words)
-        for words, *given in (
-            ("actions must be finite numbers", torch.tensor([[np.nan], [0.0]]), NONE),
-            ("actions must be finite numbers", torch.tensor([[np.inf], [0.0]]), NONE),
-            ("estimates must be finite numbers", ONE, torch.tensor([[np.nan, 0.0], [0.0, 0.0]])),
-            ("error_shapes must be finite numbers", ONE, NONE, NONSENSE),
-            ("actions must be a tensor of floats.* got ndarray", np.zeros((2, 1)), NONE),
-            ("tensor of floats.* got one of torch.int64", torch.zeros((2, 1), dtype=torch.int64), NONE),
-            ("actions must be a dense tensor.* torch.sparse_coo: call to_dense", ONE.to_sparse(), NONE),
-            ("estimates must be a dense tensor.* torch.sparse_coo", ONE, NONE.to_sparse()),
-            (r"actions must have shape \(0, 1\)", torch.tensor(0.0), NONE),
-            (r"actions must have shape \(1, 1\) beside 1 actions, got \(1,\)", torch.zeros(1), torch.zeros(2)),
-            (r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)", ONE, torch.zeros(3, 2)),
-            (r"error_shapes must have shape \(2, 2\) or \(2, 2, 2\)", ONE, NONE, torch.zeros(3, 2, 2)),
-            ("estimates must be numbers, got str", ONE, "estimates"),
-            ("estimates must be real numbers, got complex64", ONE, NONE.to(torch.complex64)),
-            ("actions must be numbers, got Tensor.* the meta device", ONE.to("meta"), NONE),
-            ("estimates must be float32 or float64, got float16", ONE, np.zeros((2, 2), np.float16)),
-            *((f"estimates must be float32 or float64, got {kind}", ONE, NONE.to(kind)) for kind in COARSE),
-            *((f"error_shapes must be float32 or float64, got {kind}", ONE, NONE, NONE.to(kind)) for kind in COARSE),
-            ("estimates must", ONE, None),
-        )
-    ],
-    (lambda: SafeLayer(CERTIFICATE, PLANT, -np.eye(2)), ValueError, "positive semidefinite"),
     # Loops: their settings, and calls before an episode has begun.
     (lambda: SafeLoop(OF_CART, CART, CONTRACT), ValueError, "channel must be a Channel"),
     (lambda: SafeLoop(OF_CART, CART, Channel(quantization_step=0.1)), ValueError, "rounds more coarsely"),
@@ -273,8 +234,6 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         ValueError,
         "as many requests or none",
     ),
-    (lambda: node_of(downlink=Channel(delay=1)), ValueError, "downlink=Channel"),
-    (lambda: node_of(echo_age=5), ValueError, "downlink=Channel"),
 ]
 
 
@@ -353,7 +312,6 @@ def test_what_is_refused_elsewhere_is_taken_where_it_belongs():
     assert SafeLoop(OF_CART, CART, KEPT).contract == CONTRACT
     Estimator(CART, KEPT, error_set=certified_error_set(CART, CONTRACT))
     assert SafetyShield(gym.Wrapper(SCALAR), CERTIFICATE.document).filter.mode == "project"
-    node_of(downlink=Channel(delay=1), echo_age=5)
 
 
 @pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved", "channel"])

@@ -349,6 +349,14 @@ def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
     assert expected.get(mode, {"safe", "fallback"}) <= set(reasons)
 
 
+def test_empty_batches_give_empty_decisions(case):
+    plant, certificate = case
+    none = SafetyFilter(certificate, plant).decide_many(
+        np.zeros((0, plant.n)), certificate.Sigma, np.zeros((0, plant.m))
+    )
+    assert (none.input.shape, none.reason.shape, none.margin.shape) == ((0, plant.m), (0,), (0,))
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("states", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mode):

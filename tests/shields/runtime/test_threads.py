@@ -1,4 +1,4 @@
-"""Threads share certificates, filters, planners, graphs of histories and layers: each gets what it would get alone."""
+"""Threads share certificates, filters, planners and graphs of histories: each gets what it would get alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 
 from ncs_gym import Channel, ChannelContract, Estimator, Packet, batch_reactor, truck_trailer
 from ncs_gym.estimation.arrival_histories import MAX_GRAPHS, arrival_histories, histories_of
@@ -23,7 +22,6 @@ from shields.packaged_certificates import certificate_for
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.set_test import ellipsoid_test
-from shields.torch import SafeLayer
 from tests.certificates import certificate_of
 
 THREADS = 8
@@ -242,21 +240,3 @@ def test_environments_in_threads_go_as_alone(mode):
         else:
             alone = VectorSafetyShield(gym.make_vec(name, num_envs=5), **filter_of_its_own)
         assert_same(answer, episodes(alone, number))
-
-
-def test_layers_of_torch_in_threads_project_and_differentiate_as_alone():
-    certificate, plant = reactor()
-    layer = SafeLayer(certificate, plant)
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1.0, 1.0, (THREADS, 50, plant.m))
-    estimates = 0.8 * plant.half_widths * rng.uniform(-1.0, 1.0, (THREADS, 50, plant.n))
-
-    def run(layer: SafeLayer, number: int) -> tuple[np.ndarray, np.ndarray]:
-        given = torch.tensor(actions[number], requires_grad=True)
-        safe = layer(given, torch.tensor(estimates[number]))
-        safe.square().sum().backward()
-        return safe.detach().numpy(), given.grad.numpy()
-
-    answers = at_once(lambda number: run(layer, number))
-    for number, answer in enumerate(answers):
-        assert_same(answer, run(SafeLayer(certificate, plant), number))
