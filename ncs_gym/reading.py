@@ -21,9 +21,8 @@ LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
 LARGEST_MODEL, MOST_MEMBERS = 256 << 20, 1000
 # Bytes of a key, and of a line in a log of `ncs loop`.
 LARGEST_KEY, LARGEST_LINE = 4096, 64 << 10
-# Bytes of a file of recorded packets, lines in it, packets of a log with those that were lost, and control steps that
-# they span.
-LARGEST_LOG, MOST_LINES, MOST_PACKETS, MOST_STEPS = 256 << 20, 6_000_000, 2_000_000, 10_000_000
+# Bytes of a file of recorded packets, packets of a log with those that were lost, and control steps that they span.
+LARGEST_LOG, MOST_PACKETS, MOST_STEPS = 256 << 20, 2_000_000, 10_000_000
 
 
 def read_file(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> bytes:
