@@ -19,9 +19,8 @@ LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
 LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
 # Bytes of a `model.zip`, of all that it unpacks to, and files in it.
 LARGEST_MODEL, MOST_MEMBERS = 256 << 20, 1000
-# Bytes of a file of recorded packets, lines in it, packets of a log with those that were lost, and control steps that
-# they span.
-LARGEST_LOG, MOST_LINES, MOST_PACKETS, MOST_STEPS = 256 << 20, 6_000_000, 2_000_000, 10_000_000
+# Bytes of a file of recorded packets, packets of a log with those that were lost, and control steps that they span.
+LARGEST_LOG, MOST_PACKETS, MOST_STEPS = 256 << 20, 2_000_000, 10_000_000
 
 
 def read_file(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> bytes:

@@ -51,7 +51,7 @@ def channel(settings: ChannelSettings) -> None:
             f"--sampling-period {known:g} s: a control step of the {'environment' if plant is None else 'plant'} takes "
             f"{step:g} s, and its contract counts these: leave the option out, or --env, --plant and --certificate"
         )
-    log = PacketLog.load(settings.file, settings.ping_period, known or 1.0, settings.ignore)
+    log = PacketLog.load(settings.file)
     dt = known or log.period
     contract = None if promise is None else promise.contract
     oldest = None if promise is None else promise.oldest
@@ -99,8 +99,8 @@ def _numbers(log: PacketLog, dt: float, asked: tuple[int, ...]) -> dict[str, Any
     ages = log.ages(dt)
     if len(ages) < 2:
         raise ValueError(
-            f"the record spans one control step of {dt:g} s, a contract needs two: take a longer record, a shorter "
-            "step, or, if its times are not in seconds, name their unit (sent_ms)"
+            f"the record spans one control step of {dt:g} s, a contract needs two: take a longer record or a shorter "
+            "step, and write its times in seconds"
         )
     samples = len(log.sent) - log.left_out(dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isnan(log.delays).astype(np.int8), [0]])))
@@ -114,7 +114,6 @@ def _numbers(log: PacketLog, dt: float, asked: tuple[int, ...]) -> dict[str, Any
         "steps": len(ages),
         "steps_with_a_packet": samples,
         "left_out": log.left_out(dt),
-        "tells_losses": log.tells_losses,
         "lost": len(log.sent) - len(arrived),
         "most_lost_in_a_row": int((edges[1::2] - edges[::2]).max(initial=0)),
         "delay_quantiles": [float(each) for each in np.quantile(arrived, [0.5, 0.9, 0.99, 1.0])],
@@ -171,8 +170,6 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
 
 
 def _lost(found: dict[str, Any]) -> str:
-    if not found["tells_losses"]:
-        return "Lost: the record does not say. Ages do not need it: they count from the newest sample that arrived."
     share = 100.0 * found["lost"] / found["packets"]
     return (
         f"Lost: {counted(found['lost'], 'packet')} ({share:.3g} %), at most {found['most_lost_in_a_row']:,} in a row."

@@ -59,7 +59,7 @@ def requirements(settings: RequirementsSettings) -> None:
     """Runs `ncs requirements`."""
     plant, today = _plant_and_network(settings)
     asked = _values(settings, plant, today)
-    log = None if settings.log is None else PacketLog.load(settings.log, None, plant.dt, settings.ignore)
+    log = None if settings.log is None else PacketLog.load(settings.log)
     with claim_folder("requirements", settings):
         found = shields.requirements(
             plant,

@@ -243,7 +243,6 @@ class RequirementsSettings(BackendSettings):
         keep: Percentage of the largest share that the cheapest network is to keep.
         log: Record of packets, as `ncs channel` reads it: also says how often its newest sample was older than
             certificates allow.
-        ignore: Names of columns of --log that are not looked at.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Not used, since the search is deterministic; every command takes it.
     """
@@ -263,7 +262,6 @@ class RequirementsSettings(BackendSettings):
     tolerance: bool = False
     keep: float = 90.0
     log: Path | None = None
-    ignore: tuple[str, ...] = ()
     force: bool = False
     seed: int = 0
 
@@ -279,13 +277,10 @@ class ChannelSettings:
     """Reads recorded packets, and says how often each channel contract would have been broken.
 
     Attributes:
-        file: A table with the named columns sent and received (sent_ms, ...), the output of ping or fping, a list of
-            round trips, a log of `ncs loop`, or the JSON of irtt (docs/requirements.md).
+        file: A table with the columns sent and received in seconds, received empty where a packet was lost, or the
+            output of Linux `ping -D` (docs/requirements.md has recipes for others).
         sampling_period: Duration of a control step [s]; by default that of --env or --plant, or the time between
             packets.
-        ping_period: Time between packets whose file does not say when they were sent, as of ping without -D [s]; by
-            default that of ping's summary, or 1.
-        ignore: Names of columns of the table that are not looked at.
         env: Id of an environment whose contract is compared with the record.
         certificate: File of a certificate whose contract is compared with the record, in place of an environment's.
         plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
@@ -298,8 +293,6 @@ class ChannelSettings:
 
     file: tyro.conf.Positional[Path]
     sampling_period: float | None = None
-    ping_period: float | None = None
-    ignore: tuple[str, ...] = ()
     env: str | None = None
     certificate: Path | None = None
     plant: Path | None = None

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel, replayed_ages
-from ncs_gym.network.log_formats import read_record
+from ncs_gym.network.log_files import read_record
 from ncs_gym.reading import MOST_STEPS, require_packets
-from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state, shown
+from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state
 
 # Times that differ by less than this fraction of a step are the same; where the resolution of the times themselves is
 # coarser than the second fraction they cannot be placed.
@@ -35,11 +34,13 @@ class PacketLog(ReadOnlyArrays):
     - At a step without a packet nothing is sent, which is the same as a lost sample.
     - A sample that takes longer than 1000 steps, which no channel and no contract allows, counts as lost.
 
+    A packet that is not in the record cannot be seen. In a log of the receiver, which has none that was lost, ages may
+    be too small: at both ends, and where several packets are sent per step.
+
     Attributes:
         sent: When each was sent, shape (k,), ascending [s].
         delays: How long each was on its way, shape (k,); NaN for a lost one [s].
-        read_as: How a file was read, in sentences; empty for a log that was not read from a file.
-        tells_losses: Whether all lost packets are in it; False for a file that has no line of them, and no numbers.
+        read_as: How a file was read, in a sentence; empty for a log that was not read from a file.
 
     Raises:
         ValueError: If there are fewer than two packets or more than two million, they are not in order or all sent at
@@ -49,7 +50,6 @@ class PacketLog(ReadOnlyArrays):
     sent: np.ndarray
     delays: np.ndarray
     read_as: str = ""
-    tells_losses: bool = True
 
     def __post_init__(self) -> None:
         sent, delays = as_setting(self.sent), as_setting(self.delays)
@@ -68,32 +68,19 @@ class PacketLog(ReadOnlyArrays):
 
     @classmethod
     @own_error_state
-    def load(
-        cls,
-        path: str | os.PathLike[str],
-        period: float | None = None,
-        step: float = 1.0,
-        ignore: Sequence[str] = (),
-    ) -> Self:
-        """Returns the packets in a file; `read_as` says how it was read (docs/requirements.md has the formats).
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Returns the packets in a file (docs/requirements.md has recipes that make one of other records).
 
         Args:
-            path: A table with named columns, a log of `ncs loop`, the output of ping or fping, round trips one per
-                line, or the JSON of irtt.
-            period: Time between packets whose file does not say when they were sent [s]; by default that of ping's
-                summary, or 1.
-            step: Duration of the steps of `ncs loop` [s].
-            ignore: Names of columns of a table that are not looked at.
+            path: A table (CSV; Parquet where pyarrow is installed) with the columns sent and received alone, in
+                seconds and in the order of sending, received empty where a packet was lost; or the output of Linux
+                `ping -D`.
 
         Raises:
-            ValueError: If the file cannot be read, its columns or numbers are ambiguous, it has more than 256 MiB, or
-                more than two million packets with those that were lost (`ncs_gym.reading`).
+            ValueError: If the file cannot be read, is neither, has more than 256 MiB, or more than two million packets
+                with those that were lost.
         """
-        period = None if period is None else as_number(period, "period", low=0.0, low_open=True)
-        if isinstance(ignore, str):
-            raise ValueError(f"ignore must be a list of names of columns, got {shown(ignore)}")
-        record = read_record(path, period, as_number(step, "step", low=0.0, low_open=True), ignore)
-        return cls(*record)
+        return cls(*read_record(path))
 
     @property
     @own_error_state
@@ -180,7 +167,7 @@ class PacketLog(ReadOnlyArrays):
         if not since[-1] / dt < MOST_STEPS:
             raise ValueError(
                 f"the record spans {since[-1] / dt:,.3g} control steps of {dt:g} s, more than {MOST_STEPS:,}: take a "
-                "longer step, a part of the record, or, if its times are not in seconds, name their unit (sent_ms)"
+                "longer step or a part of the record, and write its times in seconds"
             )
         same = _SAME + 4.0 * np.spacing(np.abs(self.sent).max()) / dt
         if same > _COARSE:

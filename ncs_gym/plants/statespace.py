@@ -88,7 +88,7 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
             "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is known, "
             f"from what is measured and give D = 0, got {shown(matrices[3] if D is None else D.tolist())}"
         )
-    is_continuous = own is None or (own is not True and own == 0)
+    is_continuous = own is not True and own == 0
     if dt is None:
         if is_continuous or own is True:
             raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
@@ -104,10 +104,10 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
 
 
 def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown."""
+    """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
     if isinstance(sys, (tuple, list)) and len(sys) in (4, 5):
-        A, B, C, D, *sampling = sys
-        return A, B, C, D, sampling[0] if sampling else None
+        A, B, C, D, own = (*sys, 0)[:5]
+        return A, B, C, D, _sampling_time(sys, own)
     model: Any = sys
     if not hasattr(model, "A") and (hasattr(model, "to_ss") or hasattr(model, "num")):
         raise ValueError(
@@ -119,4 +119,18 @@ def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
             "sys must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
             f"(A, B, C, D) or (A, B, C, D, dt), got {shown(sys)}"
         )
-    return model.A, model.B, model.C, model.D, getattr(model, "dt", None)
+    return model.A, model.B, model.C, model.D, _sampling_time(model, getattr(model, "dt", None))
+
+
+def _sampling_time(model: Any, own: Any) -> Any:
+    """Returns the sampling time of a model; raises ValueError if it leaves open whether there is one."""
+    if own is None:
+        from scipy.signal import lti  # takes long to import, and is there if the model is scipy's
+
+        if isinstance(model, lti):
+            return 0
+        raise ValueError(
+            "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with dt=0 "
+            "or with its sampling time in seconds"
+        )
+    return own

@@ -79,7 +79,7 @@ def test_requirements_say_how_often_a_record_breaks_what_is_certified(plant_file
     (tmp_path / "packets.csv").write_text("0,1\n1,2\n")
     refused = ncs("requirements", "--plant", plant_file, *asked, "--force")
     assert refused.returncode != 0
-    assert "no names" in refused.stderr
+    assert "a record is a table with the columns sent and received alone" in refused.stderr
 
 
 def test_requirements_say_that_a_record_does_not_count_where_no_sample_is_needed(record, tmp_path, without_workers):
@@ -201,7 +201,10 @@ def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(record):
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [("0,1\n1,2\n", "no names"), ("sent,received\n0,0.001\n0.01,0.011\n", "spans one control step")],
+    [
+        ("0,1\n1,2\n", "a record is a table with the columns sent and received alone"),
+        ("sent,received\n0,0.001\n0.01,0.011\n", "spans one control step"),
+    ],
 )
 def test_channel_refuses_a_file_in_one_sentence(content, words, tmp_path):
     (tmp_path / "packets.csv").write_text(content)

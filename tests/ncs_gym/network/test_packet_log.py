@@ -11,10 +11,8 @@ from ncs_gym import Channel, ChannelContract, PacketLog, TraceChannel, contract_
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 
 
-def test_log_of_a_loop_is_read_in_steps_with_the_packets_that_are_missing(tmp_path):
-    file = tmp_path / "packets-000.csv"
-    file.write_text("episode,sent,received\n77,1,2\n77,4,5\n77,3,5\n77,3,6\n12,2,3\n")
-    log = PacketLog.load(file, step=0.05)
+def test_log_is_laid_over_the_steps_of_a_loop():
+    log = PacketLog(0.05 * np.arange(6), 0.05 * np.array([1, np.nan, 2, 1, np.nan, 1]))
     assert log.trace(0.05) == (1, -1, 2, 1, -1, 1)
     assert log.period == pytest.approx(0.05)
     assert [log.send_period(dt) for dt in (0.05, 0.025)] == [1, 2]
@@ -156,33 +154,3 @@ def test_a_record_cut_for_one_duration_of_steps_is_for_that_alone(tmp_path):
         with pytest.raises(ValueError, match=words):
             env.reset(options={name: log.channel(0.1)})
     assert repr(log.channel(0.1)).startswith("TraceChannel(trace=(1, -1, 1, 1) of 4 samples, send_period=1, ")
-
-
-def test_packets_without_a_line_of_a_regular_sender_are_lost_ones(tmp_path):
-    """A receiver's log, which has lines of what it received alone, says the same as that of both ends."""
-    rng = np.random.default_rng(0)
-    sent = 0.01 * np.arange(3000) + np.append(0.0, 0.002 + 0.001 * rng.random(2999))  # not where a step begins
-    sent[2000:] += 30.0  # a pause, in which nothing was sent
-    received = np.where(rng.random(3000) < 0.2, np.nan, sent + 0.02 * rng.random(3000))
-    ends = [0, 1999, 2000, -1]  # of what was sent without a pause
-    received[ends] = sent[ends] + 0.01
-    both, alone = tmp_path / "both.csv", tmp_path / "alone.csv"
-    lines = [f"{s:.6f},{'' if np.isnan(r) else f'{r:.6f}'}" for s, r in zip(sent, received, strict=True)]
-    both.write_text("sent,received\n" + "\n".join(lines))
-    alone.write_text("sent,received\n" + "\n".join(line for line in lines if not line.endswith(",")))
-    logs = PacketLog.load(both), PacketLog.load(alone)
-    missing = int(np.isnan(received).sum())
-    assert f"{missing} packets without a line, where one is usually sent every 10" in logs[1].read_as
-    for dt in (0.01, 0.02, 0.05):
-        ages = [log.ages(dt) for log in logs]
-        np.testing.assert_array_equal(*ages)
-    assert [int(np.isnan(log.delays).sum()) for log in logs] == [missing, missing]
-
-
-@pytest.mark.parametrize("gaps", ["at any time", "in bursts"])
-def test_nothing_is_added_where_the_sender_is_not_regular(gaps, tmp_path):
-    rng = np.random.default_rng(1)
-    sent = np.cumsum(rng.exponential(0.02, 500) if gaps == "at any time" else np.tile([0.02, 0.001, 0.001], 200)[:500])
-    file = tmp_path / "events.csv"
-    file.write_text("sent,received\n" + "\n".join(f"{each:.6f},{each + 0.01:.6f}" for each in sent))
-    assert len(PacketLog.load(file).sent) == 500

@@ -22,7 +22,6 @@ def control_model(matrices, dt):
 
 CONTINUOUS = {
     "python-control": control_model((A, B, C, D), 0),
-    "python-control, dt None": control_model((A, B, C, D), None),
     "scipy": signal.StateSpace(A, B, C, D),
     "tuple": (A, B, C, D),
     "lists without D": [A.tolist(), B.tolist(), C.tolist(), None],
@@ -45,6 +44,14 @@ def test_continuous_model_is_sampled_exactly(name):
     np.testing.assert_allclose(plant.A @ [0.4, -0.9] + plant.B @ [1.7], end.y[:, -1], atol=1e-9)
     np.testing.assert_array_equal(plant.H, model.C)
     np.testing.assert_array_equal(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
+
+
+@pytest.mark.parametrize("model", [control_model(SAMPLED[:4], None), (*SAMPLED[:4], None)])
+@pytest.mark.parametrize("dt", [None, 0.1])
+def test_model_that_leaves_open_whether_it_is_in_discrete_time_is_refused(model, dt):
+    """python-control answers True to both questions where dt is None."""
+    with pytest.raises(ValueError, match="does not say whether it is in continuous or discrete time: make it with"):
+        LinearPlant.from_statespace(model, dt, **REST)
 
 
 @pytest.mark.parametrize("kind", [signal.TransferFunction, lambda num, den: SimpleNamespace(num=num, den=den)])

@@ -16,7 +16,7 @@ class Model:
     """A model with sparse matrices, as those of large systems are."""
 
     def __init__(self, kind):
-        self.A, self.B, self.C, self.D, self.dt = kind(A), kind(B), kind(C), kind(D), None
+        self.A, self.B, self.C, self.D, self.dt = kind(A), kind(B), kind(C), kind(D), 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
