@@ -22,6 +22,7 @@ from torch import nn
 from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
+from agents.sb3_vec_env import INFO_KEYWORDS
 from ncs_gym.installation import install_command
 from ncs_gym.validation import reason_of, shown
 
@@ -186,10 +187,15 @@ _SAME_ACTION = 1e-5
 class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
-    Hand it to SAC, TD3 and their kind as `replay_buffer_class`. `train` does so with the hyperparameter
+    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, and its infos to
+    `SB3VecEnv(info_keywords=AppliedActionBuffer.info_keywords)`. `train` does so with the hyperparameter
     `stored_action="applied"`. It is for returns of one step (`n_steps=1`).
+
+    Attributes:
+        info_keywords: The infos that it reads, and those that `SB3VecEnv` has at every step anyway.
     """
 
+    info_keywords = (*INFO_KEYWORDS, APPLIED, "episode_steps")
     _steps: np.ndarray | None = None  # of the episodes, when the last transition was added
 
     def add(
@@ -207,8 +213,12 @@ class AppliedActionBuffer(ReplayBuffer):
             ValueError: If infos do not say what was applied, actions have entries that are no inputs, something but the
                 shield changes them, or an action takes several steps.
         """
-        if any(APPLIED not in info for info in infos):
-            raise ValueError(f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym')
+        missing = [name for name in (APPLIED, "episode_steps") if any(name not in info for info in infos)]
+        if missing:
+            raise ValueError(
+                f'infos have no "{missing[0]}": the buffer is for environments of ncs_gym, in '
+                "SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords)"
+            )
         applied = np.array([info[APPLIED] for info in infos])
         if applied.shape != action.shape:
             raise ValueError(

@@ -17,12 +17,12 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
-from agents.algorithms import build_model, normalized_env
+from agents.algorithms import AppliedActionBuffer, build_model, normalized_env
 from agents.callbacks import OTHERS, DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
-from agents.sb3_vec_env import SB3VecEnv
+from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
 from ncs_gym.validation import counted, reason_of, warn_caller
 from shields.atomic_write import write_atomically
 
@@ -169,10 +169,11 @@ def _trainable(
             f"of {algorithm} keeps rewards with the price of a violation that there was when they were collected"
         )
     envs = loop.vector(hyperparams["n_envs"])
-    if hyperparams.get("stored_action") == "applied" and loop.base_policy is not None:
+    stores_applied = hyperparams.get("stored_action") == "applied"
+    if stores_applied and loop.base_policy is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
     try:
-        seen = SB3VecEnv(envs)
+        seen = SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords if stores_applied else INFO_KEYWORDS)
     except ValueError as error:
         raise ValueError(f"{loop.env}: {error}; {OTHERS}") from error
     env = normalized_env(algorithm, seen, hyperparams)

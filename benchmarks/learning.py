@@ -583,7 +583,8 @@ def _layered(
     env_id: str, certificate: Certificate, algorithm: str, layer: SafeLayer | None, seed: int, steps: int
 ) -> Any:
     """Returns a model trained behind the shield, with the layer or without one."""
-    envs = SB3VecEnv(VectorSafetyShield(gym.make_vec(env_id, num_envs=32), certificate))
+    shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=32), certificate)
+    envs = SB3VecEnv(shield, info_keywords=AppliedActionBuffer.info_keywords)
     own = {} if layer is None else {"layer": layer}
     if algorithm == "PPO":
         settings = {"n_steps": 32, "batch_size": 256, "n_epochs": 5, "gamma": 0.9, "gae_lambda": 0.98}

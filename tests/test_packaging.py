@@ -48,7 +48,7 @@ LAYERS = {
         {"nodes", "silence", "torch"},
     ),
     "agents": (
-        {"hyperparams", "pickled_data", "step_info"},
+        {"hyperparams", "pickled_data"},
         {"loop", "results", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
         {"normalization", "sb3_zip", "agent_card"},
