@@ -27,7 +27,7 @@ from agents.agent_file import (
     shield_to_json,
 )
 from agents.algorithms import algorithm_class, build_model, policy_arguments
-from agents.hyperparams import ALGORITHMS, ON_POLICY, complete_hyperparams, require_moderate_networks
+from agents.hyperparams import ALGORITHMS, ON_POLICY, complete_hyperparams
 from agents.loop import BasePolicy, LoopConfig, ShieldSettings
 from agents.normalization import Normalization, read_statistics, statistics_beside
 from agents.results import Evaluation
@@ -326,10 +326,6 @@ def load_sb3_zip(path: Path, env_id: str, vec_normalize: str | Path | None = Non
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     saved = read_model(path)
-    try:
-        require_moderate_networks(saved.policy_kwargs)
-    except ValueError as error:
-        raise AgentError(f"the agent in {path} is refused: {error}") from error
     cls = algorithm_class(saved.algorithm)
     sde = {"use_sde": True} if saved.use_sde else {}
     rest: dict[str, Any] = sde if saved.algorithm in ON_POLICY else sde | {"buffer_size": 1}

@@ -27,7 +27,8 @@ from ncs_gym.installation import install_command
 from ncs_gym.validation import reason_of, shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
-_NO_HYPERPARAMS = ("env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
+_NO_HYPERPARAMS = ("policy", "env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device")
+_NO_HYPERPARAMS += ("_init_setup_model",)
 _LINEAR = "lin_"
 
 
@@ -85,16 +86,14 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
 
 def _not_the_librarys(name: str) -> tuple[str, ...]:
     """Returns the hyperparameters of an algorithm that its constructor does not take."""
-    return ("n_envs", "n_timesteps", "normalize") + (
-        () if name in ON_POLICY else ("noise_type", "noise_std", "stored_action")
-    )
+    return "n_envs", "n_timesteps", "normalize", *(() if name in ON_POLICY else ("noise_std", "stored_action"))
 
 
 def _arguments(
     name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
 ) -> dict[str, Any]:
     """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown or of a wrong type."""
-    own: dict[str, Any] = {"policy": "MlpPolicy"} | {
+    own: dict[str, Any] = {
         key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
     }
     for key, value in own.items():
@@ -116,7 +115,7 @@ def _arguments(
             raise ValueError(f"noise_std must be >= 0, got {shown(deviation)}")
         size = flatdim(env.action_space)
         own["action_noise"] = NormalActionNoise(np.zeros(size), deviation * np.ones(size))
-    return own
+    return own | {"policy": "MlpPolicy"}
 
 
 def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,8 +15,7 @@ from typing import Any, BinaryIO
 
 # Bytes of a certificate, a plant, settings, results, an `agent.json` or a page, and values of its JSON.
 LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
-# Bytes of a file of hyperparameters, and values in it once all aliases are written out.
-LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
+MOST_HYPERPARAMS = 100_000
 # Bytes of a `model.zip`, of all that it unpacks to, and files in it.
 LARGEST_MODEL, MOST_MEMBERS = 256 << 20, 1000
 # Bytes of a key, and of a line in a log of `ncs loop`.

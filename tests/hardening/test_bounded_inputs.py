@@ -18,7 +18,6 @@ import pytest
 from ncs_gym import Ellipsoid, LinearPlant, PacketLog, Remainder, TraceChannel, truck_trailer
 from ncs_gym.reading import (
     LARGEST_DOCUMENT,
-    LARGEST_HYPERPARAMS,
     LARGEST_LOG,
     MOST_LINES,
     MOST_PACKETS,
@@ -69,7 +68,6 @@ def endless(request, tmp_path):
 
 
 def readers():
-    from agents.hyperparams import read_hyperparams
     from experiments.settings import CompareSettings, config_defaults
 
     return {
@@ -78,12 +76,11 @@ def readers():
         "plant": LinearPlant.load,
         "certificate": Certificate.load,
         "packets": PacketLog.load,
-        "hyperparameters": lambda path: read_hyperparams(path, "ncs_gym/CSTR-v0"),
         "settings": lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings),
     }
 
 
-NAMES = ["bytes", "text", "plant", "certificate", "packets", "hyperparameters", "settings"]
+NAMES = ["bytes", "text", "plant", "certificate", "packets", "settings"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -166,96 +163,6 @@ def test_contracts_of_a_long_record_take_few_rows():
         assert [rows[0]["max_age"], rows[-1]["max_age"]] == [1000, 0]
         assert len(rows) < 20
         assert len(broken_contracts(np.zeros_like(ages), 0.1)) == 1
-
-
-LAUGHS = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]\n" + "".join(
-    f"{new}: &{new} [{', '.join(10 * ['*' + old])}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
-)
-MERGED = "a: &a {x0: 1, x1: 1}\n" + "".join(
-    f"{new}: &{new} {{<<: [*{old}, *{old}]}}\n"
-    for old, new in zip("abcdefghijklmnopqrstuv", "bcdefghijklmnopqrstuvw", strict=True)
-)
-
-
-@pytest.mark.parametrize("text", [LAUGHS, MERGED, "a: &a [*a]\n"], ids=["laughs", "merged", "in itself"])
-def test_yaml_that_expands_is_refused(text, write):
-    from agents.hyperparams import read_hyperparams
-
-    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
-        read_hyperparams(write("laughs.yml", text), "default")
-
-
-@pytest.mark.parametrize("number", [f"1{20_000 * ':1'}", f"!!float '1{20_000 * ':1'}.5'", 20_000 * "9"])
-def test_numbers_of_yaml_are_of_moderate_length(number, write):
-    from agents.hyperparams import read_hyperparams
-
-    with little_memory(), pytest.raises(ValueError, match="are damaged: it has a number of more than 1,000 letters"):
-        read_hyperparams(write("long.yml", f"default:\n  gamma: {number}\n"), "default")
-
-
-def test_yaml_with_moderate_aliases_is_read(write):
-    from agents.hyperparams import read_hyperparams
-
-    text = "common: &common {gamma: 0.9, n_envs: 4}\ndefault:\n  <<: *common\n  n_envs: 8\n"
-    assert read_hyperparams(write("zoo.yml", text), "default") == {"gamma": 0.9, "n_envs": 8}
-    with pytest.raises(OSError, match=f"{LARGEST_HYPERPARAMS:,} bytes"):
-        read_hyperparams(write("long.yml", text + "#" * LARGEST_HYPERPARAMS), "default")
-
-
-HUGE = [
-    {"policy_kwargs": {"net_arch": [12_000, 12_000]}},
-    {"policy_kwargs": {"net_arch": {"pi": [64], "vf": [12_000, 12_000]}}},
-    {"policy_kwargs": {"net_arch": [{"pi": [12_000, 12_000], "vf": [64]}]}},
-    {"policy_kwargs": {"net_arch": {"pi": [64], "qf": [12_000, 12_000]}}},
-    {"policy_kwargs": {"net_arch": [10**9]}},
-    {"policy_kwargs": {"net_arch": [64] * 100_000}},
-    {"policy_kwargs": {"n_critics": 10**9}},
-    {"policy_kwargs": {"n_quantiles": 10**9}},
-    {"policy_kwargs": {"net_arch": [1024, 1024], "n_critics": 100}},
-    {"buffer_size": 10**12},
-    {"n_envs": 10**9},
-    {"n_envs": 10_000, "n_steps": 10_000},
-]
-
-
-@pytest.mark.cases(5)
-@pytest.mark.parametrize("hyperparams", HUGE, ids=[json.dumps(each)[:50] for each in HUGE])
-def test_hyperparameters_that_take_much_memory_are_refused(hyperparams):
-    from agents.hyperparams import complete_hyperparams
-
-    algorithm = "TQC" if {"n_critics", "n_quantiles"} & hyperparams.get("policy_kwargs", {}).keys() else "PPO"
-    algorithm = "SAC" if "buffer_size" in hyperparams else algorithm
-    with little_memory(), pytest.raises(ValueError, match=r"at most|may have|numbers of"):
-        complete_hyperparams(algorithm, hyperparams)
-
-
-def test_networks_of_usual_sizes_are_taken():
-    from agents.hyperparams import complete_hyperparams
-
-    for arch in ([64, 64], [400, 300], [1024, 1024], {"pi": [256, 256], "qf": [512, 512]}, [{"pi": [64], "vf": []}]):
-        for algorithm in ("PPO", "SAC"):
-            complete_hyperparams(algorithm, {"policy_kwargs": {"net_arch": arch}})
-
-
-def forged(folder, hyperparams):
-    """A folder with the agent.json of a pretrained agent, other hyperparameters and a checksum that fits."""
-    from agents.agent_file import document_of, pretrained_folder
-
-    source = pretrained_folder("ncs_gym/CSTR-v0")
-    content = json.loads((source / "agent.json").read_text())["agent"]
-    (folder / "agent.json").write_bytes(document_of(content | {"hyperparams": hyperparams}))
-    (folder / "model.zip").write_bytes((source / "model.zip").read_bytes())
-    return folder
-
-
-@pytest.mark.parametrize("arch", [[12_000, 12_000], [{"pi": [12_000, 12_000], "vf": [12_000, 12_000]}]])
-def test_agent_of_large_networks_is_refused_before_they_are_made(arch, tmp_path):
-    pytest.importorskip("stable_baselines3")
-    from agents import Agent, AgentError
-
-    folder = forged(tmp_path, {"policy_kwargs": {"net_arch": arch}})
-    with little_memory(), pytest.raises(AgentError, match="weights"):
-        Agent.load(folder)
 
 
 def zipped(members):
@@ -467,7 +374,6 @@ def documents(folder):
     """The content of each kind of document, and what loads such a content, whose checksum is right."""
     from agents import Agent, agent_file
     from agents.agent_file import pretrained_folder
-    from agents.hyperparams import complete_hyperparams, read_hyperparams, tuned_hyperparams
     from experiments.settings import CompareSettings, config_defaults, settings_json
 
     plant = truck_trailer(mass=4000.0)
@@ -488,10 +394,6 @@ def documents(folder):
             json.loads((agent / "agent.json").read_text())["agent"],
             lambda content: (path.write_bytes(agent_file.document_of(content)), Agent.load(folder)),
         ),
-        "hyperparameters": (
-            {"default": tuned_hyperparams("ncs_gym/CSTR-v0")},
-            as_file(lambda path: complete_hyperparams("PPO", read_hyperparams(path, "default"))),
-        ),
         "settings": (
             settings_json("compare", CompareSettings()),
             as_file(lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings)),
@@ -499,7 +401,7 @@ def documents(folder):
     }
 
 
-@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "hyperparameters", "settings"])
+@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "settings"])
 def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     pytest.importorskip("stable_baselines3")
     document, load = documents(tmp_path)[name]

@@ -178,7 +178,7 @@ def test_sweep_takes_arms_with_hyphens_and_refuses_one_twice(tmp_path, without_w
 @pytest.mark.slow
 def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
     (tmp_path / "episode.gif").write_text("mine")
-    tiny = ("--hyperparams", "n_envs=8", "n_steps=64", "policy_kwargs=dict(net_arch=[8, 8], log_std_init=-4.0)")
+    tiny = ("--hyperparams", "n_envs=8", "n_steps=64", 'policy_kwargs={"net_arch": [8, 8], "log_std_init": -4.0}')
     sweep = ("sweep", "--arms", "K x_hat", "--delays", 0, 1, 2, "--losses", 0.3)
     for command in (("train", *tiny), sweep, ("render",)):
         with without_pictures():
