@@ -119,7 +119,7 @@ def train(
         beside.append(EvaluationCallback(loop, seed))
     if start is not None:
         _go_on(start, loop, algorithm, model, env)
-    current = partial(_agent, loop, algorithm, hyperparams, model, env)
+    current = partial(_agent, loop, algorithm, hyperparams, model, env, seed)
 
     def keep() -> None:
         if checkpoints is not None:
@@ -146,7 +146,7 @@ def untrained(
     """Returns an agent with the random weights that training starts from; arguments and errors as for `train`."""
     hyperparams = complete_hyperparams(algorithm, hyperparams)
     env = VecNormalize(SB3VecEnv(loop.vector(2)), training=False)  # PPO refuses rollouts of a single step
-    return _agent(loop, algorithm, hyperparams, build_model(algorithm, env, hyperparams, seed), env)
+    return _agent(loop, algorithm, hyperparams, build_model(algorithm, env, hyperparams, seed), env, seed)
 
 
 def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
@@ -212,7 +212,7 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
 
 
 def _agent(
-    loop: LoopConfig, algorithm: str, hyperparams: dict[str, Any], model: BaseAlgorithm, env: VecNormalize
+    loop: LoopConfig, algorithm: str, hyperparams: dict[str, Any], model: BaseAlgorithm, env: VecNormalize, seed: int
 ) -> Agent:
     return Agent(
         algorithm=algorithm,
@@ -221,6 +221,7 @@ def _agent(
         channel=loop.channel,
         model=model,
         normalization=Normalization.of(env),
+        seed=seed,
         base_policy=loop.base_policy,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,

@@ -48,10 +48,10 @@ LAYERS = {
         {"nodes", "silence", "torch"},
     ),
     "agents": (
-        {"hyperparams", "pickled_data"},
+        {"hyperparams"},
         {"loop", "results", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
-        {"normalization", "sb3_zip", "agent_card"},
+        {"normalization"},
         {"agent"},
         {"training"},
     ),

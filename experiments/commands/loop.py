@@ -19,7 +19,6 @@ from experiments.backends.worker import initialize_worker, signals_blocked
 from experiments.commands import short_version
 from experiments.network_loop.log import rows_of
 from experiments.network_loop.processes import (
-    OWN_POLICIES,
     REFUSED,
     NetworkLoop,
     network_channels,
@@ -29,7 +28,6 @@ from experiments.network_loop.processes import (
     suspects_text,
 )
 from experiments.runs.loops import registered_env
-from experiments.runs.policies import require_no_statistics
 from experiments.settings import LoopSettings
 from experiments.terminal import wrapped
 from ncs_gym import NCSEnv
@@ -146,8 +144,6 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     key = os.urandom(32) if settings.key_file is None else read_file(settings.key_file, LARGEST_KEY)
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
-    if settings.policy in OWN_POLICIES:
-        require_no_statistics(settings.vec_normalize, settings.policy)
     max_age = largest_age(env.contract, 0)
     return NetworkLoop(settings=settings, uplink=uplink, downlink=downlink, secret=key, max_age=max_age)
 

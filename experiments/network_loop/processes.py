@@ -281,7 +281,7 @@ async def _controller(
     columns += ["microseconds"]
     log = StepLog(settings.out, "controller", columns)
     packets = StepLog(settings.out, "packets", ["episode", "sent", "received"])
-    propose = controller_named(settings.policy, settings.env, env, settings.seed, settings.vec_normalize)
+    propose = controller_named(settings.policy, settings.env, env, settings.seed)
     steps = unproved = 0
 
     def on_step(node: ControllerNode, proposed: Any) -> None:
@@ -357,9 +357,7 @@ def suspects_text(refused: Mapping[str, int], settings: LoopSettings) -> str:
     return f"{plants}, and if all have a wrong tag, that machine has {other}"
 
 
-def controller_named(
-    name: str, env_id: str, env: NCSEnv, seed: int, vec_normalize: Path | None = None
-) -> Callable[[np.ndarray], np.ndarray]:
+def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries."""
     plant = env.plant
     if name in OWN_POLICIES:
@@ -371,7 +369,7 @@ def controller_named(
             return plant.input_ends[1 - (count - 1) // PUSH % 2].copy()
 
         return push
-    policy = policy_by_name(name, env_id, env, seed, vec_normalize)
+    policy = policy_by_name(name, env_id, env, seed)
     rng, task = np.random.default_rng([seed, 3]), env.task
     goal = task.begin(rng, plant)
     low, high = env.observation_space.low, env.observation_space.high  # pyright: ignore[reportAttributeAccessIssue]

@@ -332,8 +332,7 @@ class RenderSettings:
             names, into a .png.
         policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
             "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
-            package), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
-        vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
+            package), or the folder of a trained agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
@@ -351,7 +350,6 @@ class RenderSettings:
     out: Path = Path("episode.gif")
     log: Path | None = None
     policy: str = "greedy"
-    vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None
     side_by_side: bool = False
@@ -380,8 +378,7 @@ class LoopSettings:
             loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
         downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
         policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", a regulator ("lqr",
-            "governor", "mpc"), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
-        vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
+            "governor", "mpc"), or the folder of a trained agent.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; without
@@ -411,7 +408,6 @@ class LoopSettings:
     channel: Assignments = field(default_factory=dict)
     downlink: Assignments = field(default_factory=dict)
     policy: str = "push"
-    vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     horizon: int | None = None
     least_safe_steps: int = 0

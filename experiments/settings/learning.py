@@ -239,11 +239,13 @@ class EvaluateSettings:
 
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`; or the zip that `model.save` of stable-baselines3 wrote, with --env; or "pretrained", for the
-            agent of --env that comes with the package.
+            `ncs train`; or "pretrained", for the agent of --env that comes with the package; or the zip that
+            `model.save` of stable-baselines3 wrote, with --env, --algorithm, --vec-normalize and --trust.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
-        vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, of which numbers alone
-            are read; "none" if the agent saw observations as they are and a file of that kind lies beside it.
+        algorithm: Algorithm of a zip.
+        vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, or "none" if the agent
+            saw observations as they are.
+        trust: Load a zip and its statistics although they may run code.
         shield: Mode of the shield, by default that of the agent's training, which a zip does not tell: none then;
             "none" for no shield; "monitor" changes nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
@@ -262,7 +264,9 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
+    algorithm: Algorithm | None = None
     vec_normalize: Path | None = None
+    trust: bool = False
     shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
     horizon: int | None = None
     least_safe_steps: int = 0

@@ -127,7 +127,6 @@ USAGE = [
     ("loop --mischief 2", "--mischief must be at least 0 and at most 1"),
     ("loop --port 70000", "--port must be at least 1 and at most 65533"),
     ("loop --room -1", "--room must be at least 0 and at most 100"),
-    ("loop --vec-normalize s.pkl", "push needs no statistics"),
     ("loop --role plant", "give both the same --key-file"),
     ("render --side-by-side --shield none", "--side-by-side compares with a shield"),
     ("requirements --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),

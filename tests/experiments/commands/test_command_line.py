@@ -247,11 +247,6 @@ def test_one_agent_is_trained(tmp_path, without_workers):
     evaluated = succeeded("evaluate", model / "model.zip", "--episodes", "2")  # beside what the agent is known by
     assert "shield: project" in evaluated.stdout
     assert "none is used" not in evaluated.stderr
-    (tmp_path / "alone.zip").write_bytes((model / "model.zip").read_bytes())
-    alone = ("--env", "ncs_gym/TruckTrailerCruise-v0", "--vec-normalize", "none", "--episodes", "2")
-    bare = succeeded("evaluate", tmp_path / "alone.zip", *alone)
-    assert "shield: none" in bare.stdout
-    assert "the channel of the id are used; give --shield" in bare.stderr
 
 
 @pytest.mark.slow
