@@ -14,7 +14,6 @@ export PYTHONDONTWRITEBYTECODE :=
 INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
 AUDIT_INSTALLED := $(VENV)/.installed-audit
-ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 LOWEST := $(VENV)-lowest
 NEWEST := $(VENV)-newest
@@ -69,7 +68,7 @@ coverage-report: ## that share, of the tests that ran last
 	@for package in $(PACKAGES) '*'; do \
 		printf '%-12s' "$$package"; $(BIN)/coverage report --include="$$package/*" --format=total || exit; done
 
-test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks, and examples in processes of their own
+test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks, and examples in processes of their own
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the study and a record as the
@@ -162,11 +161,6 @@ $(AUDIT_INSTALLED): $(INSTALLED)
 
 $(RAY_INSTALLED): $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[ray]'
-	touch $@
-
-# rl-zoo3 declares older versions than it runs with (docs/integrations.md).
-$(ZOO_INSTALLED): examples/rl_zoo/requirements.txt $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps -r examples/rl_zoo/requirements.txt
 	touch $@
 
 clean: ## removes the environment and the site

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
-    from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
+    from agents.hyperparams import tuned_hyperparams, tuned_steps
     from agents.loop import BasePolicy, LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
@@ -46,7 +46,6 @@ __all__ = [
     "evaluate",
     "pretrained",
     "pretrained_folder",
-    "read_hyperparams",
     "train",
     "tuned_hyperparams",
     "tuned_steps",
@@ -59,7 +58,7 @@ _MODULES = {
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
     "loop": ("BasePolicy", "LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
-    "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
+    "hyperparams": ("tuned_hyperparams", "tuned_steps"),
     "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
     "agent_file": ("AgentError", "pretrained_folder"),

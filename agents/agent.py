@@ -1,24 +1,25 @@
-"""A trained policy, and its files, which hold weights and numbers but no pickled code."""
+"""A trained policy, and its files: `agent.json`, and stable-baselines3's `model.zip`, whose weights alone are read."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-import warnings
+import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent_card import agent_card
 from agents.agent_file import (
-    AGENT_FILES,
     AgentError,
     document_of,
     pretrained_folder,
@@ -26,13 +27,11 @@ from agents.agent_file import (
     shield_from_json,
     shield_to_json,
 )
-from agents.algorithms import algorithm_class, build_model, policy_arguments
-from agents.hyperparams import ALGORITHMS, ON_POLICY, complete_hyperparams, require_moderate_networks
+from agents.algorithms import algorithm_class, build_model
+from agents.hyperparams import complete_hyperparams
 from agents.loop import BasePolicy, LoopConfig, ShieldSettings
-from agents.normalization import Normalization, read_statistics, statistics_beside
-from agents.results import Evaluation
+from agents.normalization import Normalization
 from agents.sb3_vec_env import SB3VecEnv
-from agents.sb3_zip import parameters_of, read_model, require_same_spaces
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
 from ncs_gym.validation import reason_of, shown
@@ -45,11 +44,12 @@ class Agent:
 
     Attributes:
         algorithm: Name of the algorithm in `agents.hyperparams.ALGORITHMS`.
-        hyperparams: Hyperparameters the agent was trained with, JSON values by name.
+        hyperparams: Hyperparameters the agent was trained with, JSON values by name; empty for one of `load_sb3_zip`.
         env: Id of the environment the agent was trained in.
         channel: Channel the agent was trained with; None for that of the id.
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
+        seed: Seed of the training; None where it is not known.
         base_policy: Policy to whose action that of the model is added; None for none.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
@@ -64,6 +64,7 @@ class Agent:
     channel: Channel | None
     model: BaseAlgorithm
     normalization: Normalization
+    seed: int | None = None
     base_policy: BasePolicy | None = None
     shield_mode: str | None = None
     horizon: int | None = None
@@ -135,15 +136,20 @@ class Agent:
         """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest.
 
         Raises:
-            ValueError: If the environment was made with something that a file does not keep.
+            ValueError: If the environment was made with something that a file does not keep, or the agent is from a
+                zip of stable-baselines3.
         """
+        if not self.hyperparams:
+            raise ValueError("the agent is from a zip of stable-baselines3, which is its file: save agent.model")
         require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
         self.model.save(buffer)
         content = {
-            "algorithm": self.algorithm,
-            "hyperparams": self.hyperparams,
             "env": self.env,
+            "algorithm": self.algorithm,
+            "seed": self.seed,
+            "versions": _versions(),
+            "hyperparams": self.hyperparams,
             "channel": to_json(self.channel),
             "shield": shield_to_json(self.shield_mode, self.horizon, self.least_safe_steps),
             "plant": None if (plant := _plant_of(self.env, self.kwargs)) is None else plant.fingerprint,
@@ -163,15 +169,12 @@ class Agent:
             content["kwargs"] = self.kwargs
         return {"model.zip": buffer.getvalue(), "agent.json": document_of(content)}
 
-    def save(
-        self, folder: str | Path, shield: ShieldSettings | None = None, evaluation: Evaluation | None = None
-    ) -> None:
-        """Writes a folder that can be shared: `model.zip`, `agent.json`, the card `README.md`, and `certificate.json`.
+    def save(self, folder: str | Path, shield: ShieldSettings | None = None) -> None:
+        """Writes a folder that can be shared: `model.zip`, `agent.json`, and `certificate.json` of a shield.
 
         Args:
             folder: The folder, which is made if it does not exist; files of these names are replaced.
             shield: The shield that the agent is meant to act behind, whose certificate is saved; None for none.
-            evaluation: Episodes whose figures the card gives; None leaves them out.
 
         Raises:
             ValueError: If the certificate is for another plant than that of the agent's environment, or see `files`.
@@ -180,7 +183,7 @@ class Agent:
         folder = Path(folder)
         if shield is not None and not _is_for_plant_of(self.env, self.kwargs, shield.certificate.fingerprint):
             raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
-        files = self.files() | {"README.md": agent_card(self, shield, evaluation).encode()}
+        files = self.files()
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             write_atomically(folder / name, content)
@@ -191,7 +194,7 @@ class Agent:
 
     @classmethod
     def load(cls, folder: str | Path) -> Agent:
-        """Returns the agent saved in a folder; nothing is unpickled, so that an untrusted file cannot run code.
+        """Returns the agent saved in a folder; of `model.zip` torch reads the weights alone (`weights_only=True`).
 
         Raises:
             AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
@@ -260,12 +263,10 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     require_kept(kwargs, env_id)
     if not _is_for_plant_of(env_id, kwargs, content["plant"]):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
-    if algorithm not in ALGORITHMS:
-        raise AgentError(f"the agent is of an unknown algorithm, {shown(algorithm)}")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs=kwargs | {"channel": content["channel"]})
     shield_mode, horizon, least_safe_steps = shield_from_json(content.get("shield"))
-    parameters, envs = parameters_of(weights), SB3VecEnv(loop.vector(2))
+    envs = SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
     is_filtered = content.get("filtered", False) is not False
@@ -277,7 +278,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
             f"{envs.observation_space.shape} now: it is registered with another task or observe="
         )
     model = build_model(algorithm, envs, hyperparams, seed=0)  # as in `untrained`
-    model.set_parameters(parameters, exact_match=True, device="cpu")
+    model.set_parameters(io.BytesIO(weights), exact_match=True, device="cpu")  # type: ignore[arg-type]
     usable = mean.shape == variance.shape == model.observation_space.shape
     if not (usable and np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise AgentError("the agent is damaged: its normalization has a wrong shape or value")
@@ -293,6 +294,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         channel=loop.channel,
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
+        seed=content.get("seed"),
         base_policy=base,
         shield_mode=shield_mode,
         horizon=horizon,
@@ -302,92 +304,52 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     )
 
 
-def is_sb3_zip(path: Path) -> bool:
-    """Returns whether a path is a zip of stable-baselines3, and not a file of an `Agent`."""
-    return path.suffix == ".zip" and not (path.name in AGENT_FILES and path.with_name("agent.json").exists())
-
-
-# In the place of a file of statistics: the agent saw observations as they are.
-NO_STATISTICS = "none"
-
-
-def load_sb3_zip(path: Path, env_id: str, vec_normalize: str | Path | None = None) -> Agent:
-    """Returns an agent that was saved by `model.save`.
+def load_sb3_zip(path: Path, env_id: str, algorithm: str, vec_normalize: Path | None) -> Agent:
+    """Returns an agent that `model.save` wrote, by stable-baselines3's `load`: it unpickles, and so may run code.
 
     Args:
-        path: The zip.
+        path: The zip, from somebody whom you trust.
         env_id: Id of the environment.
-        vec_normalize: File that `VecNormalize.save` wrote, of which numbers alone are read; "none" says that the agent
-            saw observations as they are; None, that the zip says so: those of off-policy algorithms never do.
+        algorithm: Name of the algorithm in `agents.hyperparams.ALGORITHMS`.
+        vec_normalize: File that `VecNormalize.save` wrote, which is unpickled, too; None if the agent saw observations
+            as they are.
 
     Raises:
-        AgentError: If it cannot be read, is of an unknown algorithm, has settings that only unpickling would tell, does
-            not fit the environment, or needs what is not given here; the message names it.
+        AgentError: If a file cannot be read, is of another algorithm or environment, or the policy acts by more than
+            observations, such as a recurrent one.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
-    saved = read_model(path)
+    env = SB3VecEnv(LoopConfig(env=env_id).vector(2))
+    normalization = Normalization.none(int(np.prod(env.observation_space.shape or ())))
     try:
-        require_moderate_networks(saved.policy_kwargs)
-    except ValueError as error:
-        raise AgentError(f"the agent in {path} is refused: {error}") from error
-    cls = algorithm_class(saved.algorithm)
-    sde = {"use_sde": True} if saved.use_sde else {}
-    rest: dict[str, Any] = sde if saved.algorithm in ON_POLICY else sde | {"buffer_size": 1}
-    try:
-        env = SB3VecEnv(LoopConfig(env=env_id).vector(2))
-        doubt = require_same_spaces(saved, env.observation_space, env.action_space)
-        model = cls("MlpPolicy", env, policy_kwargs=policy_arguments(saved.policy_kwargs), device="cpu", **rest)
-        model.policy.load_state_dict(parameters_of(saved.file)["policy"])
-    except Exception as error:  # a forged file may break any part of the libraries that read it
-        raise AgentError(f"the agent in {path} does not fit {env_id}: {reason_of(error)}") from error
-    if doubt:
-        warnings.warn(f"the agent in {path} {doubt}", stacklevel=2)
-    entries = int(np.prod(env.observation_space.shape or ()))
-    normalization = _normalization_for(path, saved.is_normalized, vec_normalize) or Normalization.none(entries)
-    if normalization.mean.size != entries:
-        raise AgentError(f"{vec_normalize} has statistics of {normalization.mean.size} entries, {env_id} has {entries}")
-    net_arch: Any = model.policy.net_arch
+        model = algorithm_class(algorithm).load(path, env=env, device="cpu")
+        if vec_normalize is not None:
+            statistics = VecNormalize.load(str(vec_normalize), env)
+            normalization = Normalization.of(statistics) if statistics.norm_obs else normalization
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # what is unpickled may raise any kind
+        raise AgentError(f"{path} does not load as an agent by {algorithm} in {env_id}: {reason_of(error)}") from error
+    if type(model.policy) is not model.policy_aliases["MlpPolicy"]:
+        raise AgentError(f"{path} has a {type(model.policy).__name__}, not the MlpPolicy of {algorithm}")
     return Agent(
-        algorithm=saved.algorithm,
-        hyperparams={"policy_kwargs": {"net_arch": net_arch} | saved.policy_kwargs} | sde,
-        env=env_id,
-        channel=None,
-        model=model,
-        normalization=normalization,
+        algorithm=algorithm, hyperparams={}, env=env_id, channel=None, model=model, normalization=normalization
     )
 
 
-def _normalization_for(
-    path: Path, is_normalized: bool | None, vec_normalize: str | Path | None
-) -> Normalization | None:
-    """Returns how an agent's observations are normalized; None if they are not.
-
-    Raises:
-        AgentError: If there have to be some and none are given, they cannot be read, or there can be none.
-    """
-    if vec_normalize is not None and str(vec_normalize) == NO_STATISTICS:
-        return None
-    if vec_normalize is not None:
-        if is_normalized is False:
-            raise AgentError(f"the agent in {path} saw observations as they are: leave out --vec-normalize")
-        return read_statistics(Path(vec_normalize))
-    if is_normalized is False:
-        return None
-    beside = statistics_beside(path)
-    known = f"{path} does not say whether VecNormalize normalized the observations that its agent saw"
-    if is_normalized:
-        known = f"the agent in {path} saw observations that VecNormalize normalized"
-    elif beside is not None:
-        known = f"statistics of VecNormalize lie beside {path}"
-    raise AgentError(
-        f"{known}: give --vec-normalize {beside or 'FILE'}, or --vec-normalize none if it saw them as they are"
-    )
+def _versions() -> dict[str, str]:
+    """Returns the versions of the installed packages that training depends on."""
+    found = {"python": platform.python_version()}
+    for name in ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy"):
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 # What an agent.json has: what else it says might be a part of the policy.
 _ENTRIES = {
-    *("algorithm", "hyperparams", "env", "kwargs", "channel", "plant", "shield", "normalization", "base_policy"),
-    *("filtered", "sha256_of_model"),
+    *("format", "env", "algorithm", "seed", "versions", "hyperparams", "kwargs", "channel", "plant", "shield"),
+    *("normalization", "base_policy", "filtered", "sha256_of_model"),
 }
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {

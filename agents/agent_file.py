@@ -1,7 +1,4 @@
-"""The files of an agent, checked.
-
-`agent.json` has numbers and names and the checksum of `model.zip`, the weights.
-"""
+"""The files of an agent: `agent.json` has numbers, names and the checksum of `model.zip`, the weights."""
 
 from __future__ import annotations
 
@@ -15,22 +12,20 @@ from typing import Any
 from ncs_gym.reading import LARGEST_MODEL, json_values, read_file
 from ncs_gym.validation import shown
 from shields.atomic_write import write_atomically
-from shields.json_documents import digest
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
 # Files of an agent: no other name is read or written for one, whoever made the list of names.
 AGENT_FILES = ("model.zip", "agent.json")
-_FORMAT = "ncs-gym agent 2"
+_FORMAT = "ncs-gym agent 3"
 
 
 class AgentError(ValueError):
-    """A folder holds no agent, a damaged or altered one, or one of another environment."""
+    """A file or folder holds no agent, a damaged or altered one, or one of another environment."""
 
 
 def document_of(content: dict[str, Any]) -> bytes:
     """Returns the `agent.json` of some content."""
-    document = {"format": _FORMAT, "sha256": digest(content), "agent": content}
-    return (json.dumps(document, indent=1) + "\n").encode()
+    return (json.dumps({"format": _FORMAT} | content, indent=1) + "\n").encode()
 
 
 def require_names(names: Iterable[str]) -> None:
@@ -52,7 +47,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
-    """Returns the folder of an agent, the content of its `agent.json` and its `model.zip`, whose checksums are right.
+    """Returns the folder of an agent, the content of its `agent.json` and its `model.zip`, whose checksum is right.
 
     Args:
         folder: The folder, or one of the two files in it.
@@ -63,7 +58,7 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
     folder = Path(folder)
     folder = folder.parent if folder.name in AGENT_FILES else folder
     try:
-        document = json_values(read_file(folder / "agent.json"))
+        content = json_values(read_file(folder / "agent.json"))
         weights = read_file(folder / "model.zip", LARGEST_MODEL)
     except OSError as error:
         raise AgentError(
@@ -72,18 +67,15 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
         ) from error
     except (ValueError, RecursionError) as error:
         raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise AgentError(f"{folder / 'agent.json'} is not of format {_FORMAT!r}")
-    content = document.get("agent")
-    if not isinstance(content, dict) or document.get("sha256") != digest(content):
-        raise AgentError(f"{folder / 'agent.json'} was altered: its checksum does not match")
     if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
-        raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
+        raise AgentError(f"{folder / 'model.zip'} is not the one that {folder / 'agent.json'} belongs to")
     return folder, content, weights
 
 
 def pretrained_folder(env_id: str) -> Path:
-    """Returns the folder of the small agent that comes with the package, with its card and its certificate.
+    """Returns the folder of the small agent that comes with the package.
 
     Args:
         env_id: Id of an environment of this package.

@@ -22,11 +22,13 @@ from torch import nn
 from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
+from agents.sb3_vec_env import INFO_KEYWORDS
 from ncs_gym.installation import install_command
 from ncs_gym.validation import reason_of, shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
-_NO_HYPERPARAMS = ("env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
+_NO_HYPERPARAMS = ("policy", "env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device")
+_NO_HYPERPARAMS += ("_init_setup_model",)
 _LINEAR = "lin_"
 
 
@@ -84,16 +86,14 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
 
 def _not_the_librarys(name: str) -> tuple[str, ...]:
     """Returns the hyperparameters of an algorithm that its constructor does not take."""
-    return ("n_envs", "n_timesteps", "normalize") + (
-        () if name in ON_POLICY else ("noise_type", "noise_std", "stored_action")
-    )
+    return "n_envs", "n_timesteps", "normalize", *(() if name in ON_POLICY else ("noise_std", "stored_action"))
 
 
 def _arguments(
     name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
 ) -> dict[str, Any]:
     """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown or of a wrong type."""
-    own: dict[str, Any] = {"policy": "MlpPolicy"} | {
+    own: dict[str, Any] = {
         key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
     }
     for key, value in own.items():
@@ -115,7 +115,7 @@ def _arguments(
             raise ValueError(f"noise_std must be >= 0, got {shown(deviation)}")
         size = flatdim(env.action_space)
         own["action_noise"] = NormalActionNoise(np.zeros(size), deviation * np.ones(size))
-    return own
+    return own | {"policy": "MlpPolicy"}
 
 
 def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,10 +186,15 @@ _SAME_ACTION = 1e-5
 class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
-    Hand it to SAC, TD3 and their kind as `replay_buffer_class`. `train` does so with the hyperparameter
+    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, and its infos to
+    `SB3VecEnv(info_keywords=AppliedActionBuffer.info_keywords)`. `train` does so with the hyperparameter
     `stored_action="applied"`. It is for returns of one step (`n_steps=1`).
+
+    Attributes:
+        info_keywords: The infos that it reads, and those that `SB3VecEnv` has at every step anyway.
     """
 
+    info_keywords = (*INFO_KEYWORDS, APPLIED, "episode_steps")
     _steps: np.ndarray | None = None  # of the episodes, when the last transition was added
 
     def add(
@@ -207,8 +212,12 @@ class AppliedActionBuffer(ReplayBuffer):
             ValueError: If infos do not say what was applied, actions have entries that are no inputs, something but the
                 shield changes them, or an action takes several steps.
         """
-        if any(APPLIED not in info for info in infos):
-            raise ValueError(f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym')
+        missing = [name for name in (APPLIED, "episode_steps") if any(name not in info for info in infos)]
+        if missing:
+            raise ValueError(
+                f'infos have no "{missing[0]}": the buffer is for environments of ncs_gym, in '
+                "SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords)"
+            )
         applied = np.array([info[APPLIED] for info in infos])
         if applied.shape != action.shape:
             raise ValueError(

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from agents.evaluation import evaluate
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from agents.results import TrainingPoint
-from agents.sb3_vec_env import SB3VecEnv
+from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
 
 # What to do with environments that are no loops.
 OTHERS = 'agents.train is for environments with "cost" in their infos: train others by stable-baselines3 itself'
@@ -20,8 +20,6 @@ OTHERS = 'agents.train is for environments with "cost" in their infos: train oth
 _MAX_POINTS = 200
 # The policy is evaluated about this often.
 _EVALUATIONS = 10
-# Infos of single environments that are counted.
-_COUNTED = ("cost", "shield_intervened", "shield_correction", "shield_guaranteed")
 
 
 class SafetyCallback(BaseCallback):
@@ -230,5 +228,5 @@ def _counted(callback: BaseCallback) -> dict[str, Any]:
         raise ValueError(
             f'SafetyCallback counts "cost" of every info, which the infos of these environments have not; {OTHERS}'
         )
-    known = {key: [info[key] for info in infos if key in info] for key in _COUNTED}  # some may be without a shield
+    known = {key: [info[key] for info in infos if key in info] for key in INFO_KEYWORDS}  # some may be without a shield
     return {key: values for key, values in known.items() if values}

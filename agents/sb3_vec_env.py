@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -16,7 +16,6 @@ from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.step_info import step_infos
 from ncs_gym import NCSVectorEnv
 from ncs_gym.validation import AroundEnvironment, require_batched_infos, require_not_inside
 
@@ -28,6 +27,8 @@ torch.set_num_threads(1)
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 # What gymnasium reports of ends of episodes, beside the infos of the next ones.
 _FINAL = ("final_obs", "final_info")
+# Infos that callbacks of the package and of others read at every step.
+INFO_KEYWORDS = ("cost", "shield_intervened", "shield_correction", "shield_guaranteed")
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
 _EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
 
@@ -42,15 +43,15 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
     once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
     Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`,
-    `is_success` and `episode_guaranteed` where there are such infos. The dict of an environment has the keys that it
-    reported, in an `NCSVectorEnv` all keys at all steps; values are taken out of the arrays when they are read
-    (`StepInfo`). `batch_info` has the arrays of the last step.
+    `is_success` and `episode_guaranteed` where there are such infos. Besides, the dict of an environment has those of
+    its infos that `info_keywords` names, at every step; `batch_info` has all infos as arrays.
 
     Importing this class sets torch to one thread, with which small networks train fastest; call
     `torch.set_num_threads` after the import for another number.
 
     Args:
         vector_env: The vector environment.
+        info_keywords: Infos that stand in the dict of every step, for buffers and callbacks that read them.
         allow_reset_transitions: Whether to accept environments that take a step to reset.
 
     Attributes:
@@ -65,7 +66,13 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
 
     _inside = "_made_around"
 
-    def __init__(self, vector_env: VectorEnv, *, allow_reset_transitions: bool = False) -> None:
+    def __init__(
+        self,
+        vector_env: VectorEnv,
+        *,
+        info_keywords: Sequence[str] = INFO_KEYWORDS,
+        allow_reset_transitions: bool = False,
+    ) -> None:
         if not isinstance(vector_env, (VectorEnv, gym.vector.VectorWrapper)):
             raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
         if isinstance(vector_env.single_observation_space, (gym.spaces.Dict, gym.spaces.Tuple)):
@@ -78,7 +85,9 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
                     "VecNormalize around SB3VecEnv in its place"
                 )
             layer = layer.env
-        self.vector_env = vector_env
+        if isinstance(info_keywords, str):
+            raise ValueError(f"info_keywords must be names of infos, such as ('cost',), got {info_keywords!r}")
+        self.vector_env, self._info_keywords = vector_env, tuple(info_keywords)
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._masks = isinstance(vector_env.unwrapped, _WITH_RESET_MASK)
         if self._mode is not AutoresetMode.SAME_STEP and not self._masks and not allow_reset_transitions:
@@ -134,16 +143,12 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             last = info["final_obs"]
             self.batch_info = _with_final(info, done)
-        if _is_dense(info):
-            infos = step_infos(_dense(info), self.num_envs)
-            if not self._masks:  # other people's vector environments may write into arrays of earlier steps
-                infos = [each.copy() for each in infos]
-        else:
-            infos = [{"TimeLimit.truncated": False} | _info_of(info, e) for e in range(self.num_envs)]
+        infos = _step_infos(_named(info, self._info_keywords), self.num_envs)
         # In SAME_STEP mode the others are those of the next episodes.
         final = info.get("final_info", info) if self._mode is AutoresetMode.SAME_STEP else info
-        for e, reported in _reported(final, done):
-            infos[e] = self._last_info(e, reported, last[e], bool(truncated[e] and not terminated[e]))
+        final = _named(final, (*self._info_keywords, *_EPISODE_KEYS))
+        for e in np.flatnonzero(done).tolist():
+            infos[e] = self._last_info(e, _info_of(final, e), last[e], bool(truncated[e] and not terminated[e]))
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._mode is AutoresetMode.SAME_STEP:
@@ -160,8 +165,8 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
 
     def _keep_first_infos(self, chosen: np.ndarray, info: dict[str, Any]) -> None:
         """Keeps the infos of the first observations of some environments' episodes, bool (N,)."""
-        for e, reported in _reported(info, chosen):
-            self.reset_infos[e] = reported
+        for e in np.flatnonzero(chosen).tolist():
+            self.reset_infos[e] = _info_of(info, e)
 
     def _last_info(self, e: int, info: dict[str, Any], observation: np.ndarray, cut: bool) -> dict[str, Any]:
         """Returns the info of environment e, whose episode ends in this step, given what was reported."""
@@ -279,23 +284,21 @@ def _dense(info: dict[str, Any]) -> dict[str, np.ndarray]:
     }
 
 
-def _is_dense(info: dict[str, Any]) -> bool:
-    """Returns whether every environment reported every info, and none is a dictionary."""
-    return not any(
-        isinstance(value, dict) or (key.startswith("_") and not np.all(value))
-        for key, value in info.items()
-        if key.removeprefix("_") not in _FINAL
-    )
+def _named(info: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Returns the infos of these names, and gymnasium's marks of who reported them."""
+    return {key: info[key] for name in names for key in (name, f"_{name}") if key in info}
 
 
-def _reported(info: dict[str, Any], chosen: np.ndarray) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yields the environments chosen, bool (N,), each with what it reported."""
-    numbers = np.flatnonzero(chosen).tolist()
-    if numbers and _is_dense(info):
-        dense = _dense(info)
-        yield from ((e, {key: value[e] for key, value in dense.items()}) for e in numbers)
-    else:
-        yield from ((e, _info_of(info, e)) for e in numbers)
+def _step_infos(info: dict[str, Any], count: int) -> list[dict[str, Any]]:
+    """Returns what each of some environments reported, as a dict of its own in which no episode ends."""
+    if any(isinstance(value, dict) or (key.startswith("_") and not np.all(value)) for key, value in info.items()):
+        return [{"TimeLimit.truncated": False} | _info_of(info, e) for e in range(count)]
+    infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(count)]
+    for key, values in info.items():
+        if not key.startswith("_"):
+            for each, value in zip(infos, values.tolist() if values.ndim == 1 else values.copy(), strict=True):
+                each[key] = value
+    return infos
 
 
 def _info_of(info: dict[str, Any], e: int) -> dict[str, Any]:

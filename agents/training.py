@@ -17,12 +17,12 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
-from agents.algorithms import build_model, normalized_env
+from agents.algorithms import AppliedActionBuffer, build_model, normalized_env
 from agents.callbacks import OTHERS, DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
-from agents.sb3_vec_env import SB3VecEnv
+from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
 from ncs_gym.validation import counted, reason_of, warn_caller
 from shields.atomic_write import write_atomically
 
@@ -119,7 +119,7 @@ def train(
         beside.append(EvaluationCallback(loop, seed))
     if start is not None:
         _go_on(start, loop, algorithm, model, env)
-    current = partial(_agent, loop, algorithm, hyperparams, model, env)
+    current = partial(_agent, loop, algorithm, hyperparams, model, env, seed)
 
     def keep() -> None:
         if checkpoints is not None:
@@ -146,7 +146,7 @@ def untrained(
     """Returns an agent with the random weights that training starts from; arguments and errors as for `train`."""
     hyperparams = complete_hyperparams(algorithm, hyperparams)
     env = VecNormalize(SB3VecEnv(loop.vector(2)), training=False)  # PPO refuses rollouts of a single step
-    return _agent(loop, algorithm, hyperparams, build_model(algorithm, env, hyperparams, seed), env)
+    return _agent(loop, algorithm, hyperparams, build_model(algorithm, env, hyperparams, seed), env, seed)
 
 
 def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
@@ -169,10 +169,11 @@ def _trainable(
             f"of {algorithm} keeps rewards with the price of a violation that there was when they were collected"
         )
     envs = loop.vector(hyperparams["n_envs"])
-    if hyperparams.get("stored_action") == "applied" and loop.base_policy is not None:
+    stores_applied = hyperparams.get("stored_action") == "applied"
+    if stores_applied and loop.base_policy is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
     try:
-        seen = SB3VecEnv(envs)
+        seen = SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords if stores_applied else INFO_KEYWORDS)
     except ValueError as error:
         raise ValueError(f"{loop.env}: {error}; {OTHERS}") from error
     env = normalized_env(algorithm, seen, hyperparams)
@@ -211,7 +212,7 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
 
 
 def _agent(
-    loop: LoopConfig, algorithm: str, hyperparams: dict[str, Any], model: BaseAlgorithm, env: VecNormalize
+    loop: LoopConfig, algorithm: str, hyperparams: dict[str, Any], model: BaseAlgorithm, env: VecNormalize, seed: int
 ) -> Agent:
     return Agent(
         algorithm=algorithm,
@@ -220,6 +221,7 @@ def _agent(
         channel=loop.channel,
         model=model,
         normalization=Normalization.of(env),
+        seed=seed,
         base_policy=loop.base_policy,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,

@@ -338,16 +338,14 @@ def with_interval(values: Sequence[float], sign: str = "") -> str:
 def pretrained(
     env: Sequence[str] = (),
     out: Path = ROOT / "agents" / "trained",
-    evaluate_only: bool = False,
     table: bool = False,
 ) -> None:
     """Trains the small agents that come with the package, one per registered id, behind the shield (mode project).
 
     PPO with the hyperparameters and steps of agents/tuned, or the defaults and 150,000 steps, and networks of two
-    layers of 32. Each agent is evaluated on 200 episodes and saved with its card; a line says how long that took. Its
-    certificate is the one in shields/packaged_certificates. --evaluate-only evaluates the agents that are there and
-    writes their cards again. --table prints them beside the best linear controller behind the same shield, on the same
-    episodes, without those whose packages are missing.
+    layers of 32. Each agent is saved and evaluated on 200 episodes; a line says how long that took. Its certificate is
+    the one in shields/packaged_certificates. --table prints those that are there beside the best linear controller
+    behind the same shield, on the same episodes, without those whose packages are missing.
     """
     if table:
         print("| environment | agent (overridden) | best linear controller | difference, paired |\n|---|---|---|---|")
@@ -357,26 +355,22 @@ def pretrained(
             with suppress(ModuleNotFoundError):
                 print(_row(env_id, folder), flush=True)
         else:
-            line, seconds = timed(_train_and_save, env_id, folder, evaluate_only)
+            line, seconds = timed(_train_and_save, env_id, folder)
             print(f"{line}, {seconds:.0f} s of CPU", flush=True)
 
 
-def _train_and_save(env_id: str, folder: Path, evaluate_only: bool) -> str:
-    """Trains (unless it is there), evaluates and saves the agent of an environment; returns a line about it."""
-    loop, (training_seed, evaluation_seed), violations = shielded_loop(env_id), seeds_of(PACKAGE_SEED, 0), 0
-    if evaluate_only:
-        agent = Agent.load(folder)
-    else:
-        small = {"policy_kwargs": {"net_arch": [32, 32]}}
-        hyperparams = with_changes(tuned_hyperparams(env_id) or DEFAULTS["PPO"], small)
-        training = train(loop, tuned_steps(env_id) or STEPS, training_seed, hyperparams=hyperparams)
-        agent, violations = training.agent, training.violation_steps
+def _train_and_save(env_id: str, folder: Path) -> str:
+    """Trains, saves and evaluates the agent of an environment; returns a line about it."""
+    loop, (training_seed, evaluation_seed) = shielded_loop(env_id), seeds_of(PACKAGE_SEED, 0)
+    small = {"policy_kwargs": {"net_arch": [32, 32]}}
+    hyperparams = with_changes(tuned_hyperparams(env_id) or DEFAULTS["PPO"], small)
+    training = train(loop, tuned_steps(env_id) or STEPS, training_seed, hyperparams=hyperparams)
+    agent = training.agent
+    agent.save(folder)
     evaluation = evaluate(loop, lambda observations, infos: agent.act(observations), EPISODES, evaluation_seed)
-    agent.save(folder, loop.shield, evaluation)
-    refer_to_package(folder)
     size = sum(file.stat().st_size for file in folder.iterdir())
     mean = np.mean([each.episode_return for each in evaluation.episodes])
-    violations += sum(each.violation_steps for each in evaluation.episodes)
+    violations = training.violation_steps + sum(each.violation_steps for each in evaluation.episodes)
     return f"{env_id}: return {mean:.2f}, {violations} violating steps, {size / 1e3:.0f} kB"
 
 
@@ -394,25 +388,6 @@ def _row(env_id: str, folder: Path) -> str:
         f"{mean:.2f} ({100.0 * share:.1f} %)" for mean, share in zip(returns.mean(axis=1), overridden, strict=True)
     ]
     return f"| `{env_id}` | {' | '.join(cells)} | {with_interval((returns[0] - returns[1]).tolist(), '+')} |"
-
-
-def refer_to_package(folder: Path) -> None:
-    """Leaves out the copy of the certificate, and has the card say where the package has it."""
-    (folder / "certificate.json").unlink()
-    card = folder / "README.md"
-    text = card.read_text()
-    changes = {
-        "`certificate.json`, SHA-256": "The certificate that `shields.certificate_for` returns, SHA-256",
-        "; `ncs verify certificate.json`": "",
-        "import Certificate\n\nagent = ": 'import certificate_for\n\nenv = gym.make("{env}").unwrapped\nagent = ',
-        'Certificate.load("certificate.json")': "certificate_for(env.plant, env.certificate_contract)",
-        "```python\nfrom agents": "```python\nimport gymnasium as gym\n\nfrom agents",
-    }
-    for old, new in changes.items():
-        if old not in text:
-            raise ValueError(f"the card of {folder} has no {old!r}")
-        text = text.replace(old, new.format(env=f"ncs_gym:ncs_gym/{folder.name}") if "{env}" in new else new)
-    card.write_text(text)
 
 
 TUNED_ARMS = ROOT / "experiments" / "baselines" / "tuned.json"

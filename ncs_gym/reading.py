@@ -10,15 +10,12 @@ import errno
 import json
 import os
 import stat
-from collections.abc import Callable, Iterable
 from typing import Any, BinaryIO
 
 # Bytes of a certificate, a plant, settings, results, an `agent.json` or a page, and values of its JSON.
 LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
-# Bytes of a file of hyperparameters, and values in it once all aliases are written out.
-LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
-# Bytes of a `model.zip`, of all that it unpacks to, and files in it.
-LARGEST_MODEL, MOST_MEMBERS = 256 << 20, 1000
+# Bytes of a `model.zip`.
+LARGEST_MODEL = 256 << 20
 # Bytes of a file of recorded packets, packets of a log with those that were lost, and control steps that they span.
 LARGEST_LOG, MOST_PACKETS, MOST_STEPS = 256 << 20, 2_000_000, 10_000_000
 
@@ -81,27 +78,3 @@ def require_packets(packets: int) -> None:
     """Raises ValueError if a record has too many packets."""
     if packets > MOST_PACKETS:
         raise ValueError(f"a log has at most {MOST_PACKETS:,} packets, with those that were lost; this one {packets:,}")
-
-
-def require_moderate(root: Any, parts: Callable[[Any], Iterable[Any]], most: int = MOST_VALUES) -> None:
-    """Raises ValueError if there are too many values, once what is shared is written out wherever it stands.
-
-    Args:
-        root: The value that holds all others.
-        parts: Returns the values in a value.
-        most: How many there may be.
-    """
-    sizes: dict[int, int] = {}
-
-    def size_of(value: Any) -> int:
-        if id(value) not in sizes:
-            sizes[id(value)] = most + 1  # of one that holds itself
-            sizes[id(value)] = 1 + sum(map(size_of, parts(value)))
-        return sizes[id(value)]
-
-    try:
-        is_moderate = size_of(root) <= most
-    except RecursionError:
-        raise ValueError("its values are too deep in each other") from None
-    if not is_moderate:
-        raise ValueError(f"with its aliases written out it has more than {most:,} values")

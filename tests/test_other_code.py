@@ -1,23 +1,15 @@
-"""Gymnasium's and stable-baselines3's own wrappers and rl-zoo3's trainer, around and inside shields."""
-
-import csv
-import importlib.util
-import re
-import subprocess
-import sys
-from pathlib import Path
+"""Gymnasium's and stable-baselines3's own wrappers around and inside shields."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import wrappers
+from gymnasium.envs.registration import WrapperSpec
 from gymnasium.wrappers import vector
 from stable_baselines3.common.env_util import make_vec_env
 
 from shields import SafetyShield, VectorSafetyShield
-from tests.command import environment
 
-ROOT = Path(__file__).resolve().parent.parent
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 # Steps of an episode, and of runs that need not end.
 STEPS, SOME = 200, 60
@@ -154,7 +146,6 @@ def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificat
 
 
 def wrapped_outside_monitor(keywords, **settings):
-    """What rl-zoo3 does with its env_wrapper and monitor_kwargs."""
     return make_vec_env(
         CRUISE, seed=0, wrapper_class=SafetyShield, wrapper_kwargs=settings, monitor_kwargs={"info_keywords": keywords}
     )
@@ -179,41 +170,17 @@ def test_monitor_inside_the_shield_leaves_out_the_penalty_and_does_not_know_the_
         play_stable_baselines3(env)
 
 
-def test_shield_that_is_a_part_of_the_id_is_inside_monitor(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "examples" / "rl_zoo")
-    env = make_vec_env(
-        "shielded_cruise:ShieldedCruise-v0", seed=0, monitor_kwargs={"info_keywords": ("episode_interventions",)}
+def test_shield_that_is_a_part_of_the_id_is_inside_monitor():
+    cruise, shield = gym.spec(CRUISE), {"mode": "project", "penalty": 0.1}
+    gym.register(
+        id="ShieldedCruise-v0",
+        entry_point=cruise.entry_point,
+        max_episode_steps=cruise.max_episode_steps,
+        additional_wrappers=(WrapperSpec("SafetyShield", "shields:SafetyShield", shield),),
     )
+    env = make_vec_env("ShieldedCruise-v0", seed=0, monitor_kwargs={"info_keywords": ("episode_interventions",)})
+    del gym.registry["ShieldedCruise-v0"]
     rewards, infos = play_stable_baselines3(env)
     assert infos[-1]["episode"]["episode_interventions"] == infos[-1]["episode_interventions"] > 0
     assert infos[-1]["episode"]["r"] == pytest.approx(sum(rewards), abs=1e-3)
     assert env.get_attr("spec")[0].to_json()
-
-
-def zoo(*arguments):
-    command, given = [sys.executable, "-m", *map(str, arguments)], environment(ROOT / "examples" / "rl_zoo")
-    run = subprocess.run(command, capture_output=True, text=True, env=given, timeout=600)
-    assert run.returncode == 0, run.stderr
-    return run.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("rl_zoo3") is None,
-    reason="rl_zoo3 is not installed: pip install --no-deps -r examples/rl_zoo/requirements.txt",
-)
-@pytest.mark.parametrize("name", [CRUISE, "ShieldedCruise-v0"])
-def test_rl_zoo3_trains_with_our_file_and_shield(name, tmp_path):
-    packages = ["--gym-packages", "ncs_gym", "shields", "shielded_cruise"]
-    common = ["--algo", "ppo", "--env", name, *packages, "--seed", 0, "-f", tmp_path, "--num-threads", 1]
-    file = ROOT / "examples" / "rl_zoo" / "ncs.yml"
-    printed = zoo("rl_zoo3.train", *common, "--conf-file", file, "-n", 2048, "--eval-freq", 1000, "--eval-episodes", 1)
-    assert float(re.search(r"safety/\s+\|.*?intervention_rate +\| +([\d.e-]+)", printed, re.DOTALL)[1]) > 0.0
-    assert re.search(r"violation_steps +\| +0 ", printed)
-    (first, *_) = (tmp_path / "ppo").glob("*_1/0.monitor.csv")
-    header, *rows = csv.reader(first.read_text().splitlines()[1:])
-    assert rows
-    assert {row[header.index("episode_violations")] for row in rows} == {"0.0"}
-    assert ("episode_interventions" in header) == (name == "ShieldedCruise-v0")
-    played = zoo("rl_zoo3.enjoy", *common, "--no-render", "-n", 250)
-    assert "Episode Reward" in played

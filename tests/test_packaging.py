@@ -48,10 +48,10 @@ LAYERS = {
         {"silence"},
     ),
     "agents": (
-        {"hyperparams", "pickled_data", "step_info"},
+        {"hyperparams"},
         {"loop", "results", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
-        {"normalization", "sb3_zip", "agent_card"},
+        {"normalization"},
         {"agent"},
         {"training"},
     ),

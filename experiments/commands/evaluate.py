@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
@@ -23,6 +24,9 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields.atomic_write import write_atomically
 
+if TYPE_CHECKING:
+    from agents.agent import Agent
+
 # Budget of `--smoke`.
 _SMOKE = {"episodes": 5}
 
@@ -35,16 +39,17 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.env is not None:
         registered_env(settings.env)
         env_id = id_alone(settings.env)
-    agent, folder = agent_named(str(settings.model), env_id, settings.vec_normalize)
+    model = settings.model
+    is_of_agent = model.name == "model.zip" and model.with_name("agent.json").exists()
+    is_zip = model.suffix == ".zip" and model.is_file() and not is_of_agent
+    agent, folder = _of_zip(settings, env_id) if is_zip else _of_folder(settings, env_id)
     loop = LoopConfig(env=agent.env, kwargs=agent.env_kwargs)
     if settings.between_samples is not None:
         loop = loop.with_kwargs(between_samples=settings.between_samples)
     loop = with_channel(loop, settings.channel)
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
-    from agents.agent import is_sb3_zip  # imports torch
-
-    if settings.shield == "as-trained" and is_sb3_zip(folder):
+    if settings.shield == "as-trained" and is_zip:
         say(
             f"{folder.name} does not say behind which shield and on which channel the agent was trained: no shield and "
             "the channel of the id are used; give --shield and --channel"
@@ -101,6 +106,26 @@ def evaluate(settings: EvaluateSettings) -> None:
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+
+
+def _of_folder(settings: EvaluateSettings, env_id: str | None) -> tuple[Agent, Path]:
+    if settings.algorithm is not None or settings.vec_normalize is not None or settings.trust:
+        raise ValueError(
+            f"--algorithm, --vec-normalize and --trust are for zips of stable-baselines3, not for {settings.model}"
+        )
+    return agent_named(str(settings.model), env_id)
+
+
+def _of_zip(settings: EvaluateSettings, env_id: str | None) -> tuple[Agent, Path]:
+    from agents.agent import load_sb3_zip  # imports torch
+
+    if env_id is None or settings.algorithm is None or settings.vec_normalize is None or not settings.trust:
+        raise ValueError(
+            f"{settings.model} needs --env, --algorithm, --vec-normalize (a file, or none) and --trust, since what is "
+            "pickled in it may run code"
+        )
+    statistics = None if str(settings.vec_normalize) == "none" else settings.vec_normalize
+    return load_sb3_zip(settings.model, env_id, settings.algorithm, statistics), settings.model
 
 
 def _proof_text(arm: dict[str, Any], least: int) -> str:

@@ -65,7 +65,7 @@ class _EpisodeRenderer:
         inner = ncs_env(self._env)
         assert inner.renderer is not None
         inner.renderer.scale = settings.scale or (1 if settings.out.suffix == ".gif" else 2)
-        self._policy = policy_by_name(settings.policy, env_id, inner, settings.seed, settings.vec_normalize)
+        self._policy = policy_by_name(settings.policy, env_id, inner, settings.seed)
         if mode != "none":
             on_unproved = "ignore" if mode == "monitor" else "warn"  # a monitor overrides nothing
             given = {"mode": mode, "horizon": settings.horizon, "on_unproved": on_unproved}

@@ -339,7 +339,7 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
 
 def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
     """Raises what training would raise later if agents cannot be trained with the hyperparameters given."""
-    if settings.hyperparams or settings.conf_file is not None or loop.lagrangian is not None:
+    if settings.hyperparams or loop.lagrangian is not None:
         from agents import training  # imports torch
 
         training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from math import inf
@@ -13,14 +15,14 @@ import gymnasium as gym
 from cloudpickle import dumps
 from tyro.constructors import PrimitiveConstructorSpec
 
-from agents.hyperparams import literal, with_changes
+from agents.hyperparams import with_changes
 from ncs_gym.reading import read_file
 from ncs_gym.validation import shown
 from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
 def _assignments(texts: list[str]) -> dict[str, Any]:
-    """Returns the values by name: Python's numbers, lists, dictionaries, True, False and None; otherwise the text."""
+    """Returns the values by name, each a JSON value or a word such as `lin_0.003`."""
     found: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -28,8 +30,20 @@ def _assignments(texts: list[str]) -> dict[str, Any]:
             raise ValueError(f"expected NAME=VALUE, such as gamma=0.99, got {shown(text)}")
         if name in found:
             raise ValueError(f"{name} is given twice")
-        found[name] = literal(value)
+        found[name] = _value(name, value)
     return found
+
+
+def _value(name: str, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        if not re.fullmatch(r"[\w.+-]+", text):
+            raise ValueError(
+                f"expected {name}=VALUE with a word or a JSON value, such as 0.99, true or '{{\"net_arch\": [64]}}', "
+                f"got {shown(text)}"
+            ) from None
+        return text
 
 
 Assignments = Annotated[
@@ -39,7 +53,7 @@ Assignments = Annotated[
         metavar="[NAME=VALUE [NAME=VALUE ...]]",
         instance_from_str=_assignments,
         is_instance=lambda value: isinstance(value, dict),
-        str_from_instance=lambda values: [f"{name}={value}" for name, value in values.items()],
+        str_from_instance=lambda values: [f"{name}={json.dumps(value)}" for name, value in values.items()],
     ),
 ]
 
@@ -66,14 +80,14 @@ def registration_of(env_id: str) -> str:
 def beside_those_of_file(settings: Any, of_file: Any) -> Any:
     """Returns a command's settings in which the assignments of a settings file hold where none are given.
 
-    Hyperparameters of the file are for its algorithm alone, and give way to a file of hyperparameters.
+    Hyperparameters of the file are for its algorithm alone.
     """
     merged = {
         name: with_changes(getattr(of_file, name), getattr(settings, name))
         for name in ("channel", "hyperparams")
         if hasattr(settings, name)
     }
-    if "hyperparams" in merged and (settings.algo != of_file.algo or settings.conf_file is not None):
+    if "hyperparams" in merged and settings.algo != of_file.algo:
         merged["hyperparams"] = {} if settings.hyperparams == of_file.hyperparams else settings.hyperparams
     return replace(settings, **merged)
 

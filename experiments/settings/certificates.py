@@ -323,8 +323,7 @@ class RenderSettings:
         out: File to write: .gif, .mp4, or .png for the last frame alone.
         policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
             "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
-            package), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
-        vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
+            package), or the folder of a trained agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
@@ -341,7 +340,6 @@ class RenderSettings:
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Path = Path("episode.gif")
     policy: str = "greedy"
-    vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None
     side_by_side: bool = False

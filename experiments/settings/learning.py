@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import tyro
 
-from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
+from agents.hyperparams import DEFAULTS, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
 from experiments.baselines import MARGINS
 from experiments.settings.arguments import (
@@ -95,9 +95,8 @@ class LearningSettings(BackendSettings):
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter and send_period [steps], quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
-            n_steps=64 "policy_kwargs=dict(net_arch=[64, 64])". What is not given is tuned for the environment
-            (agents/tuned), or the default.
-        conf_file: File of hyperparameters by environment, YAML or JSON, like those of rl-zoo3.
+            n_steps=64 'policy_kwargs={"net_arch": [64, 64]}', JSON values. What is not given is tuned for the
+            environment (agents/tuned), or the default.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
         smoke: Run a short version, whatever else is asked for, to see that everything works; unless `--out`
             names another folder than the usual one, in that with -smoke at the end of its name.
@@ -119,20 +118,14 @@ class LearningSettings(BackendSettings):
     between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
-    conf_file: Path | None = None
     lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
     smoke: bool = False
     force: bool = False
 
     @property
     def all_hyperparams(self) -> dict[str, Any]:
-        """All hyperparameters of the algorithm: those given, those of the file, those tuned, the defaults.
-
-        Raises:
-            ValueError: If the file is damaged, or has none for the environment.
-            OSError: If the file cannot be read.
-        """
-        given, env_id = self._given_hyperparams, id_alone(self.env)
+        """All hyperparameters of the algorithm: those given, those tuned, the defaults."""
+        given, env_id = self.hyperparams, id_alone(self.env)
         tuned = None if given.keys() >= DEFAULTS[self.algo].keys() else tuned_hyperparams(env_id, self.algo)
         found = with_changes(with_changes(DEFAULTS[self.algo], tuned or {}), given)
         return {name: value for name, value in found.items() if name != "n_timesteps"}
@@ -146,7 +139,7 @@ class LearningSettings(BackendSettings):
         """
         if self.steps is not None:
             return self.steps
-        steps = self._given_hyperparams.get("n_timesteps", tuned_steps(id_alone(self.env), self.algo) or _DEFAULT_STEPS)
+        steps = self.hyperparams.get("n_timesteps", tuned_steps(id_alone(self.env), self.algo) or _DEFAULT_STEPS)
         if type(steps) not in (int, float) or not 1 <= steps < 1e15 or steps != int(steps):
             raise ValueError(f"n_timesteps must be a whole number >= 1, got {shown(steps)}")
         return int(steps)
@@ -154,7 +147,7 @@ class LearningSettings(BackendSettings):
     @property
     def agent_line(self) -> str:
         """One line with all hyperparameters of the algorithm and where they come from."""
-        found, given = self.all_hyperparams, self._given_hyperparams.keys() - {"n_timesteps"}
+        found, given = self.all_hyperparams, self.hyperparams.keys() - {"n_timesteps"}
         is_tuned = tuned_hyperparams(id_alone(self.env), self.algo) is not None
         source = f"hyperparameters tuned for {id_alone(self.env)}" if is_tuned else "default hyperparameters"
         if given == found.keys():
@@ -166,13 +159,7 @@ class LearningSettings(BackendSettings):
     @property
     def completed(self) -> Self:
         """The same settings with the steps and all hyperparameters given, for settings.json."""
-        return replace(self, steps=self.training_steps, hyperparams=self.all_hyperparams, conf_file=None)
-
-    @property
-    def _given_hyperparams(self) -> dict[str, Any]:
-        """Hyperparameters of the command line, and those of the file."""
-        of_file = {} if self.conf_file is None else read_hyperparams(self.conf_file, id_alone(self.env))
-        return with_changes(of_file, self.hyperparams)
+        return replace(self, steps=self.training_steps, hyperparams=self.all_hyperparams)
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
@@ -252,11 +239,13 @@ class EvaluateSettings:
 
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`; or the zip that `model.save` of stable-baselines3 wrote, with --env; or "pretrained", for the
-            agent of --env that comes with the package.
+            `ncs train`; or "pretrained", for the agent of --env that comes with the package; or the zip that
+            `model.save` of stable-baselines3 wrote, with --env, --algorithm, --vec-normalize and --trust.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
-        vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, of which numbers alone
-            are read; "none" if the agent saw observations as they are and a file of that kind lies beside it.
+        algorithm: Algorithm of a zip.
+        vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, or "none" if the agent
+            saw observations as they are.
+        trust: Load a zip and its statistics although they may run code.
         shield: Mode of the shield, by default that of the agent's training, which a zip does not tell: none then;
             "none" for no shield; "monitor" changes nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
@@ -275,7 +264,9 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
+    algorithm: Algorithm | None = None
     vec_normalize: Path | None = None
+    trust: bool = False
     shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
     horizon: int | None = None
     least_safe_steps: int = 0

@@ -20,7 +20,7 @@ FORMAT = "ncs-gym settings 1"
 # Settings that results do not depend on.
 INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)
 # Settings of one call, which a file neither keeps nor gives: files outside the output folder are the user's to name.
-_OF_THE_CALL = ("config", "conf_file", "force", "page", "quote")
+_OF_THE_CALL = ("config", "force", "page", "quote")
 # Where runs are executed is kept in a file and not taken from it: a file of others must not connect to a cluster.
 _OF_THE_MACHINE = ("engine", "ray_address", "ray_wait", "cpus_per_run", "gpus_per_run")
 

@@ -129,8 +129,8 @@ def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_an
     theirs = episodes(DummyVecEnv([lambda: gym.make("ncs_gym/TruckTrailer-v0", **made)] * 2))
     assert theirs == [(0.5, 4), (0.3, 1), (0.3, 1), (0.3, 1)]
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
-        ours = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, autoreset_mode=mode, **made))
-        assert episodes(ours) == theirs
+        vector = gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, autoreset_mode=mode, **made)
+        assert episodes(SB3VecEnv(vector, info_keywords=("channel_loss",))) == theirs
 
 
 @pytest.mark.parametrize("kind", ["SubprocVecEnv", "AsyncVectorEnv"])
@@ -154,7 +154,7 @@ def test_what_is_drawn_from_changes_in_worker_processes_too(kind):
 def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_infos_of_their_starts_say_so(mode):
     envs = gym.make_vec(ID, num_envs=2, max_episode_steps=4, autoreset_mode=mode)
     draws = VectorRandomChannel(envs, [Channel(loss=0.1)])
-    env = SB3VecEnv(draws)
+    env = SB3VecEnv(draws, info_keywords=("channel_loss",))
     env.seed(0)
     env.reset()
     draws.draw_from(lambda rng: {"loss": 0.5})

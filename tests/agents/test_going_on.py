@@ -187,4 +187,3 @@ def test_agent_trained_behind_a_filter_says_so_in_its_files(loop, tmp_path):
     filtered = LoopConfig(env=CRUISE, filter=partial(VectorSafetyShield, certificate=loop.shield.certificate))
     train(filtered, 128, 0, hyperparams=SMALL).agent.save(tmp_path)
     assert Agent.load(tmp_path).is_filtered
-    assert "| filter | one that these files do not keep |" in (tmp_path / "README.md").read_text()

@@ -1,15 +1,18 @@
-"""Hyperparameters: those tuned for each environment, and those of a file."""
+"""Hyperparameters: those tuned for each environment, and the activation functions of networks."""
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from torch import nn
 
 import agents
-from agents import read_hyperparams, tuned_hyperparams, tuned_steps
-from agents.hyperparams import DEFAULTS, complete_hyperparams, literal, with_changes
+from agents import Agent, AgentError, LoopConfig, tuned_hyperparams, tuned_steps, untrained
+from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from ncs_gym.registration import ENVIRONMENTS, needing_extras, registered_ids
 
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 # Those of the three have the defaults: none were sought.
 DEFAULT = {
     f"ncs_gym/{name}-v0" for name in ("CSTR", "Convoy", "ConvoyOnRequest", "LaneKeeping", "LaneKeepingOnRequest")
@@ -50,37 +53,52 @@ def test_discount_of_the_cart_pole_sees_farther_than_a_fifth_of_a_second():
     assert 0.02 / (1.0 - tuned_hyperparams("ncs_gym/CartPole-v0")["gamma"]) > 0.5
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("mine.yml", "A-v0:\n  n_envs: 8\n  n_timesteps: !!float 1e5\n  policy_kwargs: dict(net_arch=[64, 64])\n"),
-        ("mine.json", '{"A-v0": {"n_envs": 8, "n_timesteps": 1e5, "policy_kwargs": {"net_arch": [64, 64]}}}'),
-    ],
-)
-def test_file_like_those_of_rl_zoo3_is_read(name, text, tmp_path):
-    (tmp_path / name).write_text(text)
-    found = read_hyperparams(tmp_path / name, "A-v0")
-    assert found == {"n_envs": 8, "n_timesteps": 100_000, "policy_kwargs": {"net_arch": [64, 64]}}
-    with pytest.raises(ValueError, match="has no hyperparameters for B-v0, nor for default"):
-        read_hyperparams(tmp_path / name, "B-v0")
-
-
-@pytest.mark.parametrize(("name", "text"), [("m.json", "{"), ("m.yml", "{"), ("m.yml", "!!python/name:os.system")])
-def test_damaged_file_is_one_sentence_and_runs_nothing(name, text, tmp_path):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match="are damaged: ") as caught:
-        read_hyperparams(tmp_path / name, "A-v0")
-    assert "\n" not in str(caught.value)
-
-
-def test_text_that_calls_something_stays_a_text():
-    for text in ("dict(a=print(1))", "exec('1')", "dict([1])", "lin_0.1", "{1, 2}", "1e999"):
-        assert literal(text) == text
-
-
 def test_part_of_the_networks_arguments_may_be_changed():
     changed = with_changes(DEFAULTS["PPO"], {"gamma": 0.99, "policy_kwargs": {"net_arch": [8]}})
     expected = {"gamma": 0.99, "policy_kwargs": {"net_arch": [8], "log_std_init": -0.7}}
     assert changed == DEFAULTS["PPO"] | expected
     assert complete_hyperparams("PPO", expected) == changed
     assert DEFAULTS["PPO"]["policy_kwargs"]["net_arch"] == [64, 64]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("nn.ReLU", nn.ReLU), ("GELU", nn.GELU)])
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+def test_activation_function_is_that_of_torch_and_survives_the_files(name, kind, algorithm, tmp_path):
+    policy = {"net_arch": [8], "activation_fn": name}
+    agent = untrained(
+        LoopConfig(env=CRUISE),
+        algorithm=algorithm,
+        seed=0,
+        hyperparams={"policy_kwargs": policy},
+    )
+    assert any(isinstance(module, kind) for module in agent.model.policy.modules())
+    agent.save(tmp_path)
+    again = Agent.load(tmp_path)
+    observations = np.random.default_rng(0).standard_normal((5, 3))
+    np.testing.assert_array_equal(again.act(observations), agent.act(observations))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "nn.Linear",
+        "nn.Module",
+        "os.system",
+        "nn.modules",
+        "nn.__doc__",
+        "",
+        "GLU",
+        "nn.Softmax2d",
+        3,
+        "nn.MultiheadAttention",
+    ],
+)
+def test_what_is_no_activation_function_is_named(name):
+    with pytest.raises(ValueError, match="no activation function") as caught:
+        untrained(
+            LoopConfig(env=CRUISE),
+            seed=0,
+            hyperparams={"policy_kwargs": {"activation_fn": name}},
+        )
+    assert "\n" not in str(caught.value)
+    assert not isinstance(caught.value, AgentError)

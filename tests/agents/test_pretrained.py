@@ -1,11 +1,14 @@
 """The agents that come with the package: one for every id, small, and safe behind the shield of its certificate."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from agents import AgentError, LoopConfig, ShieldSettings, evaluate, pretrained, pretrained_folder
+from benchmarks.learning import PACKAGE_SEED, seeds_of
 from ncs_gym.registration import ENVIRONMENTS
 from shields import certificate_for
 from tests.command import succeeded
@@ -22,14 +25,14 @@ def folder_of(env_id):
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_every_id_has_a_small_agent_with_its_card(env_id):
+def test_every_id_has_a_small_agent_that_says_how_it_was_trained(env_id):
     files = {file.name: file.stat().st_size for file in folder_of(env_id).iterdir()}
-    assert files.keys() == {"model.zip", "agent.json", "README.md"}
+    assert files.keys() == {"model.zip", "agent.json"}
     assert sum(files.values()) < LARGEST
-    card = (folder_of(env_id) / "README.md").read_text()
-    assert f"`{env_id}`" in card
-    assert "stable-baselines3 2" in card
-    assert "violating steps: 0 of 40,000" in card
+    document = json.loads((folder_of(env_id) / "agent.json").read_text())
+    assert (document["env"], document["algorithm"]) == (env_id, "PPO")
+    assert document["seed"] == seeds_of(PACKAGE_SEED, 0)[0]
+    assert document["versions"]["stable-baselines3"].startswith("2.")
 
 
 @pytest.mark.cases(5)
@@ -39,7 +42,6 @@ def test_every_agent_keeps_its_plant_safe_behind_its_shield(env_id):
         pytest.skip(f"{env_id} needs {ENVIRONMENTS[env_id].extra}")
     env = gym.make(env_id).unwrapped
     certificate, agent = certificate_for(env.plant, env.certificate_contract), pretrained(env_id)
-    assert certificate.checksum in (folder_of(env_id) / "README.md").read_text()
     assert (agent.env, agent.channel, agent.shield_mode) == (env_id, None, "project")
     loop = LoopConfig(env=env_id, shield=ShieldSettings(certificate, "project", on_unproved="raise"))
     episode = evaluate(loop, lambda observations, infos: agent.act(observations), 1, seed=0).episodes[0]

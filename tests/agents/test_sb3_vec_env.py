@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -59,7 +60,7 @@ def test_gymnasiums_sync_environment_is_stepped_exactly_like_stable_baselines3s_
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_our_vector_environment_loses_no_transition(mode):
     vector = gym.make_vec("ncs_gym/CartPole-v0", num_envs=30, max_episode_steps=60, autoreset_mode=mode)
-    env = SB3VecEnv(vector)
+    env = SB3VecEnv(vector, info_keywords=("cost", "estimate"))
     env.seed(0)
     observation = env.reset()
     rng, ends, cuts, steps = np.random.default_rng(1), 0, 0, np.zeros(30, int)
@@ -132,7 +133,7 @@ def test_options_reach_the_environment_once():
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_sums_over_the_infos_are_those_over_the_arrays(mode):
     shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20, autoreset_mode=mode))
-    env = SB3VecEnv(shield)
+    env = SB3VecEnv(shield, info_keywords=SUMMED)
     env.reset()
     sums, arrays, ends = dict.fromkeys(SUMMED, 0.0), dict.fromkeys(SUMMED, 0.0), 0
     for _ in range(60):
@@ -141,7 +142,8 @@ def test_sums_over_the_infos_are_those_over_the_arrays(mode):
         for key in SUMMED:
             sums[key] += sum(info.get(key, 0) for info in infos)
             arrays[key] += env.batch_info[key].sum()
-        assert all(env.batch_info.keys() - {"final_obs", "final_info"} >= info.keys() - ENDS for info in infos)
+        ends_too = (*SUMMED, "TimeLimit.truncated", *ENDS)
+        assert all(info.keys() == set(ends_too if done[0] else ends_too[: len(SUMMED) + 1]) for info in infos)
     assert sums == arrays
     assert ends == 9
     assert sums["shield_intervened"] > 20
@@ -149,7 +151,31 @@ def test_sums_over_the_infos_are_those_over_the_arrays(mode):
 
 
 SUMMED = "cost", "shield_intervened", "shield_correction", "shield_guaranteed", "packet_arrived", "contract_broken"
-ENDS = {"episode", "terminal_observation", "TimeLimit.truncated"}
+ENDS = "episode", "terminal_observation", "episode_violations", "is_success", "episode_guaranteed"
+
+
+def test_infos_of_a_step_are_plain_dictionaries_of_what_callbacks_read():
+    env = SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3)))
+    env.reset()
+    infos = env.step(np.ones((3, 1), np.float32))[3]
+    shields = {"shield_intervened", "shield_correction", "shield_guaranteed"}
+    assert all(type(info) is dict and info.keys() == {"TimeLimit.truncated", "cost", *shields} for info in infos)
+    assert [info["shield_correction"] for info in infos] == env.batch_info["shield_correction"].tolist()
+    assert json.loads(json.dumps(infos)) == infos
+    with pytest.raises(ValueError, match="info_keywords must be names of infos, such as"):
+        SB3VecEnv(env.vector_env, info_keywords="cost")
+
+
+def test_infos_that_are_arrays_are_of_their_environment_and_step():
+    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3), info_keywords=("state",))
+    env.reset()
+    seen = []
+    for _ in range(3):
+        infos = env.step(np.ones((3, 1), np.float32))[3]
+        seen += [(info["state"], info["state"].copy()) for info in infos]
+        np.testing.assert_array_equal([info["state"] for info in infos], env.batch_info["state"])
+    for state, then in seen:
+        np.testing.assert_array_equal(state, then)
 
 
 def test_infos_of_arrays_that_are_written_over_are_those_of_their_step():
@@ -171,7 +197,7 @@ def test_infos_of_arrays_that_are_written_over_are_those_of_their_step():
                 {"count": self.count},
             )
 
-    env = SB3VecEnv(Reused())
+    env = SB3VecEnv(Reused(), info_keywords=["count"])
     env.reset()
     infos = [env.step(np.zeros((2, 1)))[3] for _ in range(3)]
     assert [info["count"] for _, info in infos] == [1.0, 2.0, 3.0]
@@ -191,7 +217,7 @@ def test_last_infos_of_sync_environments_are_complete_when_all_end_at_once():
         wrappers=[Extra],
         vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
     )
-    env = SB3VecEnv(vector)
+    env = SB3VecEnv(vector, info_keywords=("k",))
     env.seed(0)
     env.reset()
     for step in range(1, 9):
@@ -280,7 +306,7 @@ def test_evaluate_policy_counts_episodes_by_its_infos():
 
 
 def test_actions_are_those_that_were_handed_over_whatever_is_written_into_them_later():
-    env = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2))
+    env = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2), info_keywords=("input",))
     env.reset()
     actions = np.full((2, 1), 0.25, np.float32)
     env.step_async(actions)
@@ -337,23 +363,25 @@ class Laps(gym.Env):
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_infos_are_those_that_each_environment_reported(mode, nested):
     makes = [lambda: Laps(2, nested), lambda: Laps(3, nested)]
-    ours, theirs = SB3VecEnv(gym.vector.SyncVectorEnv(makes, autoreset_mode=mode)), DummyVecEnv(makes)
+    names = ("final_distance", "scale", "terms", "lap_time", "end")
+    ours = SB3VecEnv(gym.vector.SyncVectorEnv(makes, autoreset_mode=mode), info_keywords=names)
+    theirs = DummyVecEnv(makes)
     ours.reset(), theirs.reset()
     ends = 0
     for _ in range(40):
         for mine, expected in zip(ours.step(np.zeros((2, 1)))[3], theirs.step(np.zeros((2, 1)))[3], strict=True):
             ends += "terminal_observation" in expected
             assert {key: mine[key] for key in mine if key != "episode"} == expected
-        assert [dict(each) for each in ours.reset_infos] == theirs.reset_infos
+        assert ours.reset_infos == theirs.reset_infos
     assert ends > 6
 
 
 def test_methods_are_called_of_the_environments_asked_for():
-    sync = SB3VecEnv(gym.vector.SyncVectorEnv([lambda: Laps(2)] * 3))
+    sync = SB3VecEnv(gym.vector.SyncVectorEnv([lambda: Laps(2)] * 3), info_keywords=("scale",))
     sync.reset()
     assert sync.env_method("set_scale", 5.0, indices=[1]) == [5.0]
     assert [info["scale"] for info in sync.step(np.zeros((3, 1)))[3]] == [1.0, 5.0, 1.0]
-    several = SB3VecEnv(gym.vector.AsyncVectorEnv([lambda: Laps(2)] * 2))
+    several = SB3VecEnv(gym.vector.AsyncVectorEnv([lambda: Laps(2)] * 2), info_keywords=("scale",))
     several.reset()
     with pytest.raises(ValueError, match="calls methods of all its environments"):
         several.env_method("set_scale", 5.0, indices=[1])

@@ -1,13 +1,9 @@
 """Small files and messages that would take memory or time without bound; each is refused before it is expanded."""
 
-import base64
-import io
 import json
 import os
-import pickle
 import re
 import tracemalloc
-import zipfile
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -17,7 +13,6 @@ import pytest
 from ncs_gym import Ellipsoid, LinearPlant, PacketLog, Remainder, TraceChannel, truck_trailer
 from ncs_gym.reading import (
     LARGEST_DOCUMENT,
-    LARGEST_HYPERPARAMS,
     LARGEST_LOG,
     MOST_PACKETS,
     MOST_VALUES,
@@ -67,7 +62,6 @@ def endless(request, tmp_path):
 
 
 def readers():
-    from agents.hyperparams import read_hyperparams
     from experiments.settings import CompareSettings, config_defaults
 
     return {
@@ -76,12 +70,11 @@ def readers():
         "plant": LinearPlant.load,
         "certificate": Certificate.load,
         "packets": PacketLog.load,
-        "hyperparameters": lambda path: read_hyperparams(path, "ncs_gym/CSTR-v0"),
         "settings": lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings),
     }
 
 
-NAMES = ["bytes", "text", "plant", "certificate", "packets", "hyperparameters", "settings"]
+NAMES = ["bytes", "text", "plant", "certificate", "packets", "settings"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -163,280 +156,6 @@ def test_contracts_of_a_long_record_take_few_rows():
         assert len(broken_contracts(np.zeros_like(ages), 0.1)) == 1
 
 
-LAUGHS = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]\n" + "".join(
-    f"{new}: &{new} [{', '.join(10 * ['*' + old])}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
-)
-MERGED = "a: &a {x0: 1, x1: 1}\n" + "".join(
-    f"{new}: &{new} {{<<: [*{old}, *{old}]}}\n"
-    for old, new in zip("abcdefghijklmnopqrstuv", "bcdefghijklmnopqrstuvw", strict=True)
-)
-
-
-@pytest.mark.parametrize("text", [LAUGHS, MERGED, "a: &a [*a]\n"], ids=["laughs", "merged", "in itself"])
-def test_yaml_that_expands_is_refused(text, write):
-    from agents.hyperparams import read_hyperparams
-
-    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
-        read_hyperparams(write("laughs.yml", text), "default")
-
-
-@pytest.mark.parametrize("number", [f"1{20_000 * ':1'}", f"!!float '1{20_000 * ':1'}.5'", 20_000 * "9"])
-def test_numbers_of_yaml_are_of_moderate_length(number, write):
-    from agents.hyperparams import read_hyperparams
-
-    with little_memory(), pytest.raises(ValueError, match="are damaged: it has a number of more than 1,000 letters"):
-        read_hyperparams(write("long.yml", f"default:\n  gamma: {number}\n"), "default")
-
-
-def test_yaml_with_moderate_aliases_is_read(write):
-    from agents.hyperparams import read_hyperparams
-
-    text = "common: &common {gamma: 0.9, n_envs: 4}\ndefault:\n  <<: *common\n  n_envs: 8\n"
-    assert read_hyperparams(write("zoo.yml", text), "default") == {"gamma": 0.9, "n_envs": 8}
-    with pytest.raises(OSError, match=f"{LARGEST_HYPERPARAMS:,} bytes"):
-        read_hyperparams(write("long.yml", text + "#" * LARGEST_HYPERPARAMS), "default")
-
-
-HUGE = [
-    {"policy_kwargs": {"net_arch": [12_000, 12_000]}},
-    {"policy_kwargs": {"net_arch": {"pi": [64], "vf": [12_000, 12_000]}}},
-    {"policy_kwargs": {"net_arch": [{"pi": [12_000, 12_000], "vf": [64]}]}},
-    {"policy_kwargs": {"net_arch": {"pi": [64], "qf": [12_000, 12_000]}}},
-    {"policy_kwargs": {"net_arch": [10**9]}},
-    {"policy_kwargs": {"net_arch": [64] * 100_000}},
-    {"policy_kwargs": {"n_critics": 10**9}},
-    {"policy_kwargs": {"n_quantiles": 10**9}},
-    {"policy_kwargs": {"net_arch": [1024, 1024], "n_critics": 100}},
-    {"buffer_size": 10**12},
-    {"n_envs": 10**9},
-    {"n_envs": 10_000, "n_steps": 10_000},
-]
-
-
-@pytest.mark.cases(5)
-@pytest.mark.parametrize("hyperparams", HUGE, ids=[json.dumps(each)[:50] for each in HUGE])
-def test_hyperparameters_that_take_much_memory_are_refused(hyperparams):
-    from agents.hyperparams import complete_hyperparams
-
-    algorithm = "TQC" if {"n_critics", "n_quantiles"} & hyperparams.get("policy_kwargs", {}).keys() else "PPO"
-    algorithm = "SAC" if "buffer_size" in hyperparams else algorithm
-    with little_memory(), pytest.raises(ValueError, match=r"at most|may have|numbers of"):
-        complete_hyperparams(algorithm, hyperparams)
-
-
-def test_networks_of_usual_sizes_are_taken():
-    from agents.hyperparams import complete_hyperparams
-
-    for arch in ([64, 64], [400, 300], [1024, 1024], {"pi": [256, 256], "qf": [512, 512]}, [{"pi": [64], "vf": []}]):
-        for algorithm in ("PPO", "SAC"):
-            complete_hyperparams(algorithm, {"policy_kwargs": {"net_arch": arch}})
-
-
-def forged(folder, hyperparams):
-    """A folder with the agent.json of a pretrained agent, other hyperparameters and a checksum that fits."""
-    from agents.agent_file import document_of, pretrained_folder
-
-    source = pretrained_folder("ncs_gym/CSTR-v0")
-    content = json.loads((source / "agent.json").read_text())["agent"]
-    (folder / "agent.json").write_bytes(document_of(content | {"hyperparams": hyperparams}))
-    (folder / "model.zip").write_bytes((source / "model.zip").read_bytes())
-    return folder
-
-
-@pytest.mark.parametrize("arch", [[12_000, 12_000], [{"pi": [12_000, 12_000], "vf": [12_000, 12_000]}]])
-def test_agent_of_large_networks_is_refused_before_they_are_made(arch, tmp_path):
-    pytest.importorskip("stable_baselines3")
-    from agents import Agent, AgentError
-
-    folder = forged(tmp_path, {"policy_kwargs": {"net_arch": arch}})
-    with little_memory(), pytest.raises(AgentError, match="weights"):
-        Agent.load(folder)
-
-
-def zipped(members):
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            with archive.open(name, "w") as file:
-                for piece in content:
-                    file.write(piece)
-    return buffer.getvalue()
-
-
-def bomb(mebibytes=300):
-    return zipped({"data": [bytes(1 << 20)] * mebibytes})
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("kind", ["outside", "inside", "many", "together", "entries inside"])
-def test_zip_that_unpacks_to_much_is_refused(kind, write):
-    pytest.importorskip("stable_baselines3")
-    from agents import AgentError
-    from agents.sb3_zip import parameters_of, read_model
-
-    content = {
-        "outside": bomb,
-        "inside": lambda: zipped({"data": [b"{}"], "policy.pth": [bomb()]}),
-        "many": lambda: zipped({f"{i}": [b""] for i in range(1001)}),
-        "together": lambda: zipped({"data": [b"{}"]} | {f"{i}.pth": [bomb(10)] for i in range(30)}),
-        "entries inside": lambda: zipped({"data": [b"{}"], "policy.pth": [100_000 * (b"PK\1\2" + bytes(42))]}),
-    }[kind]()
-    assert len(content) < 1 << 20
-    with little_memory(), pytest.raises(ValueError, match="unpacks to more than"):
-        parameters_of(content)
-    if kind in ("outside", "many"):
-        with little_memory(), pytest.raises(AgentError, match="unpacks to more than"):
-            read_model(write("agent.zip", content))
-
-
-def test_zips_in_zips_in_zips_are_not_unpacked():
-    from agents.sb3_zip import parameters_of
-
-    within = zipped({})
-    for _ in range(2):
-        within = zipped({f"{i}.pth": [within] for i in range(300)})
-    with little_memory(), pytest.raises(ValueError, match="unpacks to more than"):
-        parameters_of(within)
-
-
-def weights(state, change=lambda name, content: content):
-    """A `policy.pth` with some state in a zip, whose files are changed."""
-    import torch
-
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    with zipfile.ZipFile(buffer) as archive:
-        inner = zipped({name: [change(name, archive.read(name))] for name in archive.namelist()})
-    return zipped({"policy.pth": [inner]})
-
-
-def test_weights_are_read_as_torch_reads_them():
-    torch = pytest.importorskip("torch")
-    from agents.sb3_zip import parameters_of
-
-    layers = [torch.nn.Linear(3, 4), torch.nn.BatchNorm1d(4), torch.nn.Linear(4, 1, dtype=torch.float64)]
-    net = torch.nn.Sequential(*layers)
-    optimizer = torch.optim.Adam(net[:2].parameters())
-    net[:2](torch.ones(2, 3)).sum().backward()
-    optimizer.step()
-    for state in (net.state_dict(), optimizer.state_dict()):
-        read = parameters_of(weights(state))["policy"]
-        assert str(read) == str(dict(state))
-    net.load_state_dict(parameters_of(weights(net.state_dict()))["policy"])
-
-
-@pytest.mark.parametrize("kind", ["expanded", "shared", "part", "turned", "half", "doubled", "called", "hashed"])
-def test_weights_take_no_more_memory_than_their_files(kind):
-    torch = pytest.importorskip("torch")
-    from agents.sb3_zip import parameters_of
-
-    numbers = torch.zeros(4, 4)
-    hashed = b"\x80\x02}" + pickle.dumps(shared_tuples(), 2)[2:-1] + b"Ns."
-    called = b"\x80\x02c__builtin__\nbytearray\nJ\xff\xff\xff\x7f\x85R."
-    state = {
-        "expanded": torch.zeros(1).expand(10**9),
-        "shared": [numbers.view(16), numbers],
-        "part": numbers[1:],
-        "turned": torch.zeros(4, 5).T,
-        "half": numbers.half(),
-        "doubled": [numbers] * 2,
-    }.get(kind)
-    data = {"hashed": hashed, "called": called}.get(kind)
-    content = weights(state, lambda name, old: data if data and name.endswith("data.pkl") else old)
-    with little_memory():
-        if kind == "called":
-            assert parameters_of(content)["policy"].arguments == (2**31 - 1,)
-            return
-        with pytest.raises(ValueError, match=r"no array of its own|aliases written out"):
-            parameters_of(content)
-
-
-def shared_tuples():
-    value = ()
-    for _ in range(40):
-        value = (value, value)
-    return value
-
-
-def of_numpy(shape):
-    """A pickled array that says that it has this shape."""
-    return pickle.dumps(np.zeros(3), 4).replace(b"K\x03\x85", shape, 1)
-
-
-LONG_NAME = b"\x8c\xf0" + 240 * b"a"
-BIG = b"\x8b" + (2000).to_bytes(4, "little") + 2000 * b"\x7f"
-PICKLES = {
-    "name of tuples": pickle.dumps(shared_tuples(), 4)[:-1] + b"\x8c\x01x\x93.",
-    "long name": b"\x80\x04" + LONG_NAME + LONG_NAME + b"\x93.",
-    "name in a line": b"\x80\x04c" + 500_000 * b"a" + b"\nb\n.",
-    "name for a terminal": b"\x80\x04cos\n\x1b[2J\n.",
-    "number in a line": b"\x80\x04I" + 500_000 * b"a" + b"\n.",
-    "large number": b"\x80\x04" + BIG + b".",
-    "arguments of letters": b"\x80\x04ca\nb\nX" + (1 << 20).to_bytes(4, "little") + (1 << 20) * b"a" + b"R.",
-}
-
-
-@pytest.mark.parametrize("kind", PICKLES)
-def test_pickles_that_expand_are_refused_in_a_short_sentence(kind, write):
-    pytest.importorskip("stable_baselines3")
-    from agents import AgentError
-    from agents.normalization import read_statistics
-
-    path = write("v.pkl", PICKLES[kind])
-    with little_memory(), pytest.raises(AgentError, match="no pickle that is read here") as caught:
-        read_statistics(path)
-    assert len(str(caught.value)) < 300 + len(str(path))
-    assert str(caught.value).isprintable()
-
-
-def test_arguments_that_pickles_share_are_not_copied():
-    from agents.pickled_data import pickled_data
-
-    calls = 20_000 * b"ca\nb\nh\x00R"
-    with little_memory():
-        pickled_data(b"\x80\x04(" + 20_000 * b"N" + b"t\x94(" + calls + b"t.")
-
-
-@pytest.mark.parametrize("shape", [b"(" + 50_000 * b"J\xff\xff\xff\x7f" + b"t", b"\x8a\xff" + 255 * b"\x7f" + b"\x85"])
-def test_arrays_of_many_or_large_sizes_are_refused_before_these_are_multiplied(shape):
-    from agents.pickled_data import array_of, pickled_data
-
-    value = pickled_data(of_numpy(shape))
-    with little_memory(), pytest.raises(ValueError, match="array of another kind"):
-        array_of(value)
-
-
-def test_pickles_whose_parts_share_others_take_little_time_and_memory():
-    from agents.pickled_data import parts_of, pickled_data
-    from ncs_gym.reading import require_moderate
-
-    shared, keys = [], shared_tuples()
-    for _ in range(40):
-        shared = [shared, shared]
-    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
-        require_moderate(pickled_data(pickle.dumps(shared)), parts_of)
-    with little_memory(), pytest.raises(ValueError, match="aliases written out"):
-        pickled_data(b"\x80\x03}" + pickle.dumps(keys, 3)[2:-1] + b"Ns.")  # None by these keys
-
-
-@pytest.mark.cases(2)
-@pytest.mark.parametrize("operation", [b"}", b"]", b"\x8f", b"(", b"N"], ids=repr)
-def test_pickles_of_many_objects_are_refused_before_they_are_made(operation, write):
-    pytest.importorskip("stable_baselines3")
-    from agents import AgentError
-    from agents.normalization import read_statistics
-    from agents.sb3_zip import read_model
-
-    pickled = b"\x80\x04" + (8 << 20) * operation + b"."
-    entry = {":serialized:": base64.b64encode(pickled).decode()}
-    path = write("agent.zip", zipped({"data": [json.dumps({"policy_class": entry}).encode()]}))
-    assert path.stat().st_size < 1 << 16
-    with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
-        read_model(path)
-    with little_memory(), pytest.raises(AgentError, match="more than 100,000 operations"):
-        read_statistics(write("v.pkl", pickled))
-
-
 def places(value, path=()):
     """The paths to all values in a JSON document, of a list to the first one alone."""
     yield path
@@ -460,9 +179,7 @@ def with_long(document, path, change):
 
 def documents(folder):
     """The content of each kind of document, and what loads such a content, whose checksum is right."""
-    from agents import Agent, agent_file
-    from agents.agent_file import pretrained_folder
-    from agents.hyperparams import complete_hyperparams, read_hyperparams, tuned_hyperparams
+    from agents import Agent, pretrained_folder
     from experiments.settings import CompareSettings, config_defaults, settings_json
 
     plant = truck_trailer(mass=4000.0)
@@ -480,12 +197,8 @@ def documents(folder):
             lambda content: Certificate.read(document_of("certificate", certificate["format"], content)),
         ),
         "agent": (
-            json.loads((agent / "agent.json").read_text())["agent"],
-            lambda content: (path.write_bytes(agent_file.document_of(content)), Agent.load(folder)),
-        ),
-        "hyperparameters": (
-            {"default": tuned_hyperparams("ncs_gym/CSTR-v0")},
-            as_file(lambda path: complete_hyperparams("PPO", read_hyperparams(path, "default"))),
+            json.loads((agent / "agent.json").read_text()),
+            lambda content: (path.write_text(json.dumps(content)), Agent.load(folder)),
         ),
         "settings": (
             settings_json("compare", CompareSettings()),
@@ -494,7 +207,7 @@ def documents(folder):
     }
 
 
-@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "hyperparameters", "settings"])
+@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "settings"])
 def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     pytest.importorskip("stable_baselines3")
     document, load = documents(tmp_path)[name]

@@ -24,7 +24,7 @@ HINT = "This training had no violation and no override"
     ],
 )
 def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, without_workers, arm, log_std, happens):
-    networks = f"policy_kwargs=dict(net_arch=[8, 8], log_std_init={log_std})"
+    networks = f'policy_kwargs={{"net_arch": [8, 8], "log_std_init": {log_std}}}'
     short = ("--steps", 512, "--episodes", 1, "--hyperparams", *SMALL, networks)
     run = succeeded("train", "--arm", arm, *short, "--out", tmp_path / "r")
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())["arms"][arm]
@@ -34,7 +34,7 @@ def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, 
     assert ("raise --steps, or run `ncs compare`" in prose) is (not happens)
 
 
-SHORT = ("--episodes", 1, "--hyperparams", *SMALL, "policy_kwargs=dict(net_arch=[8, 8])", "--out")
+SHORT = ("--episodes", 1, "--hyperparams", *SMALL, 'policy_kwargs={"net_arch": [8, 8]}', "--out")
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ SMALL = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_envs=2", "n_steps=1
 
 
 def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_path, without_workers):
-    networks = "policy_kwargs=dict(net_arch=[8, 8])"
+    networks = 'policy_kwargs={"net_arch": [8, 8]}'
     run = succeeded("train", "--env", ENV, *SMALL, networks, "--out", tmp_path / "r")
     prose = run.prose
     assert f"PPO, hyperparameters tuned for {ENV}, as given n_envs, policy_kwargs, n_steps: n_envs=2, " in prose

@@ -54,7 +54,7 @@ class Shown:
         return "\n".join([results_tables(summary), *tables])
 
     def train(self):
-        small = ("n_envs=2", "n_steps=64", "batch_size=64", "policy_kwargs=dict(net_arch=[8, 8])")
+        small = ("n_envs=2", "n_steps=64", "batch_size=64", 'policy_kwargs={"net_arch": [8, 8]}')
         return printed("train", "--steps", 128, "--episodes", 1, "--hyperparams", *small, "--out", self.folder / "r")
 
     def evaluate(self):

@@ -14,22 +14,24 @@ def channel_of(*arguments):
     [
         ("0.5", 0.5),
         ("3", 3),
-        ("None", None),
-        ("True", True),
+        ("null", None),
+        ("true", True),
         ("[64, 64]", [64, 64]),
+        ('{"pi": [64]}', {"pi": [64]}),
         ("1e-3", 0.001),
         ("lin_0.1", "lin_0.1"),
+        ('"lin_0.1"', "lin_0.1"),
+        ("nn.ReLU", "nn.ReLU"),
     ],
 )
-def test_value_is_what_it_is_in_python(text, value):
+def test_value_is_a_json_value_or_a_word(text, value):
     given = channel_of("--channel", f"loss={text}")
     assert given == {"loss": value}
     assert type(given["loss"]) is type(value)
 
 
-def test_value_that_no_file_can_keep_stays_a_text():
-    assert channel_of("--channel", "loss=1e999", "delay={1, 2}", "jitter=b'1'") == {
-        "loss": "1e999",
-        "delay": "{1, 2}",
-        "jitter": "b'1'",
-    }
+@pytest.mark.parametrize("text", ["dict(a=1)", "{1, 2}", "[64", "{'a': 1}", "", "a b"])
+def test_what_is_neither_names_the_form(text, capsys):
+    with pytest.raises(SystemExit):
+        channel_of("--channel", f"loss={text}")
+    assert "expected loss=VALUE with a word or a JSON value" in " ".join(capsys.readouterr().err.split())

@@ -41,7 +41,7 @@ def test_steps_are_those_given_or_tuned_or_the_default():
     assert CompareSettings(env=CART_POLE).completed.steps == 600_000
 
 
-def test_steps_are_a_hyperparameter_of_a_file_too():
+def test_steps_are_a_hyperparameter_too():
     assert CompareSettings(hyperparams={"n_timesteps": 3e4}).training_steps == 30_000
     assert CompareSettings(hyperparams={"n_timesteps": 3e4}, steps=7).training_steps == 7
     assert "n_timesteps" not in CompareSettings(hyperparams={"n_timesteps": 3e4}).all_hyperparams
@@ -58,18 +58,16 @@ def test_what_is_given_wins_over_the_tuned_value_also_if_it_equals_the_default()
     assert f"tuned for {CART_POLE}, as given gamma: " in settings.agent_line
 
 
-def test_what_is_given_wins_over_the_file_and_the_file_over_the_tuned_values(tmp_path):
-    (tmp_path / "mine.yml").write_text(
-        f"{CART_POLE}:\n  n_timesteps: 5000\n  gamma: 0.5\n  n_steps: 8\n  policy_kwargs: dict(net_arch=[8])\n"
-    )
-    given = ["--conf-file", str(tmp_path / "mine.yml"), "--hyperparams", "gamma=0.7"]
-    settings, tuned = parse(["train", "--env", CART_POLE, *given]), tuned_hyperparams(CART_POLE)
+def test_what_is_given_wins_over_the_tuned_values():
+    given = ["n_timesteps=5000", "gamma=0.7", "n_steps=8", 'policy_kwargs={"net_arch": [8]}']
+    settings = parse(["train", "--env", CART_POLE, "--hyperparams", *given])
+    tuned = tuned_hyperparams(CART_POLE)
     networks = tuned["policy_kwargs"] | {"net_arch": [8]}
     expected = tuned | {"gamma": 0.7, "n_steps": 8, "policy_kwargs": networks}
     assert settings.all_hyperparams == expected
     assert settings.training_steps == 5000
     assert "as given gamma, policy_kwargs, n_steps: " in settings.agent_line
-    assert settings.completed == replace(settings, steps=5000, hyperparams=expected, conf_file=None)
+    assert settings.completed == replace(settings, steps=5000, hyperparams=expected)
 
 
 def test_completed_settings_come_back_whatever_is_tuned_later(tmp_path, monkeypatch):
