@@ -5,20 +5,8 @@ from __future__ import annotations
 from agents.results import TrainingStopped
 
 
-class SettingsError(ValueError):
-    """A settings file is missing or damaged, or holds settings that the command does not take."""
-
-
-class ResultsError(ValueError):
-    """A stored result is missing, damaged or altered."""
-
-
 class OtherResultsError(ValueError):
     """An output folder holds finished results of other settings, which would be replaced."""
-
-
-class FolderInUseError(RuntimeError):
-    """Another command is writing to the output folder."""
 
 
 class RunError(RuntimeError):

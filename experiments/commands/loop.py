@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections import Counter
@@ -15,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from experiments.backends.worker import initialize_worker, signals_blocked
 from experiments.commands import short_version
 from experiments.network_loop.log import rows_of
 from experiments.network_loop.processes import (
@@ -66,8 +66,7 @@ def loop(settings: LoopSettings) -> None:
     processes = [context.Process(target=_in_process, args=(run, network_loop), daemon=True) for run in others]
     try:
         for process in processes:
-            with signals_blocked():
-                process.start()
+            process.start()
         if settings.role == "plant":
             print(f"the plant waits for a controller at {settings.host}, port {settings.port}; end it with Ctrl-C")
             with suppress(KeyboardInterrupt):  # which ends both processes, too
@@ -108,7 +107,7 @@ def text_of(summary: dict[str, Any]) -> str:
 
 def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop) -> None:
     """Runs a process of the loop; the module that registers the environment is imported in each."""
-    initialize_worker()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # left to the parent, which ends its daemons
     try:
         run(network_loop)
     except OSError as error:

@@ -70,7 +70,6 @@ def endless(request, tmp_path):
 
 def readers():
     from agents.hyperparams import read_hyperparams
-    from experiments.settings import CompareSettings, config_defaults
 
     return {
         "bytes": read_file,
@@ -79,11 +78,10 @@ def readers():
         "certificate": Certificate.load,
         "packets": PacketLog.load,
         "hyperparameters": lambda path: read_hyperparams(path, "ncs_gym/CSTR-v0"),
-        "settings": lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings),
     }
 
 
-NAMES = ["bytes", "text", "plant", "certificate", "packets", "hyperparameters", "settings"]
+NAMES = ["bytes", "text", "plant", "certificate", "packets", "hyperparameters"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -468,7 +466,6 @@ def documents(folder):
     from agents import Agent, agent_file
     from agents.agent_file import pretrained_folder
     from agents.hyperparams import complete_hyperparams, read_hyperparams, tuned_hyperparams
-    from experiments.settings import CompareSettings, config_defaults, settings_json
 
     plant = truck_trailer(mass=4000.0)
     certificate = json.loads(json.dumps(certificate_of(plant).document))
@@ -492,14 +489,10 @@ def documents(folder):
             {"default": tuned_hyperparams("ncs_gym/CSTR-v0")},
             as_file(lambda path: complete_hyperparams("PPO", read_hyperparams(path, "default"))),
         ),
-        "settings": (
-            settings_json("compare", CompareSettings()),
-            as_file(lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings)),
-        ),
     }
 
 
-@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "hyperparameters", "settings"])
+@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "hyperparameters"])
 def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     pytest.importorskip("stable_baselines3")
     document, load = documents(tmp_path)[name]
