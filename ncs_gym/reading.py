@@ -13,7 +13,7 @@ import stat
 from collections.abc import Callable, Iterable
 from typing import Any, BinaryIO
 
-# Bytes of a certificate, a plant, settings, results, an `agent.json` or a page, and values of its JSON.
+# Bytes of a certificate, a plant, an `agent.json` or a page, and values of its JSON.
 LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
 # Bytes of a file of hyperparameters, and values in it once all aliases are written out.
 LARGEST_HYPERPARAMS, MOST_HYPERPARAMS = 256 << 10, 100_000
