@@ -36,7 +36,8 @@ def train(settings: TrainSettings) -> None:
     checkpoint = settings.out / "tensorboard" / run.name / CHECKPOINT
     if settings.force:
         rmtree(checkpoint, ignore_errors=True)
-    if (history := history_of(checkpoint)) and history[-1].steps < run.steps:
+    history = history_of(checkpoint) if settings.engine == "local" else []  # what other machines leave stays there
+    if history and history[-1].steps < run.steps:
         run = replace(run, went_on_after=history[-1].steps)
         print(f"the training in {settings.out} goes on after {counted(run.went_on_after, 'step')}", flush=True)
     results = results_of([run], settings.out, settings)

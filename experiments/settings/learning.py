@@ -40,15 +40,13 @@ class BackendSettings:
     ray_address: str = "local"
 
     def __post_init__(self) -> None:
-        require_limits(self, jobs=(1, MOST_JOBS))
+        require_limits(self, jobs=1)
         if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         if self.engine == "local" and self.ray_address != "local":
             raise ValueError("--ray-address is a setting of --engine ray")
 
 
-# There are no more worker processes, runs per arm and episodes per run.
-MOST_JOBS, MOST_SEEDS, MOST_EPISODES = 1024, 10_000, 1_000_000
 # Training steps where none belong to tuned hyperparameters.
 _DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
@@ -140,7 +138,7 @@ class LearningSettings(BackendSettings):
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
-        counts = {"seeds": (1, MOST_SEEDS), "steps": 1, "episodes": (1, MOST_EPISODES), "seed": 0}
+        counts = {"seeds": 1, "steps": 1, "episodes": 1, "seed": 0}
         require_limits(self, **counts, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
         require_horizon(self, self.mode, *arms)
@@ -243,7 +241,7 @@ class EvaluateSettings:
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_limits(self, episodes=(1, MOST_EPISODES), seed=0)
+        require_limits(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
             require_horizon(self, self.shield)
 
@@ -357,7 +355,7 @@ class StudySettings(BackendSettings):
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
-        counts = {"seeds": (1, MOST_SEEDS), "episodes": (1, MOST_EPISODES), "channel_episodes": (0, MOST_EPISODES)}
+        counts = {"seeds": 1, "episodes": 1, "channel_episodes": 0}
         require_limits(self, **counts, seed=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")

@@ -43,8 +43,6 @@ SETTINGS = [
     *((CompareSettings, {name: value}, f"--{name.replace('_', '-')} must be")
       for name, value in {"seeds": 0, "steps": -1, "episodes": 0, "seed": -1, "intervention_penalty": -0.1,
                           "violation_penalty": np.inf}.items()),
-    *((CompareSettings, {name: value}, "at most")
-      for name, value in {"seeds": 10**9, "jobs": 10**6, "episodes": 10**9}.items()),
     (CompareSettings, {"horizon": 0, "mode": "lookahead"}, f"{HORIZON} 0"),
     (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
     *((ChannelSettings, {"file": "f"} | given, "give --certificate and --plant, or --env")
