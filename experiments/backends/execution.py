@@ -90,13 +90,14 @@ def execute(
             for future in sorted(finished, key=lambda each: each.exception() is not None):
                 number, error = numbers.pop(future), future.exception()
                 run, counts[number] = runs[number], runs[number].total_steps
-                cause = getattr(error, "cause", None) or error  # Ray's errors of tasks have what a task raised
                 if error is None:
                     result, texts = future.result()
                     for text in texts:
                         warnings.warn(text, stacklevel=1)
                     keep(run, result)
-                elif isinstance(cause, worker_died):
+                    continue
+                cause = getattr(error, "cause", None) or error  # Ray's errors of tasks have what a task raised
+                if isinstance(cause, worker_died):
                     lost.append(run.name)
                 else:
                     known = isinstance(cause, ClusterError | RunStopped)

@@ -288,8 +288,9 @@ def history_of(checkpoint: Path) -> list[TrainingPoint]:
     """
     path = checkpoint / HISTORY_FILE
     try:
-        points = json.loads(path.read_bytes()) if path.exists() else []
-        return [TrainingPoint(**{key: nan if value is None else value for key, value in p.items()}) for p in points]
+        points: Any = json.loads(path.read_bytes()) if path.exists() else []
+        unknown: Any = nan  # null in the file
+        return [TrainingPoint(**{key: unknown if v is None else v for key, v in each.items()}) for each in points]
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"no training can go on from {checkpoint}: it is damaged; --force begins anew") from error
 
