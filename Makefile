@@ -47,8 +47,7 @@ pretrained: $(INSTALLED) ## the small agents of the package, trained again
 test-other-processor: $(INSTALLED) ## what proves and decides, as on another processor
 	OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES='$(WIDE)' $(BIN)/python -m pytest -n auto --dist worksteal \
 		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/uncertainty tests/shields tests/hardening \
-		--ignore=tests/shields/paper --ignore=tests/hardening/test_bounded_inputs.py \
-		--ignore=tests/hardening/test_result_folders.py
+		--ignore=tests/shields/paper --ignore=tests/hardening/test_bounded_inputs.py
 
 test-lowest: $(LOWEST)/.installed ## the tests, with the lowest versions of dependencies that pyproject.toml allows
 	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal
@@ -91,7 +90,7 @@ lint: $(INSTALLED) ## style and declared dependencies
 types: $(INSTALLED) ## types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environments ...
+benchmark: $(INSTALLED) ## times of imports, shields, environments ...
 	$(BIN)/python -m benchmarks.speed imports
 	$(BIN)/python -m benchmarks.speed first-shield
 	$(BIN)/python -m benchmarks.speed networked
@@ -106,7 +105,6 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environme
 	$(BIN)/python -m benchmarks.speed environments
 	$(BIN)/python -m benchmarks.speed rendering
 	$(BIN)/python -m benchmarks.speed ppo
-	$(BIN)/python -m benchmarks.speed ray
 
 example-times: $(INSTALLED) ## how long each example takes, and what it says (EXAMPLES="quick_start.py")
 	$(BIN)/python -m benchmarks.speed examples $(EXAMPLES)

@@ -1,6 +1,6 @@
 """How fast things are that a user waits for: `python -m benchmarks.speed COMMAND`.
 
-Commands: imports, first-shield, environments, networked, rendering, examples, ppo, ray.
+Commands: imports, first-shield, environments, networked, rendering, examples, ppo.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +35,11 @@ from agents import LoopConfig, SB3VecEnv, evaluate
 from agents.agent import Normalization
 from agents.algorithms import build_model, normalized_env
 from agents.hyperparams import complete_hyperparams
-from agents.loop import ShieldSettings
 from benchmarks.commands import run, table
 from benchmarks.timing import Steps, in_rounds, process_times
-from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import TrainingRun
-from experiments.settings import BackendSettings, SweepSettings
 from ncs_gym import Channel, GilbertElliott, Networked, VectorNetworked
-from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
-from shields import SafetyShield, VectorSafetyShield, certificate_for
+from shields import SafetyShield, VectorSafetyShield
 
 ROOT = Path(__file__).resolve().parent.parent
 CRUISE, CASE_STUDY = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"
@@ -453,55 +446,7 @@ def ppo(steps: int = 150_000, seeds: int = 2) -> None:
         show(name, f"{rate:.0f}", f"{rate / base:.1f}", f"{np.mean(returns):.2f}", by_seed)
 
 
-def ray(runs: int = 1000) -> None:
-    """What Ray and the driver cost per training run, without the run's own work.
-
-    Starts a Ray on this machine. The empty runs return nothing; the others return the result of a small trained agent,
-    which is computed once, so that its way back is measured and its work is not.
-    """
-    from experiments.backends.execution import execute
-    from experiments.backends.ray_backend import RayCluster, as_remote, connected
-
-    certificate = certificate_for(ncs_env(gym.make(CRUISE)).plant)
-    loop = LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "project"))
-    example = TrainingRun(
-        arm="shielded",
-        policy_kind="trained",
-        training_loop=loop,
-        loop=loop,
-        seed=0,
-        index=0,
-        steps=4096,
-        episodes=100,
-        certificate=certificate,
-        algorithm="PPO",
-        settings={"n_envs": 4},
-    )
-    result = example.execute(lambda steps: None)
-    some = [replace(example, index=index) for index in range(runs)]
-
-    def empty(expected, content):
-        return None
-
-    def full(expected, content):
-        return result
-
-    with connected("local"), tempfile.TemporaryDirectory() as folder:
-        store = RunStore(Path(folder))
-        for name, function in {"empty": empty, "with a result": full, "with a result that is stored": full}.items():
-            task = as_remote(function, BackendSettings(engine="ray"))
-            keep = store.save if "stored" in name else lambda run, result: None
-            execute(some[:50], nullcontext(RayCluster(task)), lambda run, result: None)  # starts the workers
-            start, busy = time.perf_counter(), time.process_time()
-            execute(some, nullcontext(RayCluster(task)), keep)
-            took, used = 1e3 * (time.perf_counter() - start) / runs, 1e3 * (time.process_time() - busy) / runs
-            print(f"{runs} runs, {name}: {took:.2f} ms per run, driver {used:.2f} ms", flush=True)
-    start, defaults = time.perf_counter(), SweepSettings()
-    replace(example, steps=defaults.training_steps, settings=defaults.all_hyperparams).execute(lambda steps: None)
-    print(f"a run of ncs sweep with its default budget: {time.perf_counter() - start:.1f} s on one core")
-
-
-COMMANDS = (imports, first_shield, environments, networked, rendering, examples, ppo, ray)
+COMMANDS = (imports, first_shield, environments, networked, rendering, examples, ppo)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

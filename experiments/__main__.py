@@ -60,10 +60,7 @@ def main() -> None:
 
         from experiments.terminal import warnings_as_sentences
 
-        interruption = _Interruption()
-        signal.signal(signal.SIGTERM, interruption)
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # in the background it may be ignored
-            signal.signal(signal.SIGINT, interruption)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # it ends a command as Ctrl-C does
         # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         with warnings.catch_warnings(action="ignore"):  # what it would say is an error here
@@ -89,13 +86,12 @@ def main() -> None:
 
 
 def parse(arguments: list[str]) -> object:
-    """Returns the settings of the chosen command; those of a file given by `--config` replace the defaults."""
+    """Returns the settings of the chosen command."""
     from difflib import get_close_matches
 
     import tyro
 
     from experiments import settings
-    from experiments.settings.arguments import beside_those_of_file
     from ncs_gym.validation import shown
 
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
@@ -107,12 +103,8 @@ def parse(arguments: list[str]) -> object:
         near = get_close_matches(command, kinds, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(kinds)}"
         raise ValueError(f"unknown command {shown(command)}; {hint}")
-    kind, default = kinds[command], {}
-    if hasattr(kind, "config"):
-        found, rest = settings.config_defaults(rest, command, kind)
-        default = {} if found is None else {"default": found}
-    given = tyro.cli(kind, prog=f"ncs {command}", args=rest, description=_description(kind), **default)
-    return beside_those_of_file(given, found) if default else given
+    kind = kinds[command]
+    return tyro.cli(kind, prog=f"ncs {command}", args=rest, description=_description(kind))
 
 
 def _overview(kinds: Mapping[str, type]) -> str:
@@ -154,27 +146,6 @@ def _run(settings: object) -> None:
     getattr(import_module(module), function)(settings)
 
 
-class _Interruption:
-    """What SIGTERM and Ctrl-C do: the first stops workers and keeps finished runs, another one ends all at once."""
-
-    def __init__(self) -> None:
-        self._is_told = False
-
-    def __call__(self, number: int, frame: object) -> None:
-        if not self._is_told:
-            self._is_told = True
-            raise KeyboardInterrupt
-        if (processes := sys.modules.get("multiprocessing")) is not None:
-            for each in processes.active_children():
-                each.kill()
-        os.write(2, b"" if _said else b"\nncs: interrupted\n")
-        os._exit(_INTERRUPTED)
-
-
-# What was complained of, so that it is said once.
-_said: list[str] = []
-
-
 def _sentence(error: Exception) -> str:
     """Returns an error as one line; only unexpected errors show their type.
 
@@ -199,7 +170,6 @@ def _complain(sentence: str, code: int) -> int:
         from experiments.terminal import wrapped
 
         text = wrapped(text, indent=5)
-    _said.append(sentence)
     print(text, file=sys.stderr, flush=True)
     return code
 

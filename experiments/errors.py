@@ -5,24 +5,12 @@ from __future__ import annotations
 from agents.results import TrainingStopped
 
 
-class SettingsError(ValueError):
-    """A settings file is missing or damaged, or holds settings that the command does not take."""
-
-
-class ResultsError(ValueError):
-    """A stored result is missing, damaged or altered."""
-
-
 class OtherResultsError(ValueError):
-    """An output folder holds finished results of other settings, which would be replaced."""
-
-
-class FolderInUseError(RuntimeError):
-    """Another command is writing to the output folder."""
+    """An output folder holds results of other settings, which would be replaced."""
 
 
 class RunError(RuntimeError):
-    """A training run, or a batch of an attack, failed; the message names it, the cause is its own error."""
+    """A run failed, or its worker died; the message names it, the cause is its own error."""
 
     @classmethod
     def of(cls, name: str, error: BaseException) -> RunError:
@@ -37,7 +25,7 @@ class RunStopped(TrainingStopped):
 
 
 class ClusterError(RuntimeError):
-    """The cluster cannot be reached or ended, is too small for a run, or has other versions than the driver."""
+    """The cluster cannot be joined, or a node has other versions than the driver."""
 
 
 class SafetyBroken(RuntimeError):

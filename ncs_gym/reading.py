@@ -12,7 +12,7 @@ import os
 import stat
 from typing import Any, BinaryIO
 
-# Bytes of a certificate, a plant, settings, results, an `agent.json` or a page, and values of its JSON.
+# Bytes of a certificate, a plant, an `agent.json` or a page, and values of its JSON.
 LARGEST_DOCUMENT, MOST_VALUES = 32 << 20, 2_000_000
 # Bytes of a `model.zip`.
 LARGEST_MODEL = 256 << 20

@@ -94,7 +94,7 @@ def killed(*arguments, once: Callable[[], bool]) -> None:
         assert run.poll() is None, "it ended before it was killed"
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    children = _children_of(run.pid)
+    children = children_of(run.pid)
     assert len(children) >= 2
     run.kill()
     run.wait()
@@ -103,7 +103,7 @@ def killed(*arguments, once: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-def _children_of(pid: int) -> list[int]:
+def children_of(pid: int) -> list[int]:
     """Process ids of direct children, from /proc."""
     stats = [path.read_text().rsplit(")", 1) for path in Path("/proc").glob("[0-9]*/stat") if path.exists()]
     return [int(head.split()[0]) for head, tail in stats if int(tail.split()[1]) == pid]

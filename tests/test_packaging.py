@@ -56,7 +56,7 @@ LAYERS = {
         {"training"},
     ),
     "experiments": (
-        {"errors", "json_values", "terminal"},
+        {"errors", "terminal"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
@@ -200,7 +200,6 @@ def test_few_names_are_public_and_each_is_documented():
 def test_what_takes_long_is_imported_when_it_is_needed():
     """One process imports one module after the other, those that need least first; after each it looks for the rest."""
     later = {
-        "experiments.backends.worker": {"numpy", "gymnasium"},
         "experiments.__main__": {"numpy", "tyro"},
         "ncs_gym": {"scipy.linalg", "scipy.optimize", "scipy.stats", "filterpy", "pygame", "matplotlib"},
         "shields": {"cvxpy", "clarabel", "torch", "matplotlib", "scipy.stats", "filterpy"},

@@ -16,8 +16,6 @@ from agents.agent import Agent
 from agents.agent_file import AgentError
 from agents.loop import LoopConfig
 from agents.training import untrained
-from experiments.__main__ import parse
-from experiments.settings import CompareSettings, StudySettings, config_defaults, save_settings, settings_json
 from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs
 
@@ -32,14 +30,11 @@ SAFE_WITH = {"torch.load": ("weights_only", True), "numpy.load": ("allow_pickle"
 UNPICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 NETWORK = {"socket", "ssl", "urllib", "urllib3", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"}
 
-# What goes from a driver to its own workers, over Ray, which unpickles what it is sent itself (SECURITY.md).
-BETWEEN_DRIVER_AND_WORKERS = {
-    "experiments/backends/ray_cluster.py": ["pickle", "socket"],
-    "experiments/backends/ray_backend.py": ["pickle"],
+KNOWN = {
     "experiments/settings/arguments.py": ["cloudpickle.dumps"],  # what is registered, for a digest: nobody reads it
+    # What the user says that he trusts (`ncs evaluate --trust`).
+    "agents/agent.py": ["algorithm_class(algorithm).load", "stable_baselines3.common.vec_env.VecNormalize.load"],
 }
-# What the user says that he trusts (`ncs evaluate --trust`).
-TRUSTED = {"agents/agent.py": ["algorithm_class(algorithm).load", "stable_baselines3.common.vec_env.VecNormalize.load"]}
 
 
 def imported(tree):
@@ -83,7 +78,7 @@ def test_nothing_that_runs_what_a_file_holds_is_called_in(package):
     assert files
     found = {path.relative_to(ROOT).as_posix(): dangers(path.read_text()) for path in files}
     assert {name: those for name, those in found.items() if those} == {
-        name: those for name, those in (BETWEEN_DRIVER_AND_WORKERS | TRUSTED).items() if name.startswith(package)
+        name: those for name, those in KNOWN.items() if name.startswith(package)
     }
 
 
@@ -138,26 +133,6 @@ def test_module_that_the_user_names_is_imported(evil, monkeypatch):
     (evil / "imported").unlink()
 
 
-def test_settings_of_others_import_no_module(evil):
-    content = settings_json("compare", CompareSettings())
-    content["settings"]["env"] = "evil:Evil-v0"
-    (evil / "settings.json").write_text(json.dumps(content))
-    assert_one_sentence(ncs("compare", "--config", "settings.json", cwd=evil), "unknown environment 'evil:Evil-v0'")
-
-
-@pytest.mark.parametrize("envs", [["evil:Evil-v0"], ["ncs_gym/CartPole-v0", "evil:Evil-v0"], [":Evil-v0"]])
-def test_settings_of_a_study_of_others_import_no_module(envs, evil):
-    content = settings_json("study", StudySettings())
-    content["settings"]["envs"] = envs
-    (evil / "settings.json").write_text(json.dumps(content))
-    assert_one_sentence(ncs("study", "--config", "settings.json", cwd=evil), "unknown environment", "Evil-v0")
-
-
-def test_settings_files_name_no_module():
-    assert settings_json("study", StudySettings(envs=("evil:Evil-v0",)))["settings"]["envs"] == ["Evil-v0"]
-    assert settings_json("compare", CompareSettings(env="evil:Evil-v0"))["settings"]["env"] == "Evil-v0"
-
-
 def forge(folder, **values):
     """Changes the file of an agent."""
     document = json.loads((folder / "agent.json").read_text())
@@ -176,50 +151,6 @@ def test_certificates_that_are_none_are_refused(content, tmp_path):
     (tmp_path / "c.json").write_bytes(content)
     with pytest.raises(CertificateError):
         Certificate.load(tmp_path / "c.json")
-
-
-@pytest.mark.parametrize("out", ["../mine", "{root}/mine", "here/../../mine", "link"])
-def test_settings_of_others_write_to_no_folder_outside_unless_the_user_names_it(out, tmp_path):
-    here, mine = tmp_path / "here", tmp_path / "mine"
-    here.mkdir()
-    mine.mkdir()
-    (here / "link").symlink_to(mine)
-    out = out.format(root=tmp_path)
-    content = settings_json("compare", CompareSettings(smoke=True))
-    content["settings"]["out"] = out
-    (here / "theirs.json").write_text(json.dumps(content))
-    run = ncs("compare", "--config", "theirs.json", cwd=here)
-    assert_one_sentence(run, "lies neither here nor beside the file: give --out")
-    assert list(mine.iterdir()) == []
-    named = ncs("compare", "--config", "theirs.json", "--out", out, "--env", "unknown", cwd=here)
-    assert_one_sentence(named, "unknown environment 'unknown'")
-
-
-def test_settings_may_name_the_folder_that_they_lie_in(tmp_path, monkeypatch):
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    save_settings(tmp_path / "settings.json", "compare", CompareSettings(out=tmp_path))
-    monkeypatch.chdir(elsewhere)
-    assert parse(["compare", "--config", str(tmp_path / "settings.json")]).out == tmp_path
-
-
-@pytest.mark.parametrize("change", [{"page": "mine.md"}, {"quote": ["mine.md"]}])
-def test_settings_of_others_write_no_page(change, tmp_path):
-    (tmp_path / "mine.md").write_text("<!-- ncs study: lead -->\n<!-- end -->\n")
-    content = settings_json("study", StudySettings(smoke=True))
-    content["settings"] |= change
-    (tmp_path / "theirs.json").write_text(json.dumps(content))
-    run = ncs("study", "--config", "theirs.json", cwd=tmp_path)
-    assert_one_sentence(run, "hold what ncs study does not take", next(iter(change)))
-    assert {path.name for path in tmp_path.iterdir()} == {"mine.md", "theirs.json"}
-
-
-def test_texts_in_files_mean_nothing_to_a_terminal(tmp_path):
-    content = settings_json("compare", CompareSettings()) | {"command": "\x1b]0;title\x07\x9b31m\u202e\u2028"}
-    (tmp_path / "theirs.json").write_text(json.dumps(content))
-    run = ncs("compare", "--config", "theirs.json", cwd=tmp_path)
-    assert_one_sentence(run, "holds settings of ncs", "x1b]0;title")
-    assert run.stderr.strip().isprintable()
 
 
 @pytest.fixture
@@ -256,16 +187,6 @@ def test_saving_an_agent_over_links_replaces_the_links(agent, tmp_path):
     assert {path.name for path in tmp_path.iterdir() if path.is_file() and path.read_text() == "mine"} == {
         path.name for path in agent.iterdir()
     }
-
-
-def test_settings_of_others_choose_no_cluster(tmp_path):
-    document = settings_json("compare", CompareSettings())
-    document["settings"] |= {"engine": "ray", "ray_address": "203.0.113.1:6379", "steps": 128}
-    (tmp_path / "settings.json").write_text(json.dumps(document))
-    settings, _ = config_defaults(
-        ["--config", str(tmp_path / "settings.json"), "--out", "x"], "compare", CompareSettings
-    )
-    assert (settings.engine, settings.ray_address, settings.steps) == ("local", "local", 128)
 
 
 def test_texts_in_a_certificate_mean_nothing_to_a_terminal(certificate):

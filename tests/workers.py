@@ -9,40 +9,30 @@ import contextlib
 import pickle
 from collections.abc import Iterator
 from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 from experiments.attack import monte_carlo_batch
-from experiments.backends.execution import LocalWorkers
-from experiments.backends.worker import execute_here
+from experiments.backends.execution import Engine, executed
 from experiments.commands import attack
 
 
-class _Here(LocalWorkers):
+@contextlib.contextmanager
+def _here(jobs: int, counts: Any, log_folder: Path | None = None) -> Iterator[Engine]:
     """Executes at once what is submitted; runs and results are pickled as on their way to a process and back."""
 
-    def __init__(self, log_folder: Path | None) -> None:
-        super().__init__(log_folder)
-        self._folder, self._sent = log_folder, []
-
-    def submit(self, run: Any) -> Future:
+    def submit(number: int, run: Any) -> Future:
         future: Future = Future()
         try:
-            result = execute_here(pickle.loads(pickle.dumps(run)), self._sent.append, lambda: False, self._folder)
+            result = executed(pickle.loads(pickle.dumps(run)), lambda steps: None, log_folder)
             future.set_result(pickle.loads(pickle.dumps(result)))
         except Exception as error:
             future.set_exception(error)
         return future
 
-    def reports(self) -> Iterator[int | str]:
-        while self._sent:
-            yield self._sent.pop(0)
-
-
-@contextlib.contextmanager
-def _here(workers: int, log_folder: Path | None = None) -> Iterator[_Here]:
-    yield _Here(log_folder)
+    yield submit, BrokenProcessPool
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -148,21 +147,6 @@ class MonteCarloBatch:
                 counts += SafetyCounts(level=level)
             on_progress(envs)
         return counts + SafetyCounts(broken_episodes=int(broken.sum()), packets=int(info["packets"].sum()))
-
-    def require(self, result: SafetyCounts) -> None:
-        """Raises unless counts can be this batch's.
-
-        Raises:
-            ValueError: If a batch of so many episodes cannot have counted this.
-        """
-        steps, envs = self.total_steps, self.settings.envs
-        most = dict.fromkeys(("episodes", "broken_episodes", "outside_starts"), envs) | {"level": math.inf}
-        most["unproved"] = steps + envs  # which counts starts, too
-        for name, count in vars(result).items():
-            if not 0 <= count <= most.get(name, steps):
-                raise ValueError(f"{name} of a batch cannot be {count}")
-        if (result.steps, result.episodes) != (steps, envs) or result.lapsed_violations > result.lapsed:
-            raise ValueError("these are no counts of a whole batch")
 
 
 def _claimed_and_kept(info: dict[str, Any], kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -61,6 +61,11 @@ class SafetyCounts:
     forced: int = 0
     overdue: int = 0
 
+    @classmethod
+    def of_json(cls, values: dict[str, Any]) -> SafetyCounts:
+        """Returns the counts of what `dataclasses.asdict` made of them."""
+        return cls(**values)
+
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
         sums: dict[str, Any] = {
             each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)

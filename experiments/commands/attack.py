@@ -52,42 +52,42 @@ def attack(settings: AttackSettings) -> None:
     each = max(int(settings.steps / (len(cases) * kinds * EPISODE_STEPS)), FEWEST_ENVS)
     there = None if settings.force else _envs_in(settings.out)
     settings = replace(settings, envs=min(settings.envs, each, there or each))
-    with claim_folder("attack", settings):
-        horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
-        plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
-        settings = replace(settings, horizon=horizon, plant=plant)
-        certificates = _certificates(cases, settings.out / "certificates", settings.safe_set)
-        numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
-        batches = [
-            MonteCarloBatch(settings, case, index, certificate)
-            for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
-            for index in range(number)
-        ]
-        counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
-        for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
-            counts[batch.case] += counted
-        total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
-        print(counts_table(counts, looks_ahead=looks_ahead))
-        if settings.smoke:
-            print(wrapped("A smoke run shows that everything runs; it attacks too little to show anything else."))
-        if left_out := [name for name in cases if name not in counts]:
-            listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
-            budget = f"within {settings.steps:,.0f} steps"
-            print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
-        limits = (
-            {name: cases[name].bound_violation_probability() for name in counts} if settings.noise == "gaussian" else {}
-        )
-        if limits:
-            print("", gaussian_table(counts, limits), sep="\n")
-        document = {"settings": lasting_settings(settings), "versions": versions(), "total": total.document()}
-        document["cases"] = {case: each.document() for case, each in counts.items()}
-        if limits:
-            document["bound_violation_probability"] = limits
-        write_atomically(settings.out / "attack.json", json.dumps(document, indent=1) + "\n")
-        if limits and not settings.unshielded:
-            require_within(counts, limits)
-        elif not settings.unshielded:
-            require_safe(total, looks_ahead=looks_ahead)
+    claim_folder("attack", settings)
+    horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
+    plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
+    settings = replace(settings, horizon=horizon, plant=plant)
+    certificates = _certificates(cases, settings.out / "certificates", settings.safe_set)
+    numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
+    batches = [
+        MonteCarloBatch(settings, case, index, certificate)
+        for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
+        for index in range(number)
+    ]
+    counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
+    for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
+        counts[batch.case] += counted
+    total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
+    print(counts_table(counts, looks_ahead=looks_ahead))
+    if settings.smoke:
+        print(wrapped("A smoke run shows that everything runs; it attacks too little to show anything else."))
+    if left_out := [name for name in cases if name not in counts]:
+        listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
+        budget = f"within {settings.steps:,.0f} steps"
+        print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
+    limits = (
+        {name: cases[name].bound_violation_probability() for name in counts} if settings.noise == "gaussian" else {}
+    )
+    if limits:
+        print("", gaussian_table(counts, limits), sep="\n")
+    document = {"settings": lasting_settings(settings), "versions": versions(), "total": total.document()}
+    document["cases"] = {case: each.document() for case, each in counts.items()}
+    if limits:
+        document["bound_violation_probability"] = limits
+    write_atomically(settings.out / "attack.json", json.dumps(document, indent=1) + "\n")
+    if limits and not settings.unshielded:
+        require_within(counts, limits)
+    elif not settings.unshielded:
+        require_safe(total, looks_ahead=looks_ahead)
 
 
 def _envs_in(folder: Path) -> int | None:

@@ -68,34 +68,34 @@ def compare(settings: CompareSettings) -> Comparison:
     names = settings.arms + settings.baselines
     require_arms(settings, loop, names)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
-    with claim_folder("compare", settings.completed):
-        plant = ncs_env(loop.single()).plant
-        verification = verify(certificate, plant)
-        print(wrapped(certificate_line(certificate, verification)), flush=True)
-        if is_any_trained(settings, names):
-            print(wrapped(settings.agent_line), flush=True)
-        settings = settings.completed
-        runs = _training_runs(settings, loop, certificate)
-        results = results_of(runs, settings.out, settings)
-        episodes = episodes_table(results)
-        summary = _summary(settings, loop, certificate, runs, episodes)
-        findings = findings_of(summary)
-        if "gaussian_noise" in summary:
-            findings += gaussian_sentences(summary["gaussian_noise"])
-        figures = comparison_figures(plant, certificate, summary, by_arm(results))
-        certificate.save(settings.out / "certificate.json")
-        files = {
-            "episodes.parquet": parquet(episodes, summary),
-            "training.parquet": parquet(training_table(results), summary),
-            "report.html": comparison_report(summary, verification, figures, findings),
-        }
-        write_results(settings.out, summary, files, figures)
-        count = counted(settings.seeds, "run")
-        trained = max(arm["train_steps"] for arm in summary["arms"].values())
-        per_run = f"{trained:,} training steps per arm, {counted(settings.episodes, 'episode')} per run"
-        print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
-        short = [_smoke_text(settings)] if settings.smoke else []
-        print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
+    claim_folder("compare", settings.completed)
+    plant = ncs_env(loop.single()).plant
+    verification = verify(certificate, plant)
+    print(wrapped(certificate_line(certificate, verification)), flush=True)
+    if is_any_trained(settings, names):
+        print(wrapped(settings.agent_line), flush=True)
+    settings = settings.completed
+    runs = _training_runs(settings, loop, certificate)
+    results = results_of(runs, settings.out, settings)
+    episodes = episodes_table(results)
+    summary = _summary(settings, loop, certificate, runs, episodes)
+    findings = findings_of(summary)
+    if "gaussian_noise" in summary:
+        findings += gaussian_sentences(summary["gaussian_noise"])
+    figures = comparison_figures(plant, certificate, summary, by_arm(results))
+    certificate.save(settings.out / "certificate.json")
+    files = {
+        "episodes.parquet": parquet(episodes, summary),
+        "training.parquet": parquet(training_table(results), summary),
+        "report.html": comparison_report(summary, verification, figures, findings),
+    }
+    write_results(settings.out, summary, files, figures)
+    count = counted(settings.seeds, "run")
+    trained = max(arm["train_steps"] for arm in summary["arms"].values())
+    per_run = f"{trained:,} training steps per arm, {counted(settings.episodes, 'episode')} per run"
+    print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
+    short = [_smoke_text(settings)] if settings.smoke else []
+    print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
     return Comparison(episodes, summary)
 
 

@@ -10,13 +10,13 @@ from experiments.terminal import progress_bar, text_table
 
 def reproduce(settings: ReproduceSettings) -> None:
     """Runs `ncs reproduce`."""
-    with claim_folder("reproduce", settings):
-        with progress_bar(3 * settings.starts, "simulation", "start") as bar:
-            simulations = [simulate(design, settings, bar) for design in designs()]
-        outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
-        write_results(settings.out, outcomes, figures=reproduction_figures(simulations))
-        print(table_of(outcomes))
-        print(f"files: {settings.out}")
+    claim_folder("reproduce", settings)
+    with progress_bar(3 * settings.starts, "simulation", "start") as bar:
+        simulations = [simulate(design, settings, bar) for design in designs()]
+    outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
+    write_results(settings.out, outcomes, figures=reproduction_figures(simulations))
+    print(table_of(outcomes))
+    print(f"files: {settings.out}")
 
 
 def table_of(outcomes: dict[str, dict[str, float | None]]) -> str:

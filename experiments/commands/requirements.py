@@ -27,7 +27,7 @@ from ncs_gym.validation import counted
 from shields import Certificate, Network, Requirement, Requirements
 from shields.json_documents import digest
 from shields.synthesis.network_requirements import LargestAge, kind_of_share
-from shields.synthesis.requirement_search import Answer, Search, contract_of_age
+from shields.synthesis.requirement_search import Answer, Search
 
 _DEFAULT_ENV = "ncs_gym/CartPole-v0"
 # Steps between samples, and losses in a row, that are asked about by default.
@@ -173,6 +173,10 @@ class _SearchResult:
 
     found: tuple[_StoredAnswer, ...]
 
+    @classmethod
+    def of_json(cls, values: dict[str, Any]) -> _SearchResult:
+        return cls(tuple(_StoredAnswer(**each) for each in values["found"]))
+
     @property
     def answers(self) -> dict[float, Answer]:
         """The answers by age, infinite for no contract."""
@@ -216,19 +220,6 @@ class _SearchRun:
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> _SearchResult:
         answers = self.search(lambda count: on_progress(_PARTS * count))
         return _SearchResult(tuple(_StoredAnswer.of(age, answer) for age, answer in answers.items()))
-
-    def require(self, result: _SearchResult) -> None:
-        """Raises ValueError unless all ages have an answer, and every certificate is one of its age and verifies."""
-        answers, search = result.answers, self.search
-        if missing := set(search.certain) - set(answers):
-            raise ValueError(f"no answer for age {min(missing):g}")
-        for age, answer in answers.items():
-            found = answer.certificate
-            if found is None:
-                continue
-            is_of_age = found.contract == contract_of_age(age, search.quantization_step)
-            if not (is_of_age and shields.verify(found, search.plant).valid):
-                raise ValueError(f"no certificate of this plant for age {age:g}")
 
 
 @dataclass(frozen=True)

@@ -53,44 +53,44 @@ def sweep(settings: SweepSettings) -> None:
     loops = [loop_at(settings, point) for point in points]
     require_arms(settings, loops[0], settings.arms)
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
-    with claim_folder("sweep", settings.completed):
-        if is_any_trained(settings, settings.arms):
-            print(wrapped(settings.agent_line), flush=True)
-        settings = settings.completed
-        runs = [
-            run_of_arm(settings, loop, certificate, name, index, grid_point=name_of(point))
-            for point, loop, certificate in zip(points, loops, certificates, strict=True)
-            for index in range(settings.seeds)
-            for name in settings.arms
-        ]
-        results = results_of(runs, settings.out, settings)
-        per_point = len(runs) // len(points)
-        parts = [
-            episodes_table(
-                results[i * per_point : (i + 1) * per_point],
-                **{name: float("nan" if value is None else value) for name, value in point.items()},
-            )
-            for i, point in enumerate(points)
-        ]
-        arms = [arm_summaries(part, settings.mode) for part in parts]
-        losses = [{"mean_loss": ncs_env(loop.single()).channel.mean_loss} for loop in loops]
-        summary = {
-            "cells": [point | lost | {"arms": each} for point, lost, each in zip(points, losses, arms, strict=True)]
-        } | experiment_provenance(settings, loops[0], certificates[0], runs)
-        figures = sweep_figures(summary, settings.arms)
-        certificates[0].save(settings.out / "certificate.json")
-        (settings.out / CERTIFICATES).mkdir(exist_ok=True)
-        for point, certificate in zip(points, certificates, strict=True):
-            certificate.save(settings.out / CERTIFICATES / f"{name_of(point)}.json")
-        verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
-        files = {
-            "episodes.parquet": parquet(pd.concat(parts), summary),
-            "report.html": sweep_report(summary, verification, figures),
-        }
-        write_results(settings.out, summary, files, figures)
-        count = counted(settings.seeds, "run")
-        print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
-        print(f"files: {settings.out}")
+    claim_folder("sweep", settings.completed)
+    if is_any_trained(settings, settings.arms):
+        print(wrapped(settings.agent_line), flush=True)
+    settings = settings.completed
+    runs = [
+        run_of_arm(settings, loop, certificate, name, index, grid_point=name_of(point))
+        for point, loop, certificate in zip(points, loops, certificates, strict=True)
+        for index in range(settings.seeds)
+        for name in settings.arms
+    ]
+    results = results_of(runs, settings.out, settings)
+    per_point = len(runs) // len(points)
+    parts = [
+        episodes_table(
+            results[i * per_point : (i + 1) * per_point],
+            **{name: float("nan" if value is None else value) for name, value in point.items()},
+        )
+        for i, point in enumerate(points)
+    ]
+    arms = [arm_summaries(part, settings.mode) for part in parts]
+    losses = [{"mean_loss": ncs_env(loop.single()).channel.mean_loss} for loop in loops]
+    summary = {
+        "cells": [point | lost | {"arms": each} for point, lost, each in zip(points, losses, arms, strict=True)]
+    } | experiment_provenance(settings, loops[0], certificates[0], runs)
+    figures = sweep_figures(summary, settings.arms)
+    certificates[0].save(settings.out / "certificate.json")
+    (settings.out / CERTIFICATES).mkdir(exist_ok=True)
+    for point, certificate in zip(points, certificates, strict=True):
+        certificate.save(settings.out / CERTIFICATES / f"{name_of(point)}.json")
+    verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
+    files = {
+        "episodes.parquet": parquet(pd.concat(parts), summary),
+        "report.html": sweep_report(summary, verification, figures),
+    }
+    write_results(settings.out, summary, files, figures)
+    count = counted(settings.seeds, "run")
+    print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
+    print(f"files: {settings.out}")
 
 
 def grid_points(settings: SweepSettings) -> list[_GridPoint]:

@@ -10,7 +10,6 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
-from experiments.json_values import flat
 from experiments.plots.figure_style import ArmStyle
 from experiments.report.text_tables import proofs_text
 from experiments.runs.arms import Arm
@@ -70,6 +69,14 @@ def _origin(command: str, summary: dict[str, Any], verification: Report) -> dict
     settings = summary["settings"]
     shown = {name: _text(value) for name, value in flat(settings).items()}
     return dict(command=command, summary=summary, settings=settings, shown_settings=shown, verification=verification)
+
+
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns JSON values by their dotted names, without the objects that hold others."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
 
 
 @cache

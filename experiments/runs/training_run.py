@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from itertools import pairwise
+from math import nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -17,15 +18,14 @@ from agents.agent_file import AGENT_FILES, write_files
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
-from agents.results import Episode, TrainingPoint, Trajectory
+from agents.results import HISTORY_FILE, Episode, TrainingPoint, Trajectory
 from experiments.baselines import controller, tuned_weights
-from experiments.json_values import to_json
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
 from experiments.settings import LearningSettings
 from experiments.settings.arguments import registration_of
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.validation import LARGEST_NUMBER, counted, shown
+from ncs_gym.validation import counted
 from shields import Certificate
 from shields.json_documents import digest
 
@@ -34,26 +34,6 @@ if TYPE_CHECKING:
 
 # Folder of a run's checkpoints below that of its events.
 CHECKPOINT = "checkpoint"
-# Counts are numbers that floats and tables hold exactly.
-_LARGEST_COUNT = 2**53
-
-
-@dataclass(frozen=True)
-class Start:
-    """An agent that a training goes on from, and what happened in its training.
-
-    Attributes:
-        files: Files of the agent.
-        history: Totals of its training, one point at least.
-    """
-
-    files: dict[str, bytes]
-    history: list[TrainingPoint]
-
-    @property
-    def steps(self) -> int:
-        """Steps that the agent was trained for."""
-        return self.history[-1].steps
 
 
 @dataclass(frozen=True)
@@ -71,6 +51,7 @@ class RunResult:
         trajectory: Trajectory of the first evaluation episode.
         files: Contents of the trained agent's files by name; empty if nothing was trained.
         scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
+        went_on_after: Steps of an interrupted training that this one went on from; 0 for none.
     """
 
     arm: str
@@ -83,6 +64,17 @@ class RunResult:
     trajectory: Trajectory
     files: dict[str, bytes] = field(default_factory=dict)
     scenarios: dict[str, list[Episode]] = field(default_factory=dict)
+    went_on_after: int = 0
+
+    @classmethod
+    def of_json(cls, values: dict[str, Any]) -> RunResult:
+        """Returns the result of what `dataclasses.asdict` made of it, arrays as lists, without files."""
+        episodes = [Episode(**each) for each in values["episodes"]]
+        history = [TrainingPoint(**each) for each in values["history"]]
+        trajectory = Trajectory(**{name: np.array(each) for name, each in values["trajectory"].items()})
+        scenarios = {name: [Episode(**each) for each in played] for name, played in values["scenarios"].items()}
+        parts = {"episodes": episodes, "history": history, "trajectory": trajectory, "scenarios": scenarios}
+        return cls(**values | parts)
 
     @property
     def outcome(self) -> str:
@@ -118,7 +110,8 @@ class TrainingRun:
         settings: Hyperparameters of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
         agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained. Empty for none.
-        start: What the training goes on from; None for one that begins.
+        went_on_after: Steps of an interrupted training that this one goes on from, its checkpoint in the folder of its
+            events; 0 for one that begins. The result is kept under the same key.
     """
 
     arm: str
@@ -137,7 +130,7 @@ class TrainingRun:
     settings: dict[str, Any]
     grid_point: str = ""
     agent_files: dict[str, bytes] = field(default_factory=dict)
-    start: Start | None = None
+    went_on_after: int = 0
 
     result_type = RunResult
     unit = "step"
@@ -168,7 +161,7 @@ class TrainingRun:
 
         A training that goes on meets other random numbers than it had before.
         """
-        return self._seeds(*([self.start.steps] if self.start else []))[0]
+        return self._seeds(*([self.went_on_after] if self.went_on_after else []))[0]
 
     @property
     def evaluation_seed(self) -> int:
@@ -178,7 +171,8 @@ class TrainingRun:
     @property
     def key(self) -> str:
         """SHA-256 of all that the result depends on: settings, environment, source, versions of packages."""
-        names = set(self.__dataclass_fields__) - {"certificate", "certificate_basis", "grid_point", "module"}
+        others = {"certificate", "certificate_basis", "grid_point", "module", "went_on_after"}
+        names = set(self.__dataclass_fields__) - others
         certificate = self.certificate_basis or self.certificate.checksum
         content = {name: getattr(self, name) for name in names}
         content |= {
@@ -187,8 +181,7 @@ class TrainingRun:
             "certificate": certificate,
             "training_loop": _described(self.training_loop, certificate),
             "loop": _described(self.loop, certificate),
-            "agent_files": _digests(self.agent_files),
-            "start": self.start and {"files": _digests(self.start.files), "history": to_json(self.start.history)},
+            "agent_files": {name: hashlib.sha256(file).hexdigest() for name, file in self.agent_files.items()},
         }
         return digest(content | {"versions": versions()})
 
@@ -204,7 +197,7 @@ class TrainingRun:
     @property
     def remaining_steps(self) -> int:
         """Training steps that are left, one at least."""
-        return max(self.steps - self.start.steps, 1) if self.start else self.steps
+        return max(self.steps - self.went_on_after, 1)
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
         """Returns the result; only TensorBoard's events are written."""
@@ -216,8 +209,10 @@ class TrainingRun:
                 train,
             )  # imports torch, which the process that only collects results does without
 
-            logs = log_folder and log_folder / self.name
-            if logs is not None and self.start is None:
+            logs, start, history = log_folder and log_folder / self.name, None, []
+            if logs is not None and self.went_on_after:
+                start, history = _loaded(logs / CHECKPOINT), history_of(logs / CHECKPOINT)
+            elif logs is not None:
                 shutil.rmtree(logs, ignore_errors=True)
             trained = train(
                 self.training_loop,
@@ -228,8 +223,8 @@ class TrainingRun:
                 log_folder=logs,
                 checkpoints=logs and logs / CHECKPOINT,
                 on_progress=on_progress,
-                start=self.start and _loaded(self.start.files),
-                history=self.start.history if self.start else (),
+                start=start,
+                history=history,
             )
         agent = trained.agent if trained else _agent_of(self)
         evaluations = {}
@@ -249,52 +244,12 @@ class TrainingRun:
             trajectory=evaluation.trajectory,
             files=trained.agent.files() if trained else {},
             scenarios={scenario: each.episodes for scenario, each in evaluations.items()},
+            went_on_after=self.went_on_after,
         )
-
-    def require(self, result: RunResult) -> None:
-        """Raises unless a result can be this run's.
-
-        Raises:
-            ValueError: If it has a value that the run cannot have had; the message names the first.
-        """
-        for name, value, holds in _judged(self, result):
-            if not holds:
-                raise ValueError(f"{name} of this run cannot be {shown(value)}")
 
     def _seeds(self, *more: int) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
         return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index, *more]).generate_state(2)]
-
-
-def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, bool]]:
-    """Yields the values of a result by name, and whether they can be those of a run."""
-    yield "arm", result.arm, result.arm == run.arm
-    yield "index", result.index, result.index == run.index
-    steps = result.train_steps
-    yield "train_steps", steps, run.steps <= steps <= _LARGEST_COUNT if run.trains else steps == 0
-    for name in ("train_violation_steps", "train_interventions"):
-        yield name, getattr(result, name), 0 <= getattr(result, name) <= steps
-    yield "history", result.history, bool(result.history) == bool(steps)
-    for before, after in pairwise([TrainingPoint(0, 0.0, 0, 0), *result.history]):
-        counted = after.violation_steps, after.interventions
-        falls = after.violation_steps < before.violation_steps or after.interventions < before.interventions
-        yield "history", after, before.steps < after.steps <= steps and max(counted) <= after.steps and not falls
-    yield "scenarios", result.scenarios, result.scenarios.keys() == set(run.scenarios)
-    others = {f"scenarios, {name}": episodes for name, episodes in result.scenarios.items()}
-    for name, episodes in {"episodes": result.episodes, **others}.items():
-        indices = [each.index for each in episodes]
-        yield name, indices, indices == list(range(run.episodes))
-        for each in episodes:
-            counts = each.violation_steps, each.estimate_violation_steps, each.interventions
-            counts += each.planned, each.proved, each.promised
-            counted = 1 <= each.steps <= _LARGEST_COUNT and 0 <= min(counts) <= max(counts) <= each.steps
-            numbers = abs(each.episode_return) < LARGEST_NUMBER and 0.0 <= each.largest_level < LARGEST_NUMBER
-            yield name, each, counted and numbers
-    (m, n), length = run.certificate.K.shape, result.episodes[0].steps
-    shapes = {"states": (length + 1, n), "estimates": (length + 1, n), "inputs": (length, m), "proposed": (length, m)}
-    for name, array in vars(result.trajectory).items():
-        shape, kind = (shapes[name], np.float64) if name in shapes else ((length,), np.bool_)
-        yield f"trajectory, {name}", array, array.shape == shape and array.dtype == kind
 
 
 def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
@@ -309,7 +264,9 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 def _agent_of(run: TrainingRun) -> Agent | None:
     """Returns the agent that a run does not train: that of its files, or one with initial weights; None for none."""
     if run.agent_files:
-        return _loaded(run.agent_files)
+        with TemporaryDirectory() as folder:
+            write_files(Path(folder), run.agent_files)
+            return _loaded(Path(folder))
     if run.policy_kind != "untrained":
         return None
     from agents.training import untrained
@@ -317,16 +274,25 @@ def _agent_of(run: TrainingRun) -> Agent | None:
     return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
 
 
-def _loaded(files: dict[str, bytes]) -> Agent:
+def _loaded(folder: Path) -> Agent:
     from agents.agent import Agent  # imports torch
 
-    with TemporaryDirectory() as folder:
-        write_files(Path(folder), files)
-        return Agent.load(folder)
+    return Agent.load(folder)
 
 
-def _digests(files: dict[str, bytes]) -> dict[str, str]:
-    return {name: hashlib.sha256(file).hexdigest() for name, file in files.items()}
+def history_of(checkpoint: Path) -> list[TrainingPoint]:
+    """Returns what happened in the training that left a checkpoint; nothing where there is none.
+
+    Raises:
+        ValueError: If the checkpoint is damaged.
+    """
+    path = checkpoint / HISTORY_FILE
+    try:
+        points: Any = json.loads(path.read_bytes()) if path.exists() else []
+        unknown: Any = nan  # null in the file
+        return [TrainingPoint(**{key: unknown if v is None else v for key, v in each.items()}) for each in points]
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"no training can go on from {checkpoint}: it is damaged; --force begins anew") from error
 
 
 def _policy(run: TrainingRun, agent: Agent | None) -> Policy:

@@ -1,4 +1,4 @@
-"""What each command can be told: frozen dataclasses that the parser turns into flags, and the file that keeps them."""
+"""What each command can be told: frozen dataclasses that the parser turns into flags, and their JSON values."""
 
 from experiments.settings.arguments import Assignments
 from experiments.settings.certificates import (
@@ -20,16 +20,9 @@ from experiments.settings.learning import (
     SweepSettings,
     TrainSettings,
 )
-from experiments.settings.settings_file import (
-    INCIDENTAL_SETTINGS,
-    config_defaults,
-    lasting_settings,
-    save_settings,
-    settings_json,
-)
+from experiments.settings.settings_file import lasting_settings
 
 __all__ = [
-    "INCIDENTAL_SETTINGS",
     "Assignments",
     "AttackSettings",
     "AuditSettings",
@@ -46,8 +39,5 @@ __all__ = [
     "SynthesizeSettings",
     "TrainSettings",
     "VerifySettings",
-    "config_defaults",
     "lasting_settings",
-    "save_settings",
-    "settings_json",
 ]

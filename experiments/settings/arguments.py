@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from math import inf
 from pathlib import Path
@@ -15,7 +14,6 @@ import gymnasium as gym
 from cloudpickle import dumps
 from tyro.constructors import PrimitiveConstructorSpec
 
-from agents.hyperparams import with_changes
 from ncs_gym.reading import read_file
 from ncs_gym.validation import shown
 from shields.runtime.safety_filter import LONGEST_HORIZON
@@ -75,21 +73,6 @@ def registration_of(env_id: str) -> str:
     if isinstance(plant := kwargs.get("plant"), str):  # a file, which may be another one later
         kwargs["plant"] = read_file(Path(plant))
     return hashlib.sha256(dumps([sorted(kwargs.items()), spec.max_episode_steps])).hexdigest()
-
-
-def beside_those_of_file(settings: Any, of_file: Any) -> Any:
-    """Returns a command's settings in which the assignments of a settings file hold where none are given.
-
-    Hyperparameters of the file are for its algorithm alone.
-    """
-    merged = {
-        name: with_changes(getattr(of_file, name), getattr(settings, name))
-        for name in ("channel", "hyperparams")
-        if hasattr(settings, name)
-    }
-    if "hyperparams" in merged and settings.algo != of_file.algo:
-        merged["hyperparams"] = {} if settings.hyperparams == of_file.hyperparams else settings.hyperparams
-    return replace(settings, **merged)
 
 
 # Counts are below this, so that no exponent makes an endless number.

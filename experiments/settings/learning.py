@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -22,8 +22,6 @@ from experiments.settings.arguments import (
 )
 from ncs_gym.validation import shown
 
-# Address that starts a Ray cluster of its own on this machine.
-OWN_CLUSTER = "local"
 _ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
 
 
@@ -33,36 +31,22 @@ class BackendSettings:
 
     Attributes:
         engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/scaling.md).
-        jobs: Number of worker processes of the engine "local".
-        ray_address: "local" starts a Ray on this machine for as long as it is needed, "auto" joins the one that runs
-            here, HOST:PORT joins the cluster whose head that is; this machine has to be one of its nodes.
-        ray_wait: Seconds to wait for a node that is large enough for a run: for clusters that grow on demand.
-        cpus_per_run: Processor cores that Ray reserves for a run.
-        gpus_per_run: Graphics cards that Ray reserves for a run.
+        jobs: Worker processes of the engine "local".
+        ray_address: Of the engine "ray": "local" starts a Ray, "auto" and HOST:PORT join one of which this is a node.
     """
 
     engine: Literal["local", "ray"] = "local"
     jobs: int = 2
-    ray_address: str = OWN_CLUSTER
-    ray_wait: float = 0.0
-    cpus_per_run: float = 1.0
-    gpus_per_run: float = 0.0
+    ray_address: str = "local"
 
     def __post_init__(self) -> None:
-        require_limits(self, jobs=(1, MOST_JOBS), ray_wait=0, cpus_per_run=0.0001)
+        require_limits(self, jobs=1)
         if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
-        whole = self.gpus_per_run <= 1.0 or self.gpus_per_run.is_integer()
-        if not 0.0 <= self.gpus_per_run < float("inf") or not whole:
-            raise ValueError(f"--gpus-per-run must be in [0, 1] or a whole number, got {self.gpus_per_run}")
-        if self.engine == "local":
-            for field in fields(BackendSettings)[2:]:
-                if getattr(self, field.name) != field.default:
-                    raise ValueError(f"--{field.name.replace('_', '-')} is a setting of --engine ray")
+        if self.engine == "local" and self.ray_address != "local":
+            raise ValueError("--ray-address is a setting of --engine ray")
 
 
-# Whatever a file of settings says, there are no more worker processes, runs per arm and episodes per run.
-MOST_JOBS, MOST_SEEDS, MOST_EPISODES = 1024, 10_000, 1_000_000
 # Training steps where none belong to tuned hyperparameters.
 _DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
@@ -74,36 +58,27 @@ class LearningSettings(BackendSettings):
     """Settings that the commands that train share.
 
     Attributes:
-        config: Settings file (settings.json) of an earlier run; its settings hold where none are given here.
-        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
-            your own (`ncs_gym.register_plant`).
-        seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
-        steps: Training steps per run, rounded up to whole rollouts; if not given, n_timesteps of the hyperparameters,
-            or 150,000.
+        env: Id of an environment with a plant; module:id imports the module first.
+        seed: Seed of the experiment, >= 0.
+        steps: Training steps per run, in whole rollouts; by default those tuned for the environment, or 150,000.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
-        mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), the closest one
-            after which a certified plan keeps the state in the box ("lookahead"), or the certified K x_hat ("switch";
-            "boundary" applies it unless every action would be safe).
+        mode: What the shield applies in place of an unsafe action (docs/shield.md).
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
-        intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
-        violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
+        intervention_penalty: Taken from the reward per intervention, in arms with "+penalty".
+        violation_penalty: Taken from the reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
-        safe_set: What the shield keeps if its certificate is synthesized: the polytope, or the ellipsoid inside it.
-        between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
-            own; 1 for the sampling instants alone (docs/shield.md).
+        safe_set: What a synthesized certificate keeps.
+        between_samples: Times per step at which the safe box counts (docs/shield.md); by default the plant's own.
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
-            jitter and send_period [steps], quantization_step, max_consecutive_losses.
-        hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
-            n_steps=64 'policy_kwargs={"net_arch": [64, 64]}', JSON values. What is not given is tuned for the
-            environment (agents/tuned), or the default.
-        lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
-        smoke: Run a short version, whatever else is asked for, to see that everything works; unless `--out`
-            names another folder than the usual one, in that with -smoke at the end of its name.
-        force: Replace finished results of other settings in the output folder, which otherwise is refused.
+            jitter, send_period, quantization_step, max_consecutive_losses.
+        hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
+            'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
+        lagrangian: How the arm "lagrangian" adapts its penalty per violating step; no option of the command line.
+        smoke: Run a short version to see that everything works, by default in a folder with -smoke in its name.
+        force: Replace results of other settings in the output folder.
     """
 
-    config: Path | None = None
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     seed: int = 0
     steps: OptionalStepCount = None
@@ -118,7 +93,7 @@ class LearningSettings(BackendSettings):
     between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
-    lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
+    lagrangian: tyro.conf.Suppress[LagrangianSettings] = field(default_factory=LagrangianSettings)
     smoke: bool = False
     force: bool = False
 
@@ -163,7 +138,7 @@ class LearningSettings(BackendSettings):
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
-        counts = {"seeds": (1, MOST_SEEDS), "steps": 1, "episodes": (1, MOST_EPISODES), "seed": 0}
+        counts = {"seeds": 1, "steps": 1, "episodes": 1, "seed": 0}
         require_limits(self, **counts, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
         require_horizon(self, self.mode, *arms)
@@ -174,31 +149,23 @@ class CompareSettings(LearningSettings):
     """Trains agents with and without the shield and compares violations, return and interventions.
 
     Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
-    episodes (common random numbers), prints a table and leaves summary.json, settings.json, episodes.parquet,
-    training.parquet, report.html, figures, models, TensorBoard events and the certificate in the output folder. Started
-    again with the same folder, finished runs are kept.
+    episodes, prints a table and leaves summary.json, settings.json, episodes.parquet, training.parquet, report.html,
+    figures, models, TensorBoard events and the certificate. Started again with the same folder, finished runs are kept.
 
     Attributes:
-        out: Output folder; created if it does not exist.
+        out: Output folder.
         seeds: Number of paired training runs per arm.
-        arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
-            penalty per violation), penalized:WEIGHT, lagrangian (PPO-Lagrangian adapts that penalty), shielded,
-            shielded:MODE, lookahead, trusting and trusting:lookahead (certainty-equivalent: without an error set), psf
-            (a nominal predictive safety filter), these also with a margin in percent as in psf:20, psf:tube.
-            shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
-            intervention, +residual adds the agent's action to that of K. Controllers that are not trained:
-            proportional, lqr, governor (lqr with a reference governor, governor:20 with a margin), random, K-x_hat,
-            zero-input, untrained and pretrained (the agent that comes with the package), alone or behind a filter as
-            in proportional+shielded.
+        arms: unshielded, monitor (unshielded, counts what the shield would do), penalized (a penalty per violation),
+            penalized:WEIGHT, lagrangian (adapts it), shielded, shielded:MODE, lookahead, trusting (no error set), psf
+            (predictive filter), also with a margin in percent, psf:20; shield-at-test; also with +penalty, +residual.
+            Untrained: proportional, lqr, governor, mpc, random, K-x_hat, zero-input, untrained, pretrained, alone or
+            behind a filter, lqr+shielded (docs/experiments.md).
         baselines: Arms that are listed below the others and not drawn.
-        scenarios: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
-            loss, later packets, within the contract), ideal-channel, attacked (the worst disturbance, noise of full
-            size, bursts of losses as long as the contract allows), attacked-on-an-ideal-channel, gaussian (noise
-            without a bound).
-        tuned_arms: Whether arms that were tuned by themselves (`benchmarks.learning`) are trained with what was
-            found: hyperparameters of PPO, the price of a violation, settings of PPO-Lagrangian.
-        noise: "gaussian" draws noise that may exceed the certificate's bounds, and prints the bound on the probability
-            of leaving the safe set beside the episodes that left it.
+        scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
+            attacked-on-an-ideal-channel, gaussian (docs/experiments.md).
+        tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`); no option
+            of the command line.
+        noise: "gaussian" may exceed the certificate's bounds: prints the bound on the probability of an exit.
     """
 
     out: Path = Path("runs/compare")
@@ -213,7 +180,7 @@ class CompareSettings(LearningSettings):
         "proportional+shielded",
     )
     scenarios: tuple[str, ...] = ("as trained",)
-    tuned_arms: bool = False
+    tuned_arms: tyro.conf.Suppress[bool] = False
     noise: Literal["truncated", "gaussian"] = "truncated"
 
 
@@ -221,11 +188,10 @@ class CompareSettings(LearningSettings):
 class TrainSettings(LearningSettings):
     """Trains one agent, evaluates it, and saves it with everything needed to use it.
 
-    Started again with the same folder, an interrupted training goes on from its last checkpoint, and a finished one
-    with more --steps from its agent; --force begins anew.
+    Started again with the same folder, an interrupted training goes on from its last checkpoint; --force begins anew.
 
     Attributes:
-        out: Output folder; created if it does not exist.
+        out: Output folder.
         arm: Arm that the agent is trained in; see the arms of `ncs compare`.
     """
 
@@ -279,7 +245,7 @@ class EvaluateSettings:
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_limits(self, episodes=(1, MOST_EPISODES), seed=0)
+        require_limits(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
             require_horizon(self, self.shield)
 
@@ -354,7 +320,6 @@ class StudySettings(BackendSettings):
     run in parts.
 
     Attributes:
-        config: Settings file (settings.json) of an earlier study; its settings hold where none are given here.
         out: Output folder; created if it does not exist.
         envs: Ids of the environments; the first one comes first in the report.
         seed: Seed of the study, >= 0.
@@ -375,7 +340,6 @@ class StudySettings(BackendSettings):
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 
-    config: Path | None = None
     out: Path = Path("runs/study")
     envs: tuple[str, ...] = NETWORK_ENVS
     seed: int = 0
@@ -395,7 +359,7 @@ class StudySettings(BackendSettings):
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
-        counts = {"seeds": (1, MOST_SEEDS), "episodes": (1, MOST_EPISODES), "channel_episodes": (0, MOST_EPISODES)}
+        counts = {"seeds": 1, "episodes": 1, "channel_episodes": 0}
         require_limits(self, **counts, seed=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")

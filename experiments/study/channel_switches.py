@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
+from agents.agent_file import AGENT_FILES
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
-from experiments.errors import ResultsError
 from experiments.runs.arms import Arm, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
-from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import Assignments, CompareSettings
 from experiments.study.summary import ATTACKED
@@ -59,16 +59,16 @@ def switched(channel: Channel, contract: ChannelContract | None, on: Sequence[st
 def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
     """Returns the agents of `SWITCHED_AGENTS` that a finished comparison trained, by the name of their arm.
 
-    They are those of the first runs, at most `MOST_AGENTS`. Raises ResultsError if they are missing or damaged.
+    They are those of the first runs, at most `MOST_AGENTS`. Raises OSError if they are missing.
     """
-    loop, store = loop_config(settings.env, settings.channel), RunStore(settings.out)
+    loop = loop_config(settings.env, settings.channel)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     arms = {Arm.of(name, settings.mode).name for name in settings.arms}
     agents: dict[str, AgentFiles] = {}
     count = min(settings.seeds, MOST_AGENTS)
     for name in (each for each in SWITCHED_AGENTS if each in arms):
         runs = [run_of_arm(settings.completed, loop, certificate, name, index) for index in range(count)]
-        agents[name] = [_files(store, run) for run in runs]
+        agents[name] = [_files(settings.out / "models" / run.name) for run in runs]
     return agents
 
 
@@ -105,11 +105,8 @@ def channel_switches(settings: CompareSettings, agents: Mapping[str, AgentFiles]
     return rows
 
 
-def _files(store: RunStore, run: TrainingRun) -> dict[str, bytes]:
-    result = store.load(run)
-    if result is None:
-        raise ResultsError(f"there is no result of the training {run.name}: run the comparison again")
-    return result.files
+def _files(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in AGENT_FILES}
 
 
 def _runs(on: Sequence[str], settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[TrainingRun]:

@@ -51,24 +51,24 @@ def study(settings: StudySettings) -> None:
     settings = short_version(settings, **_SMOKE, envs=settings.envs[:1], baselines=baselines)
     for path in settings.quote:
         require_marks(read_text(path))
-    with claim_folder("study", settings):
-        parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
-        episodes, summaries, channels = {}, {}, {}
-        for name, part in parts.items():
-            episodes[name], summaries[name] = compare(part)
-            if settings.channel_episodes:
-                sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
-                channels[name] = channel_switches(sweep, trained_agents(part))
-            print(flush=True)
-        kept = {key: value for key, value in lasting_settings(settings).items() if key != "smoke"}
-        provenance = {"settings": kept, "versions": versions()}
-        summary = study_summary(summaries, episodes) | {"channels": channels} | provenance
-        _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
-        print(f"files: {settings.out}")
+    claim_folder("study", settings)
+    parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
+    episodes, summaries, channels = {}, {}, {}
+    for name, part in parts.items():
+        episodes[name], summaries[name] = compare(part)
+        if settings.channel_episodes:
+            sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
+            channels[name] = channel_switches(sweep, trained_agents(part))
+        print(flush=True)
+    kept = {key: value for key, value in lasting_settings(settings).items() if key != "smoke"}
+    provenance = {"settings": kept, "versions": versions()}
+    summary = study_summary(summaries, episodes) | {"channels": channels} | provenance
+    _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
+    print(f"files: {settings.out}")
 
 
 def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSettings:
-    names = (vars(settings).keys() & CompareSettings.__dataclass_fields__.keys()) - {"config", "out", "smoke"}
+    names = (vars(settings).keys() & CompareSettings.__dataclass_fields__.keys()) - {"out", "smoke"}
     shared = {name: getattr(settings, name) for name in names}
     part = CompareSettings(env=env_id, out=settings.out / short_name(env_id), tuned_arms=True, **shared)
     return replace(part, steps=math.ceil(settings.budget * part.training_steps))

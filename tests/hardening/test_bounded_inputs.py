@@ -62,7 +62,6 @@ def endless(request, tmp_path):
 
 
 def readers():
-    from experiments.settings import CompareSettings, config_defaults
 
     return {
         "bytes": read_file,
@@ -70,11 +69,10 @@ def readers():
         "plant": LinearPlant.load,
         "certificate": Certificate.load,
         "packets": PacketLog.load,
-        "settings": lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings),
     }
 
 
-NAMES = ["bytes", "text", "plant", "certificate", "packets", "settings"]
+NAMES = ["bytes", "text", "plant", "certificate", "packets"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -180,7 +178,6 @@ def with_long(document, path, change):
 def documents(folder):
     """The content of each kind of document, and what loads such a content, whose checksum is right."""
     from agents import Agent, pretrained_folder
-    from experiments.settings import CompareSettings, config_defaults, settings_json
 
     plant = truck_trailer(mass=4000.0)
     certificate = json.loads(json.dumps(certificate_of(plant).document))
@@ -200,14 +197,10 @@ def documents(folder):
             json.loads((agent / "agent.json").read_text()),
             lambda content: (path.write_text(json.dumps(content)), Agent.load(folder)),
         ),
-        "settings": (
-            settings_json("compare", CompareSettings()),
-            as_file(lambda path: config_defaults(["--config", str(path)], "compare", CompareSettings)),
-        ),
     }
 
 
-@pytest.mark.parametrize("name", ["plant", "certificate", "agent", "settings"])
+@pytest.mark.parametrize("name", ["plant", "certificate", "agent"])
 def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     pytest.importorskip("stable_baselines3")
     document, load = documents(tmp_path)[name]

@@ -1,7 +1,6 @@
 """A real Ray on this machine: what it does when processes die, and what a user sees."""
 
 import os
-import re
 import shutil
 import signal
 import socket
@@ -11,18 +10,18 @@ import time
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
 
-from experiments.backends import ray_backend, ray_cluster  # noqa: E402
-from experiments.backends.ray_cluster import portable_task, require_answer  # noqa: E402
+from experiments.backends.execution import results_of  # noqa: E402
+from experiments.backends.ray_tasks import RETRIES, _on_node, ray_tasks  # noqa: E402
 from experiments.errors import ClusterError, RunError  # noqa: E402
 from experiments.runs.provenance import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
 from tests.command import environment, is_alive, ncs_process  # noqa: E402
+from tests.experiments.backends.small_runs import Small  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +29,6 @@ GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seed
 GRID += ["--steps", "2048", "--hyperparams", "n_envs=4"]
 RUNS = 8
 TIMEOUT = 300.0
-ONE_CORE, HALF_A_CORE = (BackendSettings(engine="ray", cpus_per_run=cpus) for cpus in (1.0, 0.5))
 
 
 def command(*arguments):
@@ -75,7 +73,7 @@ def descendants(pid):
 
 
 def working(pid):
-    return [each for each, title in descendants(pid).items() if title == "ray::work"]
+    return [each for each, title in descendants(pid).items() if title == "ray::_on_node"]
 
 
 def until(condition, what):
@@ -122,15 +120,6 @@ def local(tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module")
-def own_ray():
-    """A Ray of the tests' own process."""
-    handler = signal.getsignal(signal.SIGTERM)
-    with ray_backend.connected("local"):
-        assert signal.getsignal(signal.SIGTERM) is handler
-        yield
-
-
 def test_rows_are_those_of_the_local_engine_bit_for_bit(local, tmp_path):
     out, folder = tmp_path / "out", tmp_path / "here"
     (folder / "agents").mkdir(parents=True)  # must not hide the package of that name from the workers
@@ -163,7 +152,7 @@ def test_killed_driver_leaves_no_process_and_goes_on_where_it_was(local, tmp_pat
     run = started("sweep", *GRID, "--engine", "ray", "--out", out)
     until_stored(out, 2, run)
     processes = descendants(run.pid)
-    assert any(title == "ray::work" for title in processes.values())
+    assert any(title == "ray::_on_node" for title in processes.values())
     run.kill()
     run.communicate()
     until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
@@ -214,83 +203,25 @@ def one_sentence(run):
     return run.stderr.strip().splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--cpus-per-run", "100000"], "no node of the cluster has the 100000 cores and 0 gpus of a run"),
-        (["--gpus-per-run", "64"], "no node of the cluster has the 1 cores and 64 gpus of a run"),
-        (["--gpus-per-run", "64", "--ray-wait", "3"], "no node of the cluster has the 1 cores and 64 gpus of a run"),
-    ],
-)
-def test_more_than_any_node_has_is_one_sentence_and_does_not_wait_forever(arguments, words, tmp_path):
-    run = ncs("sweep", *GRID, "--engine", "ray", *arguments, "--out", tmp_path / "out")
-    assert words in one_sentence(run)
-    assert ("waiting up to 3 s" in run.stderr) == ("--ray-wait" in arguments)
-    assert stored(tmp_path / "out") == 0
+def test_error_of_a_run_is_not_retried_and_named(tmp_path):
+    run = Small("its-name", "fail", tmp_path)
+    with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1"):
+        results_of([run], tmp_path, BackendSettings(engine="ray"))
 
 
-def failure_of(function, *arguments):
-    """What is raised where the run "its-name" ends as a remote function does."""
-    error = function.remote(*arguments).future().exception(timeout=TIMEOUT)
-    return ray_backend.RayCluster(None).failure(SimpleNamespace(name="its-name"), error)
+def test_worker_that_always_dies_is_given_up_and_named(tmp_path):
+    run = Small("its-name", "die", tmp_path)
+    with pytest.raises(RunError, match="worker processes died in its-name"):
+        results_of([run], tmp_path, BackendSettings(engine="ray"))
+    assert (tmp_path / "its-name began").read_text() == "began\n" * (1 + RETRIES)
 
 
-def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
-    calls = str(tmp_path / "calls")
-
-    def fail():
-        with open(calls, "a") as file:
-            file.write("call\n")
-        raise KeyError("mine")
-
-    error = failure_of(ray_backend.as_remote(fail, ONE_CORE))
-    assert isinstance(error, RunError)
-    assert str(error).startswith("run its-name: KeyError: 'mine' (NCS_DEBUG=1")
-    assert Path(calls).read_text() == "call\n"
+def test_node_with_another_source_is_refused_in_one_sentence():
+    with pytest.raises(ClusterError, match=r"node .* has another source than the driver: install the same on every"):
+        _on_node(versions() | {"source": "other"}, None)
 
 
-def test_worker_that_always_dies_is_given_up_and_named(own_ray, tmp_path):
-    calls = str(tmp_path / "calls")
-
-    def die():
-        with open(calls, "a") as file:
-            file.write("call\n")
-        os._exit(1)
-
-    error = failure_of(ray_backend.as_remote(die, ONE_CORE))
-    assert isinstance(error, RunError)
-    assert str(error).startswith("run its-name: its worker died, 3 retries included")
-    assert Path(calls).read_text() == "call\n" * (1 + ray_backend.RETRIES)
-
-
-def test_node_with_another_source_is_refused_in_one_sentence(own_ray):
-    error = failure_of(ray_backend.as_remote(portable_task(), ONE_CORE), versions() | {"source": "other"}, b"")
-    assert isinstance(error, ClusterError)
-    assert "another source of ncs-gym than the driver" in str(error)
-
-
-def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
-    (tmp_path / "experiments").mkdir()
-    (tmp_path / "experiments" / "__init__.py").write_text("raise ModuleNotFoundError('no such package')")
-    work = portable_task()
-
-    def bare(path):
-        import sys
-
-        sys.path.insert(0, path)
-        for name in [name for name in sys.modules if name.partition(".")[0] == "experiments"]:
-            del sys.modules[name]
-        try:
-            return work({}, b"")
-        finally:
-            sys.path.remove(path)
-
-    error = failure_of(ray_backend.as_remote(bare, ONE_CORE), str(tmp_path))
-    assert isinstance(error, RunError)
-    assert re.match(r"run its-name: node .* cannot import ncs-gym .*: install the same on every", str(error))
-
-
-def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
+def test_workers_compute_with_as_many_threads_as_local_ones():
     def threads():
         import importlib
         import os
@@ -300,17 +231,8 @@ def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
         importlib.import_module("agents.sb3_vec_env")  # as every training does, which sets torch's
         return os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads()
 
-    assert ray.get(ray_backend.as_remote(threads, HALF_A_CORE).remote()) == threads()
-
-
-def test_listener_that_is_no_ray_is_one_sentence_in_bounded_time(monkeypatch):
-    monkeypatch.setattr(ray_cluster, "JOIN_TIMEOUT", 4.0)
-    start = time.monotonic()
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = f"127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(ClusterError, match=f"no Ray answers at --ray-address {address} within 4 s"):
-            require_answer(address)
-    assert time.monotonic() - start < 20.0
+    with ray_tasks("local"):
+        assert ray.get(ray.remote(threads).remote()) == threads()
 
 
 @contextmanager
@@ -358,15 +280,6 @@ def test_running_cluster_is_used_and_outlives_the_driver(head, local, tmp_path):
     assert_same(out, local)
 
 
-def test_cluster_that_asks_for_a_token_is_one_sentence_in_bounded_time(head, tmp_path):
-    address, own, _ = head
-    start = time.monotonic()
-    other = own | {"HOME": str(tmp_path), "RAY_AUTH_MODE": "disabled"}
-    run = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", tmp_path / "out", **other)
-    assert "it asks for a token (RAY_AUTH_MODE=token" in one_sentence(run)
-    assert time.monotonic() - start < 2 * ray_cluster.JOIN_TIMEOUT
-
-
 def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_path_factory, local, tmp_path):
     out = tmp_path / "out"
     with running_head(tmp_path_factory) as (address, own, process):
@@ -375,7 +288,7 @@ def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_
         process.terminate()
         _, errors = run.communicate(timeout=TIMEOUT)
     assert run.returncode == 2
-    assert errors.strip().splitlines()[-1].startswith("ncs: Ray has ended on this machine")
+    assert "the same command goes on with what is missing" in errors.strip().splitlines()[-1]
     assert "Traceback" not in errors
     finished = stored(out)
     assert 1 <= finished < RUNS

@@ -239,11 +239,6 @@ def test_hyperparameters_are_shown_by_their_names():
     assert "c" * 64 in text
 
 
-@pytest.mark.parametrize(("report", "command"), [(comparison, "compare"), (swept, "sweep")])
-def test_page_says_how_to_run_it_again(report, command):
-    assert f"ncs {command} --config settings.json" in report("shielded")
-
-
 def test_sweep_has_a_row_per_channel_and_arm():
     rows = Reader(swept("unshielded", "monitor", "shielded")).tables["Every channel and arm"]
     assert [row[:6] for row in rows[1:4]] == [

@@ -7,9 +7,8 @@ import pytest
 from agents.loop import BasePolicy, LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
-from experiments.errors import ResultsError
 from experiments.runs.provenance import versions
-from experiments.runs.run_store import RunStore
+from experiments.runs.run_store import load, save
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run
 
@@ -25,17 +24,17 @@ def result(run):
 
 
 @pytest.fixture
-def store(tmp_path, run, result):
-    store = RunStore(tmp_path)
-    store.save(run, result)
-    return store
+def folder(tmp_path, run, result):
+    save(tmp_path, run, result)
+    return tmp_path
 
 
-def test_stored_result_comes_back_exactly(store, run, result):
-    again = store.load(run)
+def test_stored_result_comes_back_exactly(folder, run, result):
+    again = load(folder, run)
+    models = folder / "models" / run.name
     assert again.episodes == result.episodes
     assert repr(again.history) == repr(result.history)  # NaN equals nothing, itself included
-    assert again.files == result.files
+    assert {path.name: path.read_bytes() for path in models.iterdir()} == result.files
     for name, array in vars(result.trajectory).items():
         np.testing.assert_array_equal(getattr(again.trajectory, name), array)
         assert getattr(again.trajectory, name).dtype == array.dtype
@@ -44,8 +43,8 @@ def test_stored_result_comes_back_exactly(store, run, result):
 @pytest.mark.parametrize(
     "change", [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"certificate_basis": "another plant"}]
 )
-def test_result_of_other_settings_is_not_taken(store, run, change):
-    assert store.load(replace(run, **change)) is None
+def test_result_of_other_settings_is_not_taken(folder, run, change):
+    assert load(folder, replace(run, **change)) is None
 
 
 @pytest.mark.parametrize("loop", ["loop", "training_loop"])
@@ -60,24 +59,24 @@ def test_result_of_other_settings_is_not_taken(store, run, change):
         {"shield": None},
     ],
 )
-def test_result_of_another_control_loop_is_not_taken(store, run, loop, change):
+def test_result_of_another_control_loop_is_not_taken(folder, run, loop, change):
     other = replace(getattr(run, loop), **change)
-    assert store.load(replace(run, **{loop: other})) is None
+    assert load(folder, replace(run, **{loop: other})) is None
 
 
-def test_result_behind_another_shield_is_not_taken(store, run, certificate):
+def test_result_behind_another_shield_is_not_taken(folder, run, certificate):
     for change in ({"mode": "project"}, {"penalty": 0.5}, {"mode": "lookahead", "horizon": 4}):
         other = replace(run.loop, shield=replace(run.loop.shield, **change))
-        assert store.load(replace(run, loop=other)) is None
+        assert load(folder, replace(run, loop=other)) is None
     filtered = replace(run.loop, shield=None, filter=EstimateFilterSettings("psf", certificate))
-    assert store.load(replace(run, loop=filtered)) is None
+    assert load(folder, replace(run, loop=filtered)) is None
 
 
-def test_result_of_another_certificate_or_version_is_not_taken(store, run, certificate, monkeypatch):
+def test_result_of_another_certificate_or_version_is_not_taken(folder, run, certificate, monkeypatch):
     other = replace(certificate, provenance=certificate.provenance | {"note": "other"})
-    assert store.load(replace(run, certificate=other)) is None
+    assert load(folder, replace(run, certificate=other)) is None
     monkeypatch.setattr("experiments.runs.training_run.versions", lambda: {"torch": "0"})
-    assert store.load(run) is None
+    assert load(folder, run) is None
 
 
 def test_grid_point_is_no_part_of_the_settings(run):
@@ -85,13 +84,22 @@ def test_grid_point_is_no_part_of_the_settings(run):
     assert replace(run, grid_point="loss0.3").name == "loss0.3-shielded-switch+penalty-1"
 
 
-def test_result_without_its_agent_is_refused(store, run, tmp_path):
-    (tmp_path / "models" / run.name / "model.zip").write_bytes(b"other")
-    with pytest.raises(ResultsError, match="missing or was altered"):
-        store.load(run)
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"3", b"\xff", b"[" * 10_000, None])
+def test_damaged_result_is_said_and_done_again(folder, run, content, capsys):
+    path = folder / "runs" / f"{run.name}.json"
+    document = json.loads(path.read_bytes())
+    del document["result"]["episodes"]
+    path.write_bytes(json.dumps(document).encode() if content is None else content)
+    assert load(folder, run) is None
+    assert f"{run.name}.json is damaged: its run is done again" in capsys.readouterr().err
 
 
-def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, run, result, monkeypatch):
+def test_result_without_its_agent_is_done_again(folder, run):
+    (folder / "models" / run.name / "model.zip").unlink()
+    assert load(folder, run) is None
+
+
+def test_half_stored_result_of_other_settings_leaves_nothing_behind(folder, run, result, monkeypatch):
     # Killed between the agent's files and the run's.
     def killed(path, content):
         if path.suffix == ".json" and path.parent.name == "runs":
@@ -100,8 +108,8 @@ def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, run, 
 
     monkeypatch.setattr("experiments.runs.run_store.write_atomically", killed)
     with pytest.raises(KeyboardInterrupt):
-        store.save(replace(run, steps=257), replace(result, files={"model.zip": b"new", "agent.json": b"new"}))
-    assert store.load(run) is None
+        save(folder, replace(run, steps=257), replace(result, files={"model.zip": b"new", "agent.json": b"new"}))
+    assert load(folder, run) is None
 
 
 def test_changed_source_is_another_key(run, monkeypatch):
@@ -119,19 +127,13 @@ def test_runs_of_one_name_are_refused(run, tmp_path):
 
 
 def test_nothing_stored_is_nothing_loaded(run, tmp_path):
-    assert RunStore(tmp_path).load(run) is None
+    assert load(tmp_path, run) is None
 
 
-def test_stored_file_is_data_only(store, run, tmp_path):
-    document = json.loads((tmp_path / "runs" / f"{run.name}.json").read_text())
-    assert document["run"]["key"] == run.key
-    assert set(document["run"]["result"]["files"]) == {"model.zip", "agent.json"}
-
-
-def test_finished_runs_are_not_run_again(store, run, result, tmp_path, monkeypatch, capsys):
+def test_finished_runs_are_not_run_again(folder, run, result, tmp_path, monkeypatch, capsys):
     ran = []
 
-    def record(runs, where, keep):
+    def record(runs, counts, where, keep):
         for each in runs:
             ran.append(each.name)
             keep(each, replace(result, index=2))

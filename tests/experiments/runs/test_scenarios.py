@@ -12,7 +12,7 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.report.text_tables import scenario_text, summary_text
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
-from experiments.runs.run_store import RunStore
+from experiments.runs.run_store import load, save
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
@@ -87,10 +87,9 @@ def test_scenarios_are_stored_beside_the_evaluation_as_trained(certificate, resu
     for scenario, episodes in result.scenarios.items():
         assert episodes == run_of(certificate, run.arm, (scenario,)).execute(lambda steps: None).scenarios[scenario]
         assert episodes != result.episodes
-    store = RunStore(tmp_path)
-    store.save(run, result)
-    assert store.load(run).scenarios == result.scenarios
-    assert store.load(replace(run, scenarios=ALL[:1])) is None
+    save(tmp_path, run, result)
+    assert load(tmp_path, run).scenarios == result.scenarios
+    assert load(tmp_path, replace(run, scenarios=ALL[:1])) is None
 
 
 @pytest.mark.slow

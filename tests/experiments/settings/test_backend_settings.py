@@ -4,14 +4,14 @@ import pytest
 
 from experiments.__main__ import COMMANDS
 from experiments.runs.training_run import TrainingRun
-from experiments.settings import INCIDENTAL_SETTINGS, BackendSettings
+from experiments.settings import BackendSettings, lasting_settings
 from experiments.settings.learning import CompareSettings, SweepSettings
 from tests.command import assert_one_sentence, ncs
 
 
 @pytest.mark.parametrize("address", ["local", "auto", "head:6379", "my-head.example:6379", "[::1]:1"])
 def test_addresses_of_clusters_are_taken(address):
-    assert BackendSettings(engine="ray", ray_address=address, gpus_per_run=0.25, cpus_per_run=0.5).jobs == 2
+    assert BackendSettings(engine="ray", ray_address=address).jobs == 2
 
 
 @pytest.mark.parametrize("command", ["compare", "sweep"])
@@ -27,7 +27,7 @@ def test_results_of_every_engine_have_the_same_key_and_provenance():
     names = set(BackendSettings.__dataclass_fields__)
     assert names
     assert not names & set(TrainingRun.__dataclass_fields__)
-    assert names < set(INCIDENTAL_SETTINGS)
+    assert not names & lasting_settings(CompareSettings()).keys()
 
 
 def test_engines_are_offered_by_the_commands_with_many_runs():

@@ -1,15 +1,13 @@
-"""Which hyperparameters a command trains with: those given, those of a file, those tuned, the defaults."""
-
-from dataclasses import replace
+"""Which hyperparameters a command trains with: those given, those tuned, the defaults."""
 
 import pytest
 
 from agents import tuned_hyperparams, tuned_steps
-from agents.hyperparams import DEFAULTS, complete_hyperparams
+from agents.hyperparams import DEFAULTS
 from experiments.__main__ import parse
 from experiments.runs.loops import loop_config
 from experiments.runs.training_run import require_trainable
-from experiments.settings import CompareSettings, SweepSettings, TrainSettings, save_settings
+from experiments.settings import CompareSettings, SweepSettings, TrainSettings
 
 CART_POLE = "ncs_gym/CartPole-v0"
 
@@ -70,23 +68,11 @@ def test_what_is_given_wins_over_the_tuned_values():
     assert settings.completed == replace(settings, steps=5000, hyperparams=expected)
 
 
-def test_completed_settings_come_back_whatever_is_tuned_later(tmp_path, monkeypatch):
+def test_completed_settings_have_steps_and_all_hyperparameters():
     completed = CompareSettings(env=CART_POLE, hyperparams={"policy_kwargs": {"net_arch": [16]}}).completed
-    found = completed.all_hyperparams
-    assert completed.hyperparams == found
-    save_settings(tmp_path / "s.json", "compare", completed)
-    later = complete_hyperparams("PPO", {"n_epochs": 1, "vf_coef": 0.1, "policy_kwargs": {"log_std_init": 1.0}})
-    monkeypatch.setattr("experiments.settings.learning.tuned_hyperparams", lambda *_: later)
-    read = parse(["compare", "--config", str(tmp_path / "s.json")])
-    assert read == completed
-    assert read.all_hyperparams == found
-    assert "hyperparameters as given: " in read.agent_line
-
-
-def test_file_that_gives_an_environment_alone_gets_its_tuned_hyperparameters(tmp_path):
-    save_settings(tmp_path / "s.json", "compare", CompareSettings(env=CART_POLE))
-    read = parse(["compare", "--config", str(tmp_path / "s.json")])
-    assert read.all_hyperparams == tuned_hyperparams(CART_POLE)
+    assert completed.hyperparams == completed.all_hyperparams
+    assert completed.completed == completed
+    assert "hyperparameters as given: " in completed.agent_line
 
 
 @pytest.mark.parametrize("algo", DEFAULTS)

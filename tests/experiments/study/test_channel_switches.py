@@ -8,7 +8,6 @@ import gymnasium as gym
 import pytest
 
 from experiments.backends.execution import results_of
-from experiments.errors import ResultsError
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import certificate_of, changed_channel, loop_config
 from experiments.settings import CompareSettings
@@ -64,7 +63,7 @@ def test_agents_are_those_that_the_comparison_left(compared):
     for index, files in enumerate(agents["lookahead"]):
         folder = settings.out / "models" / f"lookahead-{index}"
         assert files == {path.name: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(ResultsError, match="lookahead-2"):
+    with pytest.raises(FileNotFoundError, match="lookahead-2"):
         trained_agents(replace(settings, seeds=3))
 
 
