@@ -36,7 +36,7 @@ from ncs_gym import NCSEnv
 from ncs_gym.network.contract import largest_age
 from ncs_gym.network.wire import SHORTEST_KEY
 from ncs_gym.reading import LARGEST_KEY, read_file
-from ncs_gym.rendering.phase_plane import range_of
+from ncs_gym.rendering.phase_plane import ends_of
 from shields import Certificate, Infeasible, certificate_for
 from shields.atomic_write import write_atomically
 from shields.certificate_text import counted
@@ -156,7 +156,7 @@ class LiveView:
     """Shows the loop while it runs: a table with rich if it is installed, else a line per second; or nothing."""
 
     def __init__(self, settings: LoopSettings, env: NCSEnv) -> None:
-        self._ranges = {name: range_of(env.plant, i) for i, name in enumerate(env.plant.state_names)}
+        self._ranges = {name: ends_of(env.plant, i) for i, name in enumerate(env.plant.state_names)}
         self._is_shown = settings.live == "yes" or (settings.live == "auto" and sys.stdout.isatty())
         self._next, self._seen, self._live = 0.0, Counter[str](), None
 
@@ -200,7 +200,7 @@ class LiveView:
         for title in ("state", "estimate", "of the box"):
             table.add_column(title, min_width=12)
         for name, limits in self._ranges.items():
-            share = (row[f"x_hat_{name}"] - limits.middle) / limits.half
+            share = (2.0 * row[f"x_hat_{name}"] - limits.sum()) / (limits[1] - limits[0])
             place = min(max(round(15 * (1 + share)), 0), 30)
             bar = "".join("#" if i == place else "|" if i in (0, 15, 30) else "-" for i in range(31))
             table.add_row(name, f"{row[f'x_hat_{name}']:.4f}", f"{bar} {share:+.0%}")

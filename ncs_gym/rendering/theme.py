@@ -1,7 +1,7 @@
 """How a frame looks: its layout in pixels, its colors, and how numbers and units are written.
 
 The colors stay apart for color-blind readers (hues of Okabe and Ito), and no meaning rests on hue alone: the lost
-packet is a cross, the estimate is dashed or hollow, the safe box is dashed, and a violation is also written in words.
+packet is a cross, the estimate is dashed or hollow, limits are dashed, and a violation is also written in words.
 """
 
 from __future__ import annotations

@@ -312,6 +312,16 @@ def test_plane_shows_safe_set_error_plan_path_and_interventions_in_their_sizes_a
     assert count(frame, theme.DANGER, theme.Rect(theme.PLANE.right - 20, theme.PLANE.bottom - 20, 20, 20)) > 20
 
 
+def test_outline_of_a_set_is_around_its_projection_and_touches_it():
+    plant, polytope = (made := SafetyShield(gym.make("ncs_gym/CartPole-v0"))).unwrapped.plant, made.certificate.polytope
+    corners = PhasePlane(plant, (0, 2))._outline(polytope)
+    directions = np.zeros((8, 4))
+    directions[:, [0, 2]] = np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
+    tight = (directions[:, [0, 2]] @ corners.T).max(axis=1) / polytope.support(directions)
+    assert (tight >= 1.0 - 1e-9).all()
+    assert (tight <= 1.01).all()
+
+
 def test_header_and_panel_show_interventions_and_violations():
     acting = replace(QUIET, intervened=True, interventions=1)
     frames = [picture(step=1, input=1.0, annotation=note) for note in (QUIET, acting)]
