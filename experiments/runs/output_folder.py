@@ -42,7 +42,7 @@ _LOCK = ".lock"
 # What the operating system says where there are no locks.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 # What stands for a finished experiment, and what is drawn and listed of it.
-_FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
+_FIGURES = ("scatter", "training", "episode", "violations", "return", "states", "inputs")
 _MADE_OF_RESULTS = ("summary.json", "report.html", "episodes.parquet", "training.parquet")
 _MADE_OF_RESULTS += tuple(f"figures/{name}.png" for name in _FIGURES)
 # Differences that a message lists, and characters of each value.
