@@ -53,12 +53,7 @@ class Annotation:
 
 
 class PacketRecord(NamedTuple):
-    """When a packet was sent and when it arrives.
-
-    Attributes:
-        stamp: The step at which it was sent.
-        arrival: The step at which it arrives; None if it is lost.
-    """
+    """The step at which a packet was sent, and that at which it arrives; None if it is lost."""
 
     stamp: int
     arrival: int | None

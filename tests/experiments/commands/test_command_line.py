@@ -39,7 +39,7 @@ def test_smoke_run_leaves_every_file_of_the_contract(smoke):
         expected |= {f"models/{arm}-{i}/{name}" for i in range(2) for name in ("model.zip", "agent.json")}
     expected |= {f"runs/{name}-{i}.json" for i in range(2) for name in TRAINED + FIXED}
     assert {path for path in left if not path.startswith("figures/")} == expected
-    assert {f"figures/{name}.png" for name in ("training", "phase", "episode")} <= left
+    assert {f"figures/{name}.png" for name in ("training", "scatter", "episode")} <= left
     assert len(list(out.rglob("events.out.tfevents*"))) == 4
 
 
