@@ -82,7 +82,7 @@ def compare(settings: CompareSettings) -> Comparison:
     findings = findings_of(summary)
     if "gaussian_noise" in summary:
         findings += gaussian_sentences(summary["gaussian_noise"])
-    figures = comparison_figures(plant, certificate, summary, by_arm(results))
+    figures = comparison_figures(plant, summary, by_arm(results))
     certificate.save(settings.out / "certificate.json")
     files = {
         "episodes.parquet": parquet(episodes, summary),

@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.commands import require_extra, short_version
-from experiments.plots.animation import FORMATS, save_animation
+from experiments.plots.animation import FORMATS, save_frames
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
@@ -31,16 +31,14 @@ def render(settings: RenderSettings) -> None:
     settings = short_version(settings, **_SMOKE)
     registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
-        raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
+        raise ValueError(f"--out must end in {' or '.join(FORMATS)}, got {settings.out}")
     require_place(settings.out)
     if settings.policy not in UNTRAINED_POLICIES:
         require_extra("train", "stable_baselines3", "torch")
-    if settings.out.suffix == ".mp4":
-        require_extra("render", "imageio_ffmpeg")
     modes = ("none", settings.shield) if settings.side_by_side else (settings.shield,)
     renderers = [_EpisodeRenderer(settings, mode) for mode in modes]
     frames = map(_side_by_side, _frames(renderers, settings.steps))
-    size = save_animation(frames, settings.out, settings.fps, settings.width)
+    size = save_frames(frames, settings.out, settings.fps)
     for renderer in renderers:
         print(renderer)
     print(f"saved to {settings.out} ({size / 1e6:.2f} MB)")

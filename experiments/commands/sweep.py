@@ -12,8 +12,7 @@ from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summaries, episodes_table, parquet
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.plots.heatmaps import sweep_figures
-from experiments.report.html import sweep_report
+from experiments.plots.heatmaps import sweep_map
 from experiments.report.text_tables import sweep_table
 from experiments.runs.arms import full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
@@ -24,7 +23,6 @@ from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
-from shields import verify
 
 # Budget of `--smoke`, which takes the first and the last value of each side of the grid.
 _SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
@@ -77,17 +75,13 @@ def sweep(settings: SweepSettings) -> None:
     summary = {
         "cells": [point | lost | {"arms": each} for point, lost, each in zip(points, losses, arms, strict=True)]
     } | experiment_provenance(settings, loops[0], certificates[0], runs)
-    figures = sweep_figures(summary, settings.arms)
+    figure = sweep_map(summary["cells"], settings.arms)
     certificates[0].save(settings.out / "certificate.json")
     (settings.out / CERTIFICATES).mkdir(exist_ok=True)
     for point, certificate in zip(points, certificates, strict=True):
         certificate.save(settings.out / CERTIFICATES / f"{name_of(point)}.json")
-    verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
-    files = {
-        "episodes.parquet": parquet(pd.concat(parts), summary),
-        "report.html": sweep_report(summary, verification, figures),
-    }
-    write_results(settings.out, summary, files, figures)
+    files = {"episodes.parquet": parquet(pd.concat(parts), summary)}
+    write_results(settings.out, summary, files, {"violations": (figure.caption, figure.png)})
     count = counted(settings.seeds, "run")
     print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
     print(f"files: {settings.out}")

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from tqdm import tqdm
 
 from experiments.paper.paper_example import PaperExample
-from experiments.plots.comparison_figures import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import STYLE, CaptionedFigure, with_unit
 from experiments.settings.certificates import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
@@ -161,10 +160,12 @@ def _draw_states(axis: Axes, simulation: Simulation) -> None:
     for i, path in enumerate(simulation.states):
         label = None if i else "true state"
         axis.plot(path[:, 0], path[:, 1], color=_COLOR, lw=0.6, alpha=0.5, label=label)
-    axis.plot(*projected_ellipsoid(design.L, (0, 1)).T, color="black", lw=1.4, label="safe set")
-    box = projected_box(design.plant.box, design.plant.box_ends, (0, 1))
-    assert box is not None
-    axis.plot(*box.T, color="black", lw=1.0, ls="--", label="safe box")
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    outline = np.linalg.cholesky(design.L) @ np.stack([np.cos(angle), np.sin(angle)])
+    axis.plot(*outline, color="black", lw=1.4, label="safe set")
+    (left, bottom), (right, top) = design.plant.own_limits
+    box = [left, right, right, left, left], [bottom, bottom, top, top, bottom]
+    axis.plot(*box, color="black", lw=1.0, ls="--", label="safe box")
     axis.set_xlabel("coupling stretch [m]")
     axis.set_ylabel("stretch rate [m/s]")
     axis.set_aspect("equal")

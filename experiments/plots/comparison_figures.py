@@ -1,4 +1,4 @@
-"""The figures of a comparison: cost and return, training curves, one episode over time, and the phase plane."""
+"""The figures of a comparison: cost and return, training curves, and one episode over time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from scipy.linalg import null_space, orth
-from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from agents.results import Trajectory
 from experiments.plots.figure_style import (
@@ -25,15 +23,12 @@ from experiments.plots.figure_style import (
     input_labels,
     label,
     legend_below,
-    state_labels,
     thousands,
     with_unit,
 )
 from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.training_run import RunResult
 from ncs_gym import LinearPlant
-from ncs_gym.plants.past_inputs import inputs_under_way
-from shields import Certificate
 
 _INK = "#222222"
 _LIMIT = {"color": _INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
@@ -44,16 +39,10 @@ _FEW_POINTS = 5
 # The rate of interventions is averaged over this many steps, an episode of 200 in each of 64 environments: it rises and
 # falls with the episodes, which start together.
 RATE_WINDOW = 64 * 200
-# Largest number of panels side by side.
-_COLUMNS = 4
-# The view is the projection of box and safe set, enlarged by this factor; states farther away are left out.
-_VIEW = 3.0
-# Directions whose projection is shorter than this lie across the plane.
-_FLAT = 1e-9
 
 
 def comparison_figures(
-    plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: ResultsByArm
+    plant: LinearPlant, summary: dict[str, Any], results: ResultsByArm
 ) -> dict[str, tuple[str, bytes]]:
     """Returns caption and PNG file of every figure by name, what the findings are about first."""
     arms = {name: results[name] for name in summary["arms"]}
@@ -62,8 +51,6 @@ def comparison_figures(
     if trained:
         figures["training"] = training_figure(trained)
     figures["episode"] = episode_figure(plant, arms)
-    if plant.n - inputs_under_way(plant) > 1:  # a single state has no phase plane
-        figures["phase"] = phase_figure(plant, certificate, arms)
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}
 
 
@@ -300,120 +287,3 @@ def _draw_events(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
     axis.set_ylim(-0.6, len(names) - 0.4)
     axis.tick_params(axis="y", length=0)
     axis.grid(False)
-
-
-def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> CaptionedFigure:
-    """Returns two states of the first evaluation episode of each run, a panel per arm, with safe box and safe set."""
-    states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
-    plane = plane_of(certificate, states, plant.n - inputs_under_way(plant))
-    box = projected_box(plant.box, plant.box_ends, plane)
-    outlines = {"safe set": (_outline(certificate, plane), "-"), "safe box": (box, "--")}
-    prefix = "" if plant.n == 2 else "projection of the "
-    drawn = np.concatenate([outline for outline, _ in outlines.values() if outline is not None])
-    middle, extent = 0.5 * (drawn.max(axis=0) + drawn.min(axis=0)), 0.5 * np.ptp(drawn, axis=0)
-    furthest = np.abs(states[:, plane] - middle).max(axis=0)
-    half = np.clip(1.05 * furthest, 1.08 * extent, _VIEW * extent)
-    caption = "Phase plane: true states of the first evaluation episode of each run, for every arm."
-    if plant.n > 2:
-        caption += (
-            f" Of the {plant.n} states the two that come closest to the boundary of the safe set,"
-            f" {plant.state_names[plane[0]]} and {plant.state_names[plane[1]]};"
-            " the curves are the projections of safe set and safe box on their plane, and a state within a projection"
-            " may lie outside of the set."
-        )
-    if (furthest > _VIEW * extent).any():
-        caption += " Some trajectories leave the view."
-    x, y = (with_unit(state_labels(plant)[i], plant.state_units[i]) for i in plane)
-    rows = -(-len(arms) // _COLUMNS)
-    columns = -(-len(arms) // rows)
-    with matplotlib.rc_context(STYLE):
-        figure = CaptionedFigure((min(11.0, 1.4 + 3.2 * columns), 0.9 + 2.9 * rows), caption)
-        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        low, high = middle - half, middle + half
-        panels[0, 0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        handles: dict[str, Artist] = {}
-        for at, (panel, (name, results)) in enumerate(zip(panels.flat, arms.items(), strict=False)):
-            for title, (outline, line) in outlines.items():
-                if outline is not None:
-                    (handles[prefix + title],) = panel.plot(*outline.T, color=_INK, lw=1.2, ls=line)
-            for result in results:
-                handles |= _draw_path(panel, plant, result.trajectory, plane, name, len(results))
-            lowest = at + columns >= len(arms)  # of its column, though perhaps not in the last row
-            label(panel, x if lowest else "", y if at % columns == 0 else "", name)
-            panel.tick_params(labelbottom=lowest)
-        for panel in panels.flat[len(arms) :]:
-            panel.set_visible(False)
-        legend_below(figure, handles)
-        return figure
-
-
-def plane_of(certificate: Certificate, states: np.ndarray, own: int) -> tuple[int, int]:
-    """Returns the two states that are farthest from the middle of the safe set, in units of its extent; ascending.
-
-    Args:
-        certificate: Of the safe set.
-        states: Shape (k, n).
-        own: How many states count, the first ones; those behind are past inputs.
-    """
-    safe_set, axes = certificate.safe_set, np.eye(states.shape[1])[:own]
-    high, low = safe_set.support(axes), -safe_set.support(-axes)
-    furthest = (np.abs(2.0 * states[:, :own] - high - low) / (high - low)).max(axis=0)
-    first, second = sorted(np.argsort(-furthest, kind="stable")[:2].tolist())
-    return first, second
-
-
-def _draw_path(
-    axis: Axes, plant: LinearPlant, path: Trajectory, plane: tuple[int, int], arm: str, count: int
-) -> dict[str, Artist]:
-    x, y = path.states[:, plane].T
-    axis.plot(x, y, color=ArmStyle.of(arm).color, lw=0.9, alpha=max(0.8 - 0.05 * count, 0.3))
-    (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=_INK, mew=1.0)
-    handles: dict[str, Artist] = {"start": start}
-    if (violating := _violating(path, plant)).any():
-        (cross,) = axis.plot(x[violating], y[violating], "x", color=_INK, ms=4.5, mew=1.0)
-        handles["violation"] = cross
-    return handles
-
-
-def _outline(certificate: Certificate, plane: tuple[int, int]) -> np.ndarray:
-    """Returns points around the projection of the safe set onto two states, shape (k, 2); the first one is the last."""
-    if certificate.polytope is None:
-        return projected_ellipsoid(certificate.L, plane)
-    corners = certificate.polytope.outline(plane)
-    return np.concatenate([corners, corners[:1]])
-
-
-def projected_ellipsoid(shape: np.ndarray, plane: tuple[int, int], points: int = 361) -> np.ndarray:
-    """Returns the outline of the projection of {x : x' shape^-1 x <= 1} on two coordinates, shape (points, 2).
-
-    The projection of an ellipsoid is the ellipse whose shape is the block of the two coordinates.
-
-    Args:
-        shape: Shape of the ellipsoid, positive definite, shape (n, n).
-        plane: The two coordinates.
-        points: Number of points of the outline.
-    """
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
-    return (np.linalg.cholesky(shape[np.ix_(plane, plane)]) @ np.stack([np.cos(angle), np.sin(angle)])).T
-
-
-def projected_box(rows: np.ndarray, ends: np.ndarray, plane: tuple[int, int]) -> np.ndarray | None:
-    """Returns the outline of the projection of {x : low_j <= c_j x <= high_j}, closed, shape (corners + 1, 2).
-
-    None if it is unbounded, or a row has one end alone.
-
-    Args:
-        rows: Rows c_j, shape (k, n).
-        ends: low < 0 and high > 0, shape (2, k).
-        plane: The two coordinates.
-    """
-    pick, free = np.eye(rows.shape[1])[list(plane)], null_space(rows)
-    # Along unlimited directions the box is a prism over these coordinates, in which it is bounded.
-    basis = orth(rows.T)
-    if (free.size and np.abs(pick @ free).max() > _FLAT) or basis.shape[1] == 1 or not np.isfinite(ends).all():
-        return None
-    walls, (low, high) = rows @ basis, ends
-    sides = np.vstack([np.column_stack([walls, -high]), np.column_stack([-walls, low])])
-    corners = HalfspaceIntersection(sides, np.zeros(basis.shape[1])).intersections @ basis.T @ pick.T
-    hull = corners[ConvexHull(corners).vertices]
-    return np.vstack([hull, hull[:1]])

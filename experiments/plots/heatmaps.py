@@ -1,10 +1,11 @@
-"""Heatmaps: those of a sweep, a panel per arm, and that of `ncs requirements`, where certificates end."""
+"""Heatmaps: that of a sweep, a panel per arm, and that of `ncs requirements`, where certificates end."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -14,7 +15,6 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import Rectangle
 
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands
-from experiments.runs.arms import Arm
 from experiments.runs.loops import losses_text
 from ncs_gym.validation import counted
 
@@ -27,83 +27,39 @@ _SIDE_LABELS = {"delay": "delay [steps]", "downlink_loss": "loss of commands"}
 _LETTERS_PER_INCH = 11
 # Largest number of panels side by side.
 _COLUMNS, _COLUMNS_OF_NETWORKS = 4, 3
-# A color scale without a fixed start spans at least this fraction of the largest value: near ones look alike.
-_SMALLEST_SPAN = 0.1
+# The scale of violating episodes reaches at least this far [%].
+_LEAST_TOP = 10.0
 # Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
 _DARK = 0.45
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _BOUNDARY, _TODAY = "#c1272d", "#ff9800"
 
 
-class _Quantity(NamedTuple):
-    """What a heatmap shows: the entry `key` of an arm's summary times a factor, on a color scale from low to high.
-
-    Without an end given, and beyond the highest one, the scale reaches to the values.
-    """
-
-    key: str
-    title: str
-    colors: str
-    low: float | None
-    high: float | None
-    caption: str
-    factor: float = 100.0
-    of_shields: bool = False
-
-
-_VIOLATIONS = "Violations: fraction of evaluation episodes in which the true state violates, over all runs of an arm."
-_RETURN = "Return: mean of the evaluation episodes, without penalties; one color scale for all arms."
-_INTERVENTIONS = "Interventions: fraction of the agent's actions in evaluation that the shield overrides."
-QUANTITIES = {
-    "violations": _Quantity("eval_violation_rate", "violating episodes [%]", "OrRd", 0.0, 10.0, _VIOLATIONS),
-    "return": _Quantity("eval_return_mean", "mean return", "cividis", None, None, _RETURN, factor=1.0),
-    "interventions": _Quantity(
-        "intervention_rate", "actions overridden [%]", "PuBu", 0.0, None, _INTERVENTIONS, of_shields=True
-    ),
-}
-
-
-def sweep_figures(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name; without an arm that has a shield, none of interventions."""
-    figures = {}
-    for name, quantity in QUANTITIES.items():
-        shown = [arm for arm in arms if not quantity.of_shields or Arm.of(arm).mode is not None]
-        if shown:
-            figure = sweep_map(summary["cells"], shown, quantity)
-            figures[name] = (figure.caption, figure.png)
-    return figures
-
-
-def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
-    """Returns one quantity: a panel per arm and combination of what the axes do not show."""
+def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> CaptionedFigure:
+    """Returns the violating episodes: a panel per arm and combination of what the axes do not show."""
     side = "delay" if all(cell.get("downlink_loss") is None for cell in cells) else "downlink_loss"
     losses, values = (sorted({cell[each] for cell in cells}) for each in ("loss", side))
     others = list(dict.fromkeys(_other(cell, side) for cell in cells))
     varied = [len(set(values)) > 1 for values in zip(*others, strict=True)]
     panels = {}
-    for other in others:
-        for arm in arms:
-            panel = panels[_title(arm, other, varied)] = np.full((len(values), len(losses)), np.nan)
-            for cell in cells:
-                if _other(cell, side) == other:
-                    number = quantity.factor * cell["arms"][arm][quantity.key]
-                    panel[values.index(cell[side]), losses.index(cell["loss"])] = number
-    fields = list(panels.values())
-    low = np.nanmin(fields) if quantity.low is None else quantity.low
-    high = np.nanmax(fields) if quantity.high is None else max(quantity.high, np.nanmax(fields))
-    if quantity.low is None and (missing := _SMALLEST_SPAN * max(abs(low), abs(high)) - (high - low)) > 0.0:
-        low, high = low - missing / 2, high + missing / 2
-    norm = Normalize(low, high if high > low else low + 1.0)  # a scale has a length where all values are zero, too
+    for other, arm in product(others, arms):
+        panel = panels[_title(arm, other, varied)] = np.full((len(values), len(losses)), np.nan)
+        for cell in cells:
+            if _other(cell, side) == other:
+                rate = cell["arms"][arm]["eval_violation_rate"]
+                panel[values.index(cell[side]), losses.index(cell["loss"])] = 100.0 * rate
     runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
-    caption = f"{quantity.caption} {counted(runs, 'run')} per field."
-    if quantity.of_shields and "monitor" in arms:
-        caption += " The monitor's are what the shield would have overridden."
+    caption = (
+        "Violations: fraction of evaluation episodes in which the true state violates, over all runs of an arm. "
+        f"{counted(runs, 'run')} per field."
+    )
     if not varied[1] and cells[0]["burst_length"]:
         caption += f" Losses come in bursts of {cells[0]['burst_length']:g} packets on average."
     caption = " ".join(filter(None, (caption, losses_text(cells))))
     across = -(-len(arms) // -(-len(arms) // _COLUMNS))
+    norm = Normalize(0.0, max(_LEAST_TOP, *(float(np.nanmax(panel)) for panel in panels.values())))
     sides: tuple[_Side, _Side] = (_SIDE_LABELS[side], values), ("loss probability", losses)
-    return _maps(panels, *sides, quantity.title, quantity.colors, norm, across, caption)[0]
+    return _maps(panels, *sides, "violating episodes [%]", "OrRd", norm, across, caption)[0]
 
 
 def requirements_map(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -11,9 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.plots.figure_style import ArmStyle
-from experiments.report.text_tables import proofs_text
 from experiments.runs.arms import Arm
-from experiments.runs.loops import losses_text
 from shields import Report
 
 # Pixels of a figure per pixel of the page: the widest figures then fill it, and letters have the same size in all.
@@ -28,27 +26,19 @@ Figures = Mapping[str, tuple[str, bytes]]
 
 def comparison_report(summary: dict[str, Any], verification: Report, figures: Figures, findings: list[str]) -> str:
     """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline."""
-    runs, title = max(arm["runs"] for arm in summary["arms"].values()), f"Safe learning on {summary['settings']['env']}"
-    context = _origin("compare", summary, verification)
-    trains = _trains([summary["arms"] | summary["references"]])
+    settings, arms = summary["settings"], summary["arms"] | summary["references"]
     return render_page(
-        "comparison.html.j2", figures, title=title, runs=runs, trains=trains, findings=findings, **context
+        "comparison.html.j2",
+        figures,
+        title=f"Safe learning on {settings['env']}",
+        runs=max(arm["runs"] for arm in summary["arms"].values()),
+        trains=any(arm["train_steps"] for arm in arms.values()),
+        findings=findings,
+        summary=summary,
+        settings=settings,
+        shown_settings={name: _text(value) for name, value in flat(settings).items()},
+        verification=verification,
     )
-
-
-def sweep_report(summary: dict[str, Any], verification: Report, figures: Figures) -> str:
-    """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings."""
-    title, context = f"Channels of {summary['settings']['env']}", _origin("sweep", summary, verification)
-    cells = summary["cells"]
-    context |= {"losses": losses_text(cells), "proofs": proofs_text(cells)}
-    return render_page(
-        "sweep.html.j2", figures, title=title, trains=_trains([cell["arms"] for cell in cells]), **context
-    )
-
-
-def _trains(groups: Sequence[Mapping[str, dict[str, Any]]]) -> bool:
-    """Returns whether anything was trained, given the summaries of arms by name."""
-    return any(arm["train_steps"] for arms in groups for arm in arms.values())
 
 
 def render_page(template: str, figures: Figures, **context: Any) -> str:
@@ -62,13 +52,6 @@ def render_page(template: str, figures: Figures, **context: Any) -> str:
     images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
     percent = f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%"
     return _environment().get_template(template).render(images=images, percent=percent, resamples=RESAMPLES, **context)
-
-
-def _origin(command: str, summary: dict[str, Any], verification: Report) -> dict[str, Any]:
-    """Returns the variables that say where results of a command come from."""
-    settings = summary["settings"]
-    shown = {name: _text(value) for name, value in flat(settings).items()}
-    return dict(command=command, summary=summary, settings=settings, shown_settings=shown, verification=verification)
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

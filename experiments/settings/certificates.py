@@ -320,7 +320,7 @@ class RenderSettings:
     Attributes:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
-        out: File to write: .gif, .mp4, or .png for the last frame alone.
+        out: File to write: .gif, or .png for the last frame alone.
         policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
             "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
             package), or the folder of a trained agent.
@@ -333,7 +333,6 @@ class RenderSettings:
         fps: Frames per second; one frame per step.
         scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, sharp on dense screens, and
             1 for a .gif, whose file would be several times as large.
-        width: Width of the animation [pixels]; by default as drawn.
         smoke: Draw a few steps only, to see that everything works; into episode-smoke.gif unless `--out` differs.
     """
 
@@ -348,11 +347,10 @@ class RenderSettings:
     steps: StepCount = 200
     fps: int = 10
     scale: int | None = None
-    width: int | None = None
     smoke: bool = False
 
     def __post_init__(self) -> None:
         require_horizon(self, self.shield)
-        require_limits(self, seed=0, steps=1, fps=(1, 50), scale=(1, 4), width=160)
+        require_limits(self, seed=0, steps=1, fps=(1, 50), scale=(1, 4))
         if self.side_by_side and self.shield == "none":
             raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')

@@ -276,8 +276,8 @@ class SweepSettings(LearningSettings):
     """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
 
     Every point of the grid is a comparison of its own with the same seeds. Leaves episodes.parquet, summary.json,
-    settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
-    kept.
+    settings.json, a heatmap of the violating episodes, and the models. Started again with the same folder, finished
+    runs are kept.
 
     Attributes:
         out: Output folder; created if it does not exist.
@@ -292,7 +292,7 @@ class SweepSettings(LearningSettings):
         mass_factors: Factors of the mass in the environment's process, the certificate being that of the model (factor
             1); for environments whose process has a mass.
         downlink_losses: Loss probabilities of commands, for environments with a downlink; the environment's own if none
-            is given. The heatmaps then show losses of samples against losses of commands. Where none are lost, inputs
+            is given. The heatmap then shows losses of samples against losses of commands. Where none are lost, inputs
             are committed for the delay only.
     """
 

@@ -1,7 +1,7 @@
 """How a frame looks: its layout in pixels, its colors, and how numbers and units are written.
 
 The colors stay apart for color-blind readers (hues of Okabe and Ito), and no meaning rests on hue alone: the lost
-packet is a cross, the estimate is dashed or hollow, the safe box is dashed, and a violation is also written in words.
+packet is a cross, the estimate is dashed or hollow, limits are dashed, and a violation is also written in words.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class Rect(NamedTuple):
 
 
 WIDTH, HEIGHT = 640, 480
-HEADER = Rect(0, 0, WIDTH, 40)
-PLANT_VIEW = Rect(0, 40, WIDTH, 176)
-PLANE = Rect(72, 228, 232, 196)
-PANEL = Rect(330, 228, 294, 244)
+HEADER, PLANT_VIEW = Rect(0, 0, WIDTH, 40), Rect(0, 40, WIDTH, 176)
+PLANE, PANEL = Rect(72, 228, 232, 196), Rect(330, 228, 294, 244)
 # Height of the line on which packets travel; every drawing of a plant leaves it free.
 PACKET_LINE = PLANT_VIEW.y + 32
+# Font sizes.
+SMALL, BODY, LARGE = 13, 14, 17
 
 PAPER: Color = (255, 255, 255)
 MIST: Color = (244, 246, 249)
@@ -63,14 +63,10 @@ CARGO: Color = (180, 190, 200)
 CRATE: Color = (138, 153, 170)
 GLASS: Color = (204, 225, 240)
 
-# Font sizes.
-SMALL, BODY, LARGE = 13, 14, 17
-
 
 def blend(first: Color, second: Color, fraction: float) -> Color:
     """Returns a mixture of two colors: the first at fraction 0, the second at fraction 1."""
-    fraction = min(max(fraction, 0.0), 1.0)
-    red, green, blue = (round(a + (b - a) * fraction) for a, b in zip(first, second, strict=True))
+    red, green, blue = np.rint(first + np.clip(fraction, 0.0, 1.0) * np.subtract(second, first)).astype(int).tolist()
     return red, green, blue
 
 
@@ -89,11 +85,9 @@ def tick_label(value: float, half: float) -> str:
 
 def value_label(value: float, limit: float, unit: str = "") -> str:
     """Returns a changing value and its unit; the number of decimals depends on the limit alone."""
-    decimals = 2 if not 0.0 < limit < 1e300 else int(np.clip(2 - np.floor(np.log10(limit)), 0, 6))
-    value = round(value, decimals) + 0.0  # no minus zero
-    number = f"{value:+.{decimals}f}" if abs(value) < 1e6 else f"{value:+.1e}"
-    number = number.replace("-", "\N{MINUS SIGN}")
-    return f"{number} {unit_label(unit)}".strip()
+    decimals = int(np.clip(2 - np.floor(np.log10(limit)), 0, 6)) if 0.0 < limit < 1e300 else 2
+    number = f"{value:+z.{decimals}f}" if abs(value) < 1e6 else f"{value:+.1e}"
+    return f"{number} {unit_label(unit)}".strip().replace("-", "\N{MINUS SIGN}")
 
 
 def unit_label(unit: str) -> str:

@@ -113,7 +113,7 @@ def test_arms_with_and_without_training_are_compared_where_limits_have_two_ends(
     arms = json.loads((folder / "c" / "summary.json").read_text())
     assert set(arms["references"]) == set(baselines)
     assert all(arms["arms"][name]["eval_violation_steps"] == 0 for name in ("shielded", "shielded+residual"))
-    assert (folder / "c" / "figures" / "phase.png").is_file()
+    assert (folder / "c" / "figures" / "episode.png").is_file()
 
 
 @pytest.mark.slow

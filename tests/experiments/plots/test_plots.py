@@ -2,31 +2,22 @@
 
 from dataclasses import replace
 from itertools import combinations
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
-from scipy.optimize import linprog
 
 from agents.results import TrainingPoint
-from experiments.plots import comparison_figures as figures
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
     comparison_figures,
     episode_figure,
-    phase_figure,
-    projected_box,
-    projected_ellipsoid,
     scatter_figure,
     training_figure,
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
 from experiments.runs.arms import _arms
-from ncs_gym import Ellipsoid, LinearPlant
-from shields.polytope import Polytope
-from tests.command import without_pictures
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
 
@@ -60,14 +51,6 @@ def by_color(axis):
     return {to_hex(line.get_color()).lower(): line for line in lines(axis)}
 
 
-def keeping(L):
-    """What figures take of a certificate of an ellipsoid."""
-    return SimpleNamespace(L=L, polytope=None, safe_set=Ellipsoid(L))
-
-
-BALL = keeping(np.eye(2))
-
-
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
     assert all(ArmStyle.of(arm.name).marker for arm in _arms("project").values())
     looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
@@ -94,12 +77,12 @@ def test_arms_have_the_same_color_in_every_figure(plant):
     shown = arms("unshielded", "shielded:boundary")
     training = training_figure(shown).axes[0]
     scatter = scatter_figure(summary_of(shown)["arms"]).axes[0]
-    phase = phase_figure(plant, BALL, shown)
+    path = trajectory(np.zeros((3, 2)))
+    episode = episode_figure(random_plant(1, 2, 1), arms(*shown, trajectory=path)).axes[0]
     wanted = {ArmStyle.of(name).color.lower() for name in shown}
     assert set(by_color(training)) == wanted
     assert {to_hex(line.get_markeredgecolor()).lower() for line in scatter.get_lines()} >= wanted
-    for name, axis in zip(shown, phase.axes, strict=True):
-        assert ArmStyle.of(name).color.lower() in by_color(axis)
+    assert set(by_color(episode)) >= wanted
 
 
 def test_legend_takes_rows_until_it_fits_the_figure(plant):
@@ -161,88 +144,6 @@ def test_caption_of_a_training_names_the_arms_whose_return_contains_penalties_an
     assert "penalties" not in training_figure(arms("unshielded", "shielded")).caption
 
 
-def test_phase_plane_has_a_panel_per_arm_a_path_per_run_and_marks_violations(plant):
-    states = np.linspace(0.0, 2.5, 6)[:, None] * [1.0, 0.0]  # the box ends at 2: one state violates
-    shown = arms("unshielded", "shielded", runs=3, trajectory=trajectory(states))
-    figure = phase_figure(plant, BALL, shown)
-    assert len(figure.axes) == 2
-    for axis, name in zip(figure.axes, shown, strict=True):
-        own = [line for line in lines(axis) if to_hex(line.get_color()).lower() == ArmStyle.of(name).color.lower()]
-        assert len(own) == 3
-        crosses = [line for line in axis.get_lines() if line.get_marker() == "x"]
-        assert [line.get_xdata().tolist() for line in crosses] == [[2.5]] * 3
-    assert figure.axes[0].get_xlabel() == "coupling stretch [m]"
-    assert figure.axes[0].get_ylabel() == "stretch rate [m/s]"
-
-
-def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
-    far = trajectory(np.array([[0.0, 0.0], [1e3, 0.0]]))
-    figure = phase_figure(plant, BALL, arms("unshielded", trajectory=far))
-    low, high = figure.axes[0].get_xlim()
-    assert 2.0 < high < 10.0
-    assert low == -high
-    assert "leave the view" in figure.caption
-
-
-def test_of_many_states_the_largest_are_shown_and_the_caption_speaks_of_projections():
-    states = np.array([[0.0, 0.1, 0.0, 0.1], [0.1, 0.9, 0.2, 0.3]])
-    certificate = keeping(np.diag([1.0, 1, 1, 0.1]))
-    figure = phase_figure(random_plant(0, 4, 1), certificate, arms("shielded", trajectory=trajectory(states)))
-    assert "x2 and x4" in figure.caption
-    assert "projection" in figure.caption
-    assert any("projection of the safe set" in text for text in texts(figure))
-
-
-def test_phase_plane_draws_the_set_that_the_shield_keeps_and_chooses_states_by_it():
-    """The ellipsoid inside is small and long in other directions: neither outline nor choice is its."""
-    polytope = Polytope(rows=np.diag([0.5, 0.5, 10.0]), multipliers=np.zeros((4, 3)))
-    certificate = SimpleNamespace(L=np.diag([0.01, 1.0, 1e-4]), polytope=polytope, safe_set=polytope)
-    states = np.array([[0.0, 0.0, 0.0], [1.5, 1.0, 0.09]])
-    plant = random_plant(0, 3, 1)
-    figure = phase_figure(plant, certificate, arms("shielded", trajectory=trajectory(states)))
-    assert "x1 and x3" in figure.caption
-    drawn = [line.get_xydata() for line in figure.axes[0].get_lines() if line.get_linestyle() == "-"]
-    assert any(np.allclose(np.abs(points).max(axis=0), [2.0, 0.1]) for points in drawn)
-    shifted = np.array([[10.0, 0.0, 0.0], [10.5, 0.4, 0.05]])  # close to the middle of a set elsewhere
-    moved = SimpleNamespace(L=certificate.L, polytope=None, safe_set=_Moved(np.array([10.0, 0.0, 0.0])))
-    assert figures.plane_of(moved, shifted, 3) == (1, 2)
-    assert figures.plane_of(moved, shifted, 2) == (0, 1)  # the third is a past input
-
-
-class _Moved:
-    """A box around another point, with half-widths 2, 1 and 0.1."""
-
-    def __init__(self, center):
-        self.center = center
-
-    def support(self, directions):
-        return directions @ self.center + np.abs(directions) @ np.array([2.0, 1.0, 0.1])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_projections_reach_as_far_as_the_sets_in_every_direction(seed):
-    rng = np.random.default_rng(seed)
-    factor, rows, ends = rng.standard_normal((4, 4)), rng.standard_normal((5, 4)), rng.uniform(0.2, 2.0, (2, 5))
-    ellipse = projected_ellipsoid(factor @ factor.T, (0, 2), 20_001)
-    box = projected_box(rows, ends * [[-1.0], [1.0]], (0, 2))
-    for angle in np.linspace(0.0, np.pi, 7):
-        direction = np.array([np.cos(angle), 0.0, np.sin(angle), 0.0])
-        reach = linprog(-direction, np.vstack([-rows, rows]), ends.ravel(), bounds=(None, None))
-        assert (box @ direction[[0, 2]]).max() == pytest.approx(-reach.fun)
-        wanted = Ellipsoid(factor @ factor.T).support(direction)
-        assert (ellipse @ direction[[0, 2]]).max() == pytest.approx(wanted, rel=1e-5)
-
-
-def test_box_without_limits_in_the_plane_has_no_outline_and_elsewhere_does_not_matter():
-    rows = np.array([[0.5, 0.0, 0.0], [0.0, 0.25, 0.0]])
-    ends = np.array([[-1.0, -0.5], [1.0, 1.5]])
-    assert projected_box(rows, ends, (0, 2)) is None
-    assert projected_box(rows, np.array([[-1.0, -np.inf], [1.0, 1.5]]), (0, 1)) is None
-    outline = projected_box(rows, ends, (0, 1))
-    np.testing.assert_allclose([outline.min(axis=0), outline.max(axis=0)], [[-2.0, -2.0], [2.0, 6.0]])
-    assert len(outline) == 5
-
-
 @pytest.mark.parametrize(
     ("names", "pair"),
     [
@@ -291,9 +192,6 @@ def test_violations_of_limits_that_states_do_not_show_are_marked_too():
         if line.get_marker() == "x"
     ]  # fmt: skip
     np.testing.assert_allclose(crosses.get_xdata(), plant.dt * np.array([3, 8]))
-    figure = phase_figure(plant, BALL, arms("unshielded", trajectory=path))
-    marked = [line for line in figure.axes[0].get_lines() if line.get_marker() == "x"]
-    assert {len(line.get_xdata()) for line in marked} == {2}
 
 
 def test_an_episode_that_ended_early_stands_beside_a_longer_one():
@@ -366,15 +264,7 @@ def test_arms_that_coincide_have_markers_of_different_sizes():
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
     shown = arms(*ALL_ARMS[:5])
-    figures = comparison_figures(plant, BALL, summary_of(shown), shown)
-    assert set(figures) == {"training", "scatter", "phase", "episode"}
-    assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
-    assert len({caption for caption, _ in figures.values()}) == 4
-
-
-def test_a_single_state_has_no_phase_plane():
-    single = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, disturbance_bound=0.01, initial_bound=0.0)
-    shown = arms("unshielded", "shielded", trajectory=trajectory(np.zeros((11, 1))))
-    with without_pictures():
-        figures = comparison_figures(single, SimpleNamespace(L=np.eye(1), polytope=None), summary_of(shown), shown)
+    figures = comparison_figures(plant, summary_of(shown), shown)
     assert set(figures) == {"training", "scatter", "episode"}
+    assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
+    assert len({caption for caption, _ in figures.values()}) == 3

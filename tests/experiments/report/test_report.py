@@ -1,17 +1,16 @@
 import base64
 import json
 import re
-from functools import partial
 from html.parser import HTMLParser
 
 import pytest
 from jinja2 import UndefinedError
 
-from experiments.report.html import comparison_report, sweep_report
+from experiments.report.html import comparison_report
 from experiments.runs.arms import Arm
 from shields import Report
 from shields.verification.condition import flag
-from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
+from tests.experiments.results import ALL_ARMS, run, summary_of
 
 VERIFIED = Report((flag("(E1) Sigma - A Sigma A' >= 0", True), flag("(S) the safe set", True)))
 PNG = b"\x89PNG" + bytes(12) + (1360).to_bytes(4) + b"pixels"
@@ -55,22 +54,12 @@ def comparison(*names, runs=3, figures=None, findings=(), change=None, **setting
     return comparison_report(summary_of(results, **settings), VERIFIED, figures or {}, list(findings))
 
 
-def swept(*names, seeds=1, mode="project", change=None, **settings):
-    arms = summary_of({name: [run(name, i, **(change or {})) for i in range(seeds)] for name in names})["arms"]
-    channels = [(0.0, 0, None, 1.0, None), (0.6, 4, 0.05, 2.0, 1.5)]
-    sides = ("loss", "delay", "quantization_step", "burst_length", "mass_factor")
-    cells = [dict(zip(sides, channel, strict=True)) | {"mean_loss": channel[0], "arms": arms} for channel in channels]
-    own = provenance(arms=list(names), seeds=seeds, mode=mode, **settings)
-    return sweep_report({"cells": cells} | own, VERIFIED, {"violations": ("Violations. Of all.", PNG)})
-
-
 def safety(page):
     return {row[0]: row[1:] for row in Reader(page).tables["Violations and interventions of each arm"]}
 
 
-@pytest.mark.parametrize("report", [partial(comparison, figures={"a": ("A. B.", PNG)}), swept])
-def test_page_is_well_formed_and_needs_nothing_from_elsewhere(report):
-    page = report(*ALL_ARMS)
+def test_page_is_well_formed_and_needs_nothing_from_elsewhere():
+    page = comparison(*ALL_ARMS, figures={"a": ("A. B.", PNG)})
     reader = Reader(page)
     assert reader.open == []
     assert not re.search(r"https?:|//[a-z]|@import|url\(", page)
@@ -82,9 +71,8 @@ def test_page_is_well_formed_and_needs_nothing_from_elsewhere(report):
     assert any(attributes.get("name") == "viewport" for _, attributes in reader.tags)
 
 
-@pytest.mark.parametrize("report", [comparison, swept])
-def test_everything_from_outside_is_escaped(report):
-    page = report("shielded", env=ATTACK, certificate=ATTACK, hyperparams={ATTACK: ATTACK})
+def test_everything_from_outside_is_escaped():
+    page = comparison("shielded", env=ATTACK, certificate=ATTACK, hyperparams={ATTACK: ATTACK})
     assert "<script" not in page
     assert page.count("&lt;script&gt;") >= 4
     assert ATTACK in "".join(Reader(page).text)
@@ -239,23 +227,11 @@ def test_hyperparameters_are_shown_by_their_names():
     assert "c" * 64 in text
 
 
-def test_sweep_has_a_row_per_channel_and_arm():
-    rows = Reader(swept("unshielded", "monitor", "shielded")).tables["Every channel and arm"]
-    assert [row[:6] for row in rows[1:4]] == [
-        [arm, "0", "0", "own", "1", "own"] for arm in ("unshielded", "monitor", "shielded")
-    ]
-    assert rows[4][:6] == ["unshielded", "0.6", "4", "0.05", "2", "1.5 times"]
-    assert [row[8] for row in rows[1:4]] == ["\N{EN DASH}", "(10.0 %)", "10.0 %"]
-    assert "0 of 20 %, at most 84.19 %" in rows[1][7]
-    assert "none: one run" in rows[1][9]
-    assert "over 3 runs" in swept("shielded", seeds=3)
-
-
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
 def test_the_shield_is_explained_as_its_mode_acts(mode):
     assert Arm.of("shielded", mode).mode == mode
     assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
-    assert ("where not every input" in swept("shielded", mode=mode)) == (mode == "boundary")
+    assert ("where not every input" in comparison("shielded", mode=mode)) == (mode == "boundary")
 
 
 @pytest.mark.parametrize(

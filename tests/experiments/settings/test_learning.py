@@ -1,5 +1,7 @@
 """Which hyperparameters a command trains with: those given, those tuned, the defaults."""
 
+from dataclasses import replace
+
 import pytest
 
 from agents import tuned_hyperparams, tuned_steps

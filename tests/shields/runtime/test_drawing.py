@@ -59,10 +59,10 @@ def test_the_picture_shows_the_inputs_and_the_count_of_the_info(certificate):
     env = shielded(certificate)
     for _ in range(5):
         info = env.step(FULL_THROTTLE)[4]
-        frame = env.unwrapped.renderer.frame_record()
+        frame = env.unwrapped.renderer.episode
         note = frame.annotation
         np.testing.assert_array_equal(note.proposed, info["input_proposed"])
-        np.testing.assert_array_equal(frame.input, info["input"])
+        np.testing.assert_array_equal(frame.info["input"], info["input"])
         assert note.intervened == info["shield_intervened"]
         assert note.interventions == info["episode_interventions"]
 
