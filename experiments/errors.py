@@ -22,7 +22,7 @@ class FolderInUseError(RuntimeError):
 
 
 class RunError(RuntimeError):
-    """A training run, or a batch of an attack, failed; the message names it, the cause is its own error."""
+    """A training run failed; the message names it, the cause is its own error."""
 
     @classmethod
     def of(cls, name: str, error: BaseException) -> RunError:
@@ -38,7 +38,3 @@ class RunStopped(TrainingStopped):
 
 class ClusterError(RuntimeError):
     """The cluster cannot be reached or ended, is too small for a run, or has other versions than the driver."""
-
-
-class SafetyBroken(RuntimeError):
-    """A shielded loop left its safe set or its box, or its proof did not hold, although every assumption held."""

@@ -17,7 +17,7 @@ from agents.agent_file import AgentError
 from agents.loop import LoopConfig
 from agents.training import untrained
 from experiments.__main__ import parse
-from experiments.settings import CompareSettings, StudySettings, config_defaults, save_settings, settings_json
+from experiments.settings import CompareSettings, config_defaults, save_settings, settings_json
 from shields import Certificate, CertificateError
 from shields.json_documents import digest
 from tests.command import assert_one_sentence, ncs
@@ -147,16 +147,7 @@ def test_settings_of_others_import_no_module(evil):
     assert_one_sentence(ncs("compare", "--config", "settings.json", cwd=evil), "unknown environment 'evil:Evil-v0'")
 
 
-@pytest.mark.parametrize("envs", [["evil:Evil-v0"], ["ncs_gym/CartPole-v0", "evil:Evil-v0"], [":Evil-v0"]])
-def test_settings_of_a_study_of_others_import_no_module(envs, evil):
-    content = settings_json("study", StudySettings())
-    content["settings"]["envs"] = envs
-    (evil / "settings.json").write_text(json.dumps(content))
-    assert_one_sentence(ncs("study", "--config", "settings.json", cwd=evil), "unknown environment", "Evil-v0")
-
-
 def test_settings_files_name_no_module():
-    assert settings_json("study", StudySettings(envs=("evil:Evil-v0",)))["settings"]["envs"] == ["Evil-v0"]
     assert settings_json("compare", CompareSettings(env="evil:Evil-v0"))["settings"]["env"] == "Evil-v0"
 
 
@@ -205,17 +196,6 @@ def test_settings_may_name_the_folder_that_they_lie_in(tmp_path, monkeypatch):
     save_settings(tmp_path / "settings.json", "compare", CompareSettings(out=tmp_path))
     monkeypatch.chdir(elsewhere)
     assert parse(["compare", "--config", str(tmp_path / "settings.json")]).out == tmp_path
-
-
-@pytest.mark.parametrize("change", [{"page": "mine.md"}, {"quote": ["mine.md"]}])
-def test_settings_of_others_write_no_page(change, tmp_path):
-    (tmp_path / "mine.md").write_text("<!-- ncs study: lead -->\n<!-- end -->\n")
-    content = settings_json("study", StudySettings(smoke=True))
-    content["settings"] |= change
-    (tmp_path / "theirs.json").write_text(json.dumps(content))
-    run = ncs("study", "--config", "theirs.json", cwd=tmp_path)
-    assert_one_sentence(run, "hold what ncs study does not take", next(iter(change)))
-    assert {path.name for path in tmp_path.iterdir()} == {"mine.md", "theirs.json"}
 
 
 def test_texts_in_files_mean_nothing_to_a_terminal(tmp_path):

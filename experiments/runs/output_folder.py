@@ -25,16 +25,14 @@ from ncs_gym.reading import json_values, read_file
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
-_FINISHED = ("summary.json", "attack.json", "runs/*.json")
-_FINISHED_PARTS = {"study": ("*/summary.json",), "train": ("tensorboard/*/checkpoint/agent.json",)}
+_FINISHED = ("summary.json", "runs/*.json")
+_FINISHED_PARTS = {"train": ("tensorboard/*/checkpoint/agent.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
-_IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
+_IGNORED = {*INCIDENTAL_SETTINGS, "smoke"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
 _GROWING = {
     "compare": ("seeds", "arms", "baselines"),
-    "study": ("seeds", "arms", "baselines", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
-    "attack": ("steps",),
     "train": ("steps",),
 }
 # Whoever holds the lock of this file has the folder. It is the operating system's: it ends with the process.
@@ -57,7 +55,7 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
     what follows is refused (ValueError, OSError) before anything was computed, the folder is left as it was.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
-    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs attack` or
+    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of
     `ncs train`.
 
     Args:

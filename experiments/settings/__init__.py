@@ -17,7 +17,6 @@ from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
     LearningSettings,
-    StudySettings,
     SweepSettings,
     TrainSettings,
 )
@@ -43,7 +42,6 @@ __all__ = [
     "RenderSettings",
     "ReproduceSettings",
     "RequirementsSettings",
-    "StudySettings",
     "SweepSettings",
     "SynthesizeSettings",
     "TrainSettings",

@@ -6,18 +6,16 @@ import os
 from dataclasses import replace
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.agent_file import AgentError
 from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
-from experiments.attack.monte_carlo_batch import MonteCarloBatch
-from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
 from experiments.report.text_tables import summary_text
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.run_store import RunStore, file_name
-from experiments.settings import AttackSettings, CompareSettings
+from experiments.settings import CompareSettings
 from shields.json_documents import document_of
 from tests.command import assert_one_sentence, ncs
 from tests.experiments.results import training_run
@@ -102,12 +100,9 @@ LINKS = ["runs", "models", "models/shielded-0", "figures", "tensorboard", "chann
 
 
 @pytest.mark.cases(6)
-@pytest.mark.parametrize(
-    ("command", "name"),
-    [*(("compare", name) for name in LINKS), *(("attack", name) for name in ("certificates", "runs"))],
-)
+@pytest.mark.parametrize("name", LINKS)
 @pytest.mark.parametrize("is_there", [True, False])
-def test_links_in_an_output_folder_are_refused_before_anything_is_written(command, name, is_there, tmp_path):
+def test_links_in_an_output_folder_are_refused_before_anything_is_written(name, is_there, tmp_path):
     mine, out = tmp_path / "mine", tmp_path / "theirs"
     mine.mkdir()
     (mine / "photo.png").write_bytes(b"png")
@@ -116,8 +111,7 @@ def test_links_in_an_output_folder_are_refused_before_anything_is_written(comman
     target = mine / "secret" if "." in name else mine
     (out / name).symlink_to(target if is_there else mine / "new")
     before = everything_in(tmp_path)
-    extra = ["--steps", "1", "--jobs", "1"] if command == "attack" else ["--smoke"]
-    assert_one_sentence(ncs(command, *extra, "--out", out), f"{name} is a link", "give another --out")
+    assert_one_sentence(ncs("compare", "--smoke", "--out", out), f"{name} is a link", "give another --out")
     assert everything_in(tmp_path) == before
 
 
@@ -125,7 +119,7 @@ def test_pipes_in_an_output_folder_are_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "runs")
     with (
         pytest.raises(ResultsError, match=r"runs is neither a file nor a folder"),
-        claim_folder("attack", AttackSettings(out=tmp_path)),
+        claim_folder("compare", CompareSettings(out=tmp_path)),
     ):
         pass
 
@@ -262,62 +256,6 @@ def test_changed_results_are_refused_or_usable(data, stored, run):
 @examples(5000, same=False)
 def test_many_changed_results_are_refused_or_usable(data, stored, run):
     assert_refused_or_usable(data, stored, run)
-
-
-# Counts of a batch of four episodes.
-COUNTS = {"steps": 800, "episodes": 4, "interventions": 10, "level": 0.5}
-
-
-@pytest.fixture(scope="module")
-def batch(certificate, tmp_path_factory):
-    """A batch, and the folder with its result, for tests that change it."""
-    campaign = AttackSettings(seed=0, random_plants=0, envs=4)
-    batch = MonteCarloBatch(campaign, "TruckTrailerCruise-v0, bursts", 0, certificate)
-    folder = tmp_path_factory.mktemp("batch")
-    RunStore(folder).save(batch, SafetyCounts(**COUNTS))
-    return batch, folder, file_of(folder, batch).read_bytes()
-
-
-def loaded(batch, **change):
-    """What is loaded of a batch with other counts."""
-    run, folder, content = batch
-    file_of(folder, run).write_bytes(content)
-    forged(folder, run, lambda counts: counts.update(change))
-    return RunStore(folder).load(run)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"more": 1},
-        *({name: -1} for name in vars(SafetyCounts())),
-        *({name: "1"} for name in vars(SafetyCounts())),
-        *({name: 10**9} for name in vars(SafetyCounts()) if name != "level"),
-        *({name: 0} for name in ("steps", "episodes")),
-        {"level": float("nan")},
-        {"level": None},
-        {"exits": 1.0},
-        {"exits": True},
-        {"lapsed_violations": 1},
-        {"files": {"model.zip": ""}},
-    ],
-)
-def test_forged_counts_are_one_sentence(change, batch):
-    assert loaded(batch) == SafetyCounts(**COUNTS)
-    with pytest.raises(ResultsError, match=r"is no result of its run .*: delete it to repeat the run"):
-        loaded(batch, **change)
-
-
-@given(change=st.dictionaries(st.sampled_from(sorted(vars(SafetyCounts()))), JSON_VALUES, min_size=1, max_size=3))
-@example(change={"broken_episodes": 0})
-@examples(100)
-def test_changed_counts_are_refused_or_usable(batch, change):
-    try:
-        counts = loaded(batch, **change)
-    except ResultsError:
-        return
-    counts_table({"case, own": counts}, looks_ahead=False)
-    json.dumps(counts.document(), allow_nan=False)
 
 
 @pytest.mark.parametrize(

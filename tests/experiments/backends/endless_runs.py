@@ -30,7 +30,7 @@ class Endless:
 
 
 def endless(settings: Any) -> None:
-    """Stands for `ncs attack`."""
+    """Stands for `ncs compare`."""
     from experiments.backends.execution import execute, executor_of
 
     reports = settings.seed == 0
@@ -42,6 +42,6 @@ def endless(settings: Any) -> None:
 if __name__ == "__main__":
     from experiments.__main__ import COMMANDS, main
 
-    COMMANDS["attack"] = ("AttackSettings", "tests.experiments.backends.endless_runs:endless", {})
-    sys.argv[:1] = ["ncs", "attack", "--jobs", "2"]
+    COMMANDS["compare"] = ("CompareSettings", "tests.experiments.backends.endless_runs:endless", {})
+    sys.argv[:1] = ["ncs", "compare", "--jobs", "2"]
     main()

@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -16,10 +15,8 @@ import pytest
 from experiments.errors import FolderInUseError, OtherResultsError
 from experiments.runs.output_folder import claim_folder as folder_of
 from experiments.settings import (
-    AttackSettings,
     CompareSettings,
     ReproduceSettings,
-    StudySettings,
     SweepSettings,
     TrainSettings,
 )
@@ -92,15 +89,11 @@ def test_settings_of_an_earlier_command_stay_where_a_later_one_refuses(tmp_path)
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("sweep", SweepSettings, {"losses": (0.0, 0.3)}, "losses"),
         ("sweep", SweepSettings, {"quantization_steps": (0.1,)}, "quantization_steps"),
-        ("attack", AttackSettings, {"mode": "switch"}, "mode"),
-        ("study", StudySettings, {"budget": 0.5}, "budget"),
-        ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
-        ("attack", AttackSettings, {"steps": 1e6}, "steps"),
         ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
     ],
 )
 def test_folder_with_results_of_other_settings_is_refused(command, kind, change, words, tmp_path):
-    settings = finished(command, kind(out=tmp_path / "out"), "attack.json" if command == "attack" else "summary.json")
+    settings = finished(command, kind(out=tmp_path / "out"), "summary.json")
     before = (tmp_path / "out" / "settings.json").read_bytes()
     with pytest.raises(OtherResultsError, match=f"of other settings.*{words}.*: give another --out, or --force"):
         claim_folder(command, replace(settings, **change))
@@ -119,12 +112,10 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
         ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto", "cpus_per_run": 0.5}),
         ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
-        ("attack", AttackSettings, {"steps": 1e9, "jobs": 1}),
-        ("study", StudySettings, {"seeds": 20, "page": Path("docs/results.md"), "smoke": True}),
     ],
 )
 def test_what_changes_no_result_or_adds_to_them_is_taken(command, kind, change, tmp_path):
-    settings = finished(command, kind(out=tmp_path), "attack.json" if command == "attack" else "summary.json")
+    settings = finished(command, kind(out=tmp_path), "summary.json")
     claim_folder(command, replace(settings, **change))
 
 
@@ -183,14 +174,6 @@ def test_single_finished_runs_are_kept_and_a_folder_without_any_is_taken(tmp_pat
         claim_folder("compare", replace(settings, seed=2))
 
 
-def test_finished_parts_of_a_study_are_kept(tmp_path):
-    settings = StudySettings(out=tmp_path)
-    claim_folder("study", settings)
-    finished("compare", CompareSettings(out=tmp_path / "CartPole-v0"))
-    with pytest.raises(OtherResultsError, match="channel_episodes 25, now 3"):
-        claim_folder("study", replace(settings, channel_episodes=3))
-
-
 def test_results_of_another_command_are_refused(tmp_path):
     finished("compare", CompareSettings(out=tmp_path))
     with pytest.raises(OtherResultsError, match="holds finished results of ncs compare: give another --out"):
@@ -229,8 +212,8 @@ def test_settings_of_something_else_are_not_replaced(content, tmp_path):
 @pytest.mark.parametrize(
     "arguments",
     [
-        *(["compare", "--smoke"], ["train", "--smoke"], ["sweep", "--smoke"], ["study", "--smoke"]),
-        *(["attack", "--steps", "1"], ["reproduce"], ["compare", "--smoke", "--force"]),
+        *(["compare", "--smoke"], ["train", "--smoke"], ["sweep", "--smoke"]),
+        *(["reproduce"], ["compare", "--smoke", "--force"]),
     ],
 )
 def test_folder_that_another_command_has_is_refused(arguments, tmp_path):
@@ -274,13 +257,6 @@ def test_folder_is_free_again_when_its_command_is_killed_or_interrupted_or_ends(
 def test_the_lock_is_no_file_that_stays(tmp_path):
     (tmp_path / ".lock").write_text("of a process that was killed")
     claim_folder("compare", CompareSettings(out=tmp_path))
-
-
-def test_a_study_has_its_folder_and_those_of_its_parts(tmp_path):
-    with folder_of("study", StudySettings(out=tmp_path)):
-        claim_folder("compare", CompareSettings(out=tmp_path / "CartPole-v0"))
-        with pytest.raises(FolderInUseError):
-            claim_folder("study", StudySettings(out=tmp_path))
 
 
 def test_file_system_without_locks_is_pointed_out(tmp_path, monkeypatch):
