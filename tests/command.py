@@ -20,7 +20,7 @@ from experiments.__main__ import main
 ROOT = Path(__file__).resolve().parent.parent
 # A command whose files many tests look at (the fixture `smoke`), whose unshielded agents explore enough to violate in
 # training.
-SMOKE = ("compare", "--smoke", "--arms", "unshielded", "shielded", "--baselines", "zero input", "proportional+shielded")
+SMOKE = ("compare", "--smoke", "--arms", "unshielded", "shielded", "--baselines", "zero input", "lqr+shielded")
 SMOKE += ("--hyperparams", "policy_kwargs=dict(log_std_init=0.0)", "n_epochs=2")
 
 

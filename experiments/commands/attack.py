@@ -151,8 +151,11 @@ def table_of(rows: dict[str, Counter[str]]) -> str:
     columns = ("steps", "episodes", "outside S", "outside box", "no claim")
     table = [["", "", "", "outside", "outside", "no", "over-"]]
     table += [["case", "steps", "episodes", "S", "box", "claim", "ridden"]]
+    env_id = ""
     for name, counts in [*rows.items(), ("all", total)]:
+        before, (env_id, comma, kind) = env_id, name.rpartition(", ")
+        table += [[env_id]] if comma and env_id != before else []
         numbers = [f"{counts[column]:,}" for column in columns]
-        table.append([name, *numbers, f"{counts['overridden'] / counts['steps']:.1%}"])
+        table.append([comma[1:] + kind, *numbers, f"{counts['overridden'] / counts['steps']:.1%}"])
     text = text_table(table, rules=(2, len(table) - 1))
     return "\n".join([f"{counted(EPISODE_STEPS, 'step')} in each episode\n", text, *map(wrapped, _LEGEND)])

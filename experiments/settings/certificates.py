@@ -119,7 +119,7 @@ class AttackSettings:
     """
 
     env: str | None = None
-    steps: StepCount = 2_000_000
+    steps: StepCount = 1_000_000
     mode: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     horizon: int | None = None
@@ -288,9 +288,8 @@ class RenderSettings:
         out: File to write: .gif, .mp4, or .png for the last frame alone.
         log: Folder of the logs of `ncs loop`: draws the last steps of its newest episode, of the plant that `--env`
             names, into a .png.
-        policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
-            "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
-            package), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
+        policy: "lqr", "mpc", "zero", "random", "pretrained" (the small agent that comes with the package), the folder
+            of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
         vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
@@ -308,7 +307,7 @@ class RenderSettings:
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Path = Path("episode.gif")
     log: Path | None = None
-    policy: str = "greedy"
+    policy: str = "lqr"
     vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None
@@ -337,8 +336,8 @@ class LoopSettings:
         channel: Changes of what the network does to samples and echoes, by the names that `ncs compare` lists, such as
             loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
         downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
-        policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", a regulator ("lqr",
-            "governor", "mpc"), the folder of a trained agent, or a zip that `model.save` of stable-baselines3 wrote.
+        policy: "push" (the largest input one way, then the other), "zero", "random", "lqr", "mpc", the folder of a
+            trained agent, or a zip that `model.save` of stable-baselines3 wrote.
         vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.

@@ -195,13 +195,11 @@ class CompareSettings(LearningSettings):
         seeds: Number of paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
             penalty per violation), penalized:WEIGHT, lagrangian (PPO-Lagrangian adapts that penalty), shielded,
-            shielded:MODE, lookahead, trusting and trusting:lookahead (certainty-equivalent: without an error set), psf
-            (a nominal predictive safety filter), these also with a margin in percent as in psf:20, psf:tube.
-            shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
-            intervention, +residual adds the agent's action to that of K. Controllers that are not trained:
-            proportional, lqr, governor (lqr with a reference governor, governor:20 with a margin), random, K-x_hat,
-            zero-input, untrained and pretrained (the agent that comes with the package), alone or behind a filter as
-            in proportional+shielded.
+            shielded:MODE, lookahead, trusting (certainty-equivalent: without an error set) and psf (a nominal
+            predictive safety filter), these also with a margin in percent as in psf:20, psf:tube. shield-at-test,
+            trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per intervention. Policies
+            that are not trained: lqr, mpc, mpc:20, random, K-x_hat, zero-input, untrained and pretrained (the agent
+            that comes with the package), alone or behind a filter as in lqr+shielded.
         baselines: Arms that are listed below the others and not drawn.
         scenarios: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
             loss, later packets, within the contract), ideal-channel, attacked (the worst disturbance, noise of full
@@ -220,9 +218,9 @@ class CompareSettings(LearningSettings):
         "zero input",
         "K x_hat",
         "untrained",
-        "proportional",
-        "proportional+trusting",
-        "proportional+shielded",
+        "lqr",
+        "lqr+trusting",
+        "lqr+shielded",
     )
     scenarios: tuple[str, ...] = ("as trained",)
     tuned_arms: bool = False

@@ -17,7 +17,7 @@ ALL_ARMS = [
     "monitor",
     "penalized",
     *(f"shielded{mode}{penalty}" for mode in ("", ":project", ":switch", ":boundary") for penalty in ("", "+penalty")),
-    *("penalized:10", "lagrangian", "lookahead", "trusting", "trusting:lookahead", "psf", "shield at test"),
+    *("penalized:10", "lagrangian", "lookahead", "trusting", "psf:tube", "psf", "shield at test"),
 ]
 
 

@@ -69,8 +69,8 @@ SETTINGS = [
 
 ARMS = ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor", "penalized:", "penalized:-1"]
 ARMS += ["penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1", "trusting:project", "psf:switch"]
-ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "proportional+", "lqr+penalty"]
-ARMS += ["proportional+monitored", "lqr+residual", "+shielded", "K x_hat+K x_hat"]
+ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "lqr+", "lqr+penalty"]
+ARMS += ["lqr+monitored", "shielded+residual", "+shielded", "K x_hat+K x_hat", "governor", "trusting:7", "mpc:tube"]
 BURSTS = [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, NAN), (0.3, INF)]
 
 CALLS = [
@@ -132,12 +132,12 @@ ONE_SENTENCE = [
     ("compare --env ncs_gym/CartPol-v0", "'ncs_gym/CartPol-v0'; did you mean 'ncs_gym/CartPole-v0'?"),
     ("compare --env cstr", "'cstr'; did you mean 'ncs_gym/CSTR-v0'?"),
     ("channel nofile.csv", "cannot read packets from nofile.csv: No such file or directory"),
-    ("compare --arms shieled", "unknown arm 'shieled' (did you mean 'shielded'?)"),
+    ("compare --arms shieled", "unknown arm 'shieled'; known are unshielded, monitor, penalized[:WEIGHT]"),
     ("compare --env CSTR-v0", "unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"),
     ("compare --env ncs_gym/CartPole", "unknown environment 'ncs_gym/CartPole'; did you mean 'ncs_gym/CartPole-v0'?"),
-    ("compare --arms shielded hope", "unknown arm 'hope'", "shielded:MODE"),
+    ("compare --arms shielded hope", "unknown arm 'hope'", "shielded[:MODE]"),
     ("compare --arms shielded shielded", "--arms must be arms that differ"),
-    ("compare --arms unshielded,shielded", "'unshielded,shielded' (several are separated by spaces)"),
+    ("compare --arms unshielded,shielded", "unknown arm 'unshielded,shielded'; known are"),
     ("compare --config nowhere.json", "cannot read settings nowhere.json"),
     ("compare --channel loss=1.5", "loss"),
     ("compare --hyperparams gamma=2", "gamma must be in [0, 1], got 2"),
@@ -167,7 +167,7 @@ ONE_SENTENCE = [
     ("render --out a.avi", "--out must end in one of .gif, .mp4, .png"),
     ("render --env CartPole-v1", "unknown environment 'CartPole-v1'"),
     ("render --out nowhere/a.gif", "No such file or directory"),
-    ("render --policy nowhere", "no policy nowhere:", "those with a name are greedy, zero, random, lqr"),
+    ("render --policy nowhere", "no policy nowhere:", "those with a name are zero, random, lqr"),
     ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
     ("attack --env ncs_gym/Nothing-v0", "unknown environment 'ncs_gym/Nothing-v0'"),
     ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
@@ -181,8 +181,7 @@ ONE_SENTENCE = [
 # Known without a certificate, which may take minutes.
 BEFORE_A_CERTIFICATE = [
     ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
-    ("compare --env ncs_gym/TruckTrailer-v0 --arms lqr governor:10", "arm governor:10: governor:10 clips targets"),
-    ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "arm governor: governor clips targets"),
+    ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "unknown arm 'governor'; known are unshielded"),
 ]  # fmt: skip
 
 # There are a file `file` and a folder `here`.

@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
 from agents.results import TrainingPoint
+from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS
 from experiments.network_loop.log import StepLog
 from experiments.plots import comparison_figures as figures
 from experiments.plots.comparison_figures import (
@@ -25,7 +26,6 @@ from experiments.plots.comparison_figures import (
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
 from experiments.plots.loop_figure import loop_log_figure
-from experiments.runs.arms import _arms
 from ncs_gym import Ellipsoid, LinearPlant
 from shields.polytope import Polytope
 from tests.command import without_pictures
@@ -71,7 +71,9 @@ BALL = keeping(np.eye(2))
 
 
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
-    assert all(ArmStyle.of(arm.name).marker for arm in _arms("project").values())
+    policies = (*CONTROLLERS, *REGULATORS, "untrained", "pretrained")
+    assert all(ArmStyle.of(f"{policy}{each}").marker for policy in policies for each in ("", "+shielded", "+psf:tube"))
+    assert all(ArmStyle.of(f"{each}{kind}").marker for each in FILTERS for kind in ("", "+penalty", " at test"))
     looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
@@ -80,7 +82,7 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
 
 def test_markers_tell_a_price_apart_and_filters_of_a_fixed_policy():
     assert ArmStyle.of("penalized").size != ArmStyle.of("penalized:10").size
-    policies = [ArmStyle.of(f"lqr+{name}") for name in ("trusting", "trusting:lookahead", "shielded", "lookahead")]
+    policies = [ArmStyle.of(f"lqr+{name}") for name in ("trusting", "psf:tube", "shielded", "lookahead")]
     assert len({(style.color, style.hollow) for style in policies}) == len(policies)
 
 

@@ -115,7 +115,7 @@ def test_columns_of_a_wide_table_stand_closer_together():
     arm = summary_of({"lookahead": [run("lookahead", returns=(-10.0, -30.0)) for _ in range(2)]})["arms"]["lookahead"]
     arm |= {"eval_violation_rate": 0.95, "eval_violation_rate_ci95": [0.751, 0.999], "train_violation_steps": 123_456}
     narrow = summary_text({"lookahead": arm}, {})
-    wide = summary_text({"lookahead": arm, "proportional+lookahead": arm}, {})
+    wide = summary_text({"lookahead": arm, "pretrained+lookahead": arm}, {})
     assert "  95.0 [75.1, 99.9]  " in narrow
     assert "lookahead 95.0 [75.1, 99.9]     0    0" in wide
     assert 70 < max(map(len, wide.splitlines())) <= 80
