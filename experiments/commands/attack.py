@@ -54,8 +54,8 @@ def attack(settings: AttackSettings) -> None:
             for first in range(0, each, _MOST):
                 worst = worst_case(certificate, settings.mode)
                 vector = gym.make_vec(id_alone(env_id), num_envs=min(_MOST, each - first), channel=channel, **worst)
-                planning = {"horizon": settings.horizon} if settings.mode == "lookahead" else {}
-                shield = VectorSafetyShield(vector, certificate, settings.mode, on_unproved="ignore", **planning)
+                mode, horizon = settings.mode, settings.horizon
+                shield = VectorSafetyShield(vector, certificate, mode, horizon=horizon, on_unproved="ignore")
                 for found in attacked(shield, rng):
                     counts.update(found)
                     bar.update(found["steps"])
