@@ -32,9 +32,10 @@ help: ## this list
 compare: $(INSTALLED) ## agents with and without a shield, compared (OUT=runs/compare)
 	$(BIN)/ncs compare --out $(OUT)
 
-# The pages of results: runs that runs/study has already are kept, so that it can be done in parts. STUDY: more options of ncs study.
+# Runs that runs/study has already are kept, so that it can be done in parts.
 study: $(INSTALLED) ## the whole study, and the pages of results
-	$(BIN)/ncs study --page docs/results.md --quote README.md docs/index.md docs/when_not.md $(STUDY)
+	$(BIN)/python -m benchmarks.study compare
+	$(BIN)/python -m benchmarks.study pages
 
 test: $(INSTALLED) ## the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
@@ -72,7 +73,7 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the study and a record as the
 # pages have them, hints, and the same bits in every process.
-SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/experiments/study \
+SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/test_study.py \
 	tests/experiments/commands/test_requirements.py \
 	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \
 	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process

@@ -35,13 +35,13 @@ from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
 from benchmarks.commands import run, some_of
+from benchmarks.study import ENVS, REGULATED, TRAINED
 from benchmarks.timing import timed
 from experiments.analysis.statistics import mean_interval
 from experiments.baselines import RegulatorWeights, controller
 from experiments.baselines.controllers import equilibrium
 from experiments.runs.arms import Arm
 from experiments.settings import CompareSettings
-from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS, TRAINED_ARMS
 from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.plants.lqr import lqr_gain
@@ -409,13 +409,13 @@ TRAINING_STEPS = 60_000
 
 
 def tune_arms(
-    env: Sequence[str] = NETWORK_ENVS,
-    arms: Annotated[Sequence[str], some_of((*TRAINED_ARMS, *REGULATED_ARMS))] = (*TRAINED_ARMS, *REGULATED_ARMS),
+    env: Sequence[str] = ENVS,
+    arms: Annotated[Sequence[str], some_of((*TRAINED, *REGULATED))] = (*TRAINED, *REGULATED),
     episodes: int = 24,
     out: Path = Path("runs/tuned_arms.jsonl"),
     write: bool = False,
 ) -> None:
-    """Tunes every arm of `ncs study` by itself, each behind its own filter, with the same budget.
+    """Tunes every arm of the study by itself, each behind its own filter, with the same budget.
 
     Of a regulator a grid of weights is tried, of an agent `CANDIDATES` of PPO's hyperparameters and then, with the best
     of the first three, two more: prices of a violation, settings of PPO-Lagrangian, or hyperparameters where an arm has
@@ -433,7 +433,7 @@ def tune_arms(
 
         def best(arm: str, tries: list[dict[str, Any]], loop: LoopConfig = loop, own: Certificate = certificate) -> Any:
             """Returns what gave the highest mean return, and prints it."""
-            is_trained = arm in TRAINED_ARMS
+            is_trained = arm in TRAINED
             number, measure = (4 * episodes, _trained_arm) if is_trained else (episodes, _regulated_arm)
             returns = [
                 results.of([loop.env, arm, number, each], lambda each=each: measure(loop, arm, own, each, number))
@@ -445,7 +445,7 @@ def tune_arms(
             return found
 
         for arm in arms:
-            if arm in REGULATED_ARMS:
+            if arm in REGULATED:
                 found = best(arm, [asdict(each) for each in GRID])
             else:
                 price = PRICES if arm == "penalized" else {}

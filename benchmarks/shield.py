@@ -20,13 +20,14 @@ from scipy.optimize import minimize_scalar
 from benchmarks.commands import run, some_of, table
 from benchmarks.random_plants import random_plant
 from benchmarks.timing import Steps, microseconds, resident, timed
-from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
+from experiments.commands.attack import hostile_agents, starts, worst_case
 from ncs_gym import (
     Actuator,
     Channel,
     ChannelContract,
     LinearPlant,
     NCSEnv,
+    NCSVectorEnv,
     Packet,
     batch_reactor,
     cart_pole,
@@ -349,13 +350,13 @@ def _largest_step_outside(plant: LinearPlant, process: Any, rng: np.random.Gener
 def _attacked(env: NCSEnv, process: Any, certificate: Any, episodes: int, seed: int) -> dict[str, np.ndarray]:
     """First steps, one per episode, of leaving S or the box and of both alarms; inf for never."""
     settings = {"plant": env.plant, "channel": env.channel, "contract": env.contract, "process": process}
-    many = WorstCaseVectorEnv(episodes, certificate, **settings)
+    many = NCSVectorEnv(episodes, **settings, **worst_case(certificate))
     shield, rng = VectorSafetyShield(many, certificate, on_unproved="ignore"), np.random.default_rng(seed)
-    _, info = shield.reset(seed=seed)
-    agents = HostileAgents(episodes, env.plant, certificate, rng)
+    _, info = shield.reset(seed=seed, options={"state": starts(certificate, rng, episodes)})
+    act = hostile_agents(certificate, env.plant, episodes, rng)
     first = {name: np.full(episodes, np.inf) for name in ("set", "box", "alarm", "simulation")}
     for step in range(1, EPISODE_STEPS + 1):
-        *_, info = shield.step(agents.act(info["estimate"]))
+        *_, info = shield.step(act(info["estimate"]))
         now = {
             "set": ~(certificate.safe_set.gauge(info["state"]) <= 1.0),
             "box": info["cost"] > 0.0,

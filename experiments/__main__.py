@@ -33,7 +33,6 @@ _TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pandas", "p
 # The settings and the function of each command, and the packages that it needs of each extra.
 COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "compare": ("CompareSettings", "experiments.commands.compare:compare", _TRAINING),
-    "study": ("StudySettings", "experiments.study.study:study", _TRAINING),
     "train": ("TrainSettings", "experiments.commands.train:train", _TRAINING),
     "evaluate": ("EvaluateSettings", "experiments.commands.evaluate:evaluate", _TRAINING),
     "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", _TRAINING),

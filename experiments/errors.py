@@ -26,7 +26,3 @@ class RunStopped(TrainingStopped):
 
 class ClusterError(RuntimeError):
     """The cluster cannot be joined, or a node has other versions than the driver."""
-
-
-class SafetyBroken(RuntimeError):
-    """A shielded loop left its safe set or its box, or its proof did not hold, although every assumption held."""

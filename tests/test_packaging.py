@@ -60,9 +60,8 @@ LAYERS = {
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
-        {"report", "attack", "paper"},
-        {"commands", "published"},
-        {"study"},
+        {"report", "paper"},
+        {"commands"},
         {"__main__"},
     ),
 }

@@ -14,9 +14,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from experiments.attack import monte_carlo_batch
 from experiments.backends.execution import Engine, executed
-from experiments.commands import attack
 
 
 @contextlib.contextmanager
@@ -37,7 +35,7 @@ def _here(jobs: int, counts: Any, log_folder: Path | None = None) -> Iterator[En
 
 @contextlib.contextmanager
 def no_worker_processes(*, evaluates_on_the_way: bool = False) -> Iterator[None]:
-    """Commands execute their training runs and batches in this process.
+    """Commands execute their training runs in this process.
 
     Evaluations on the way take most of a short training and change no result (tests/agents/test_training.py): they are
     left out unless they are asked for.
@@ -55,11 +53,3 @@ def _no_evaluation(*settings: Any) -> Any:
     from agents.callbacks import RegularCallback
 
     return RegularCallback(lambda: None)
-
-
-def replace_cases(monkeypatch: Any, cases: dict[str, Any]) -> None:
-    """Has `ncs attack` attack these cases instead of its own."""
-    for module in (monte_carlo_batch, attack):
-        monkeypatch.setattr(
-            module, "cases_of", lambda settings: {name: case.with_delta(settings.delta) for name, case in cases.items()}
-        )

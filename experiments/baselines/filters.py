@@ -21,7 +21,7 @@ from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.set_test import certificate_test
 from shields.verification import require_valid
 
-# Margins that filters and governors are given, of the safe set and the box, in percent.
+# Margins that filters and controllers are given, of the safe set and the box, in percent.
 MARGINS = (5, 10, 20, 40, 50)
 # Steps that are looked ahead; a tube leaves no room for more than a few.
 HORIZON, TUBE_HORIZON = 20, 3
@@ -36,45 +36,30 @@ class CertaintyEquivalentFilter:
     """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid.
 
     This is what a safety filter does that is handed an estimate as if it were the state. Everything else is kept: the
-    safe set S, the disturbance bound E(D), the projection onto the inputs that pass, the margins against rounding,
-    K x_hat where no input passes, and in mode "lookahead" the plans. With the error ellipsoid goes the proof: x = x_hat
+    safe set S, the disturbance bound E(D), the projection onto the inputs that pass, the margins against rounding, and
+    K x_hat where no input passes. With the error ellipsoid goes the proof: x = x_hat
     is all it would hold for.
 
     Args:
         certificate: Verified exactly here.
         plant: The plant it was made for.
-        mode: "project" or "lookahead"; see `SafetyFilter`.
-        horizon: Longest plan of mode "lookahead" [steps]; None for that of `SafetyFilter`.
         margin: Fraction of the safe set that is kept free after the next step: the next state is taken to be off by as
             much, margin^2 L in the place of A Sigma_k A', where states can be off at all: past inputs are known.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
-        ValueError: If there is no such mode.
     """
 
-    def __init__(
-        self,
-        certificate: Certificate,
-        plant: LinearPlant,
-        mode: str = "project",
-        horizon: int | None = None,
-        margin: float = 0.0,
-    ) -> None:
-        self._filter = SafetyFilter(certificate, plant, mode, horizon)
+    def __init__(self, certificate: Certificate, plant: LinearPlant, margin: float = 0.0) -> None:
+        self._filter = SafetyFilter(certificate, plant)
         unknown, back = np.arange(plant.n) < plant.n - inputs_under_way(plant), np.linalg.pinv(plant.A)
         off = margin**2 * np.where(np.outer(unknown, unknown), certificate.L, 0.0)
         self._assumed = self._filter.errors_of_many((back @ off @ back.T)[None])
-        self._plans = np.empty((0, plant.m, 0))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
-        """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
-        errors, plans = self._assumed.of(np.zeros(len(estimates), np.intp)), None
-        if self._plans.shape[-1] == len(estimates):
-            plans = np.where(begun, np.nan, self._plans)
-        decided = self._filter.decide_columns(estimates.T, errors, proposed.T, plans)
-        self._plans = decided.plan
-        return decided.input.T
+        """Returns the inputs to apply, shape (N, m), as a `Rule`."""
+        errors = self._assumed.of(np.zeros(len(estimates), np.intp))
+        return self._filter.decide_columns(estimates.T, errors, proposed.T, None).input.T
 
 
 class PredictiveFilter:
@@ -257,11 +242,7 @@ def _tube(
 
 
 # How each filter is made from a certificate and its plant.
-_NOMINAL: dict[str, Callable[..., Rule]] = {
-    "trusting": CertaintyEquivalentFilter,
-    "trusting:lookahead": partial(CertaintyEquivalentFilter, mode="lookahead"),
-    "psf": PredictiveFilter,
-}
+_NOMINAL: dict[str, Callable[..., Rule]] = {"trusting": CertaintyEquivalentFilter, "psf": PredictiveFilter}
 # Also with margins in percent of the safe set, as in "psf:10", and with a tube.
 FILTERS: dict[str, Callable[..., Rule]] = {
     **_NOMINAL,
@@ -331,18 +312,15 @@ class EstimateFilterSettings:
         name: A name in `FILTERS`.
         certificate: Certificate of the safe set; it is verified when the filter is built.
         penalty: Subtracted from the reward per intervention.
-        horizon: Longest plan [steps], for a filter that plans; None for its default.
     """
 
     name: str
     certificate: Certificate
     penalty: float = 0.0
-    horizon: int | None = None
 
     def __call__(self, env: VectorEnv) -> EstimateFilter:
         """Returns the environment behind the filter; raises CertificateError if the certificate is not its plant's."""
-        given = {} if self.horizon is None else {"horizon": self.horizon}
-        rule = FILTERS[self.name](self.certificate, _environment_behind(env).plant, **given)
+        rule = FILTERS[self.name](self.certificate, _environment_behind(env).plant)
         return EstimateFilter(env, rule, self.penalty)
 
 

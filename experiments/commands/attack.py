@@ -1,158 +1,161 @@
-"""`ncs attack`: attacks shielded control loops by Monte Carlo simulation with worst-case disturbances."""
+"""`ncs attack`: worst-case disturbances and agents against the shielded loops of registered environments."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-from pathlib import Path
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
 
-from tqdm import tqdm
+import gymnasium as gym
+import numpy as np
 
-from experiments.attack.attack_cases import AttackCase
-from experiments.attack.monte_carlo_batch import MonteCarloBatch, cases_of, kinds_of_batches
-from experiments.attack.safety_counts import (
-    SafetyCounts,
-    counts_table,
-    gaussian_table,
-    require_safe,
-    require_within,
-)
-from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.runs.output_folder import claim_folder
-from experiments.runs.provenance import versions
-from experiments.settings import AttackSettings, lasting_settings
-from experiments.settings.certificates import FEWEST_ENVS
-from experiments.terminal import wrapped
-from ncs_gym.network import downlink_protocol
-from ncs_gym.reading import json_values, read_file
-from ncs_gym.registration import EPISODE_STEPS
-from ncs_gym.uncertainty.disturbances import as_noise
-from ncs_gym.validation import reason_of
-from shields import Certificate
+from experiments.runs.loops import registered_env
+from experiments.runs.output_folder import require_place
+from experiments.settings import AttackSettings
+from experiments.settings.arguments import id_alone
+from experiments.terminal import progress_bar, say, text_table, wrapped
+from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, LinearPlant
+from ncs_gym.registration import EPISODE_STEPS, registered_ids
+from ncs_gym.validation import counted
+from shields import Certificate, VectorSafetyShield, certificate_for
 from shields.atomic_write import write_atomically
-from shields.runtime.safety_filter import DEFAULT_HORIZON
 
-# Budget of `--smoke`, which attacks the environments' own channels alone unless something else is asked for.
-_SMOKE = {"steps": 1e5, "random_plants": 0}
-_SMOKE_CHANNEL = "its channel"
-# Cases that a line names.
-_MOST_LISTED = 6
+# Episodes of a batch, at least and at most.
+_FEWEST, _MOST = 8, 1024
+# Starts are pulled in: by more than rounding, and behind a downlink, whose first inputs are zero, well into the set.
+_INWARD, _BEHIND_DOWNLINK = 1.0 - 1e-9, 0.3
+_LEGEND = (
+    "blackout: no packet at all",
+    "late: the oldest sample that the contract allows, at every step",
+    "rare: the longest gap that the contract allows, every time",
+    "outside S, outside box: steps with a true state there",
+    "no claim: steps that the shield did not guarantee",
+    "overridden: steps that the shield changed, in mode monitor would have changed",
+)
 
 
 def attack(settings: AttackSettings) -> None:
-    """Runs `ncs attack`."""
-    settings = shortened(settings)
-    cases, kinds = cases_of(settings), len(kinds_of_batches(settings))
-    if settings.noise == "gaussian":
-        cases = _with_covariances(cases)
-    if not settings.unshielded:
-        _require_claims(cases)
-    # Smaller batches, so that each kind of each case comes in once within the budget; those in the folder are kept.
-    each = max(int(settings.steps / (len(cases) * kinds * EPISODE_STEPS)), FEWEST_ENVS)
-    there = None if settings.force else _envs_in(settings.out)
-    settings = replace(settings, envs=min(settings.envs, each, there or each))
-    claim_folder("attack", settings)
-    horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
-    plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
-    settings = replace(settings, horizon=horizon, plant=plant)
-    certificates = _certificates(cases, settings.out / "certificates", settings.safe_set)
-    numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
-    batches = [
-        MonteCarloBatch(settings, case, index, certificate)
-        for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
-        for index in range(number)
-    ]
-    counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
-    for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
-        counts[batch.case] += counted
-    total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
-    print(counts_table(counts, looks_ahead=looks_ahead))
-    if settings.smoke:
-        print(wrapped("A smoke run shows that everything runs; it attacks too little to show anything else."))
-    if left_out := [name for name in cases if name not in counts]:
-        listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
-        budget = f"within {settings.steps:,.0f} steps"
-        print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
-    limits = (
-        {name: cases[name].bound_violation_probability() for name in counts} if settings.noise == "gaussian" else {}
-    )
-    if limits:
-        print("", gaussian_table(counts, limits), sep="\n")
-    document = {"settings": lasting_settings(settings), "versions": versions(), "total": total.document()}
-    document["cases"] = {case: each.document() for case, each in counts.items()}
-    if limits:
-        document["bound_violation_probability"] = limits
-    write_atomically(settings.out / "attack.json", json.dumps(document, indent=1) + "\n")
-    if limits and not settings.unshielded:
-        require_within(counts, limits)
-    elif not settings.unshielded:
-        require_safe(total, looks_ahead=looks_ahead)
+    """Runs `ncs attack`; ends with exit code 1 if a guaranteed state was outside, or a guarantee was lost."""
+    settings = short_version(settings, steps=1, env=settings.env or registered_ids()[0])
+    require_place(settings.out)
+    envs = {each: registered_env(each) for each in ([settings.env] if settings.env else registered_ids())}
+    channels = {env_id: channels_of(env.channel, env.contract) for env_id, env in envs.items()}
+    cases = [(env_id, kind, channel) for env_id in envs for kind, channel in channels[env_id].items()]
+    each = max(-(-settings.steps // (len(cases) * EPISODE_STEPS)), _FEWEST)
+    rows, failed = {}, Counter[str]()
+    with progress_bar(len(cases) * each * EPISODE_STEPS, "attack", "step") as bar:
+        for number, (env_id, kind, channel) in enumerate(cases):
+            env = envs[env_id]
+            certificate = certificate_for(env.plant, env.certificate_contract, settings.safe_set)
+            counts, rng = Counter[str](), np.random.default_rng([settings.seed, number])
+            for first in range(0, each, _MOST):
+                worst = worst_case(certificate, settings.mode)
+                vector = gym.make_vec(id_alone(env_id), num_envs=min(_MOST, each - first), channel=channel, **worst)
+                mode, horizon = settings.mode, settings.horizon
+                shield = VectorSafetyShield(vector, certificate, mode, horizon=horizon, on_unproved="ignore")
+                for found in attacked(shield, rng):
+                    counts.update(found)
+                    bar.update(found["steps"])
+                shield.close()
+            rows[f"{id_alone(env_id).removeprefix('ncs_gym/')}, {kind}"] = counts
+            failed.update(counts)
+    print(table_of(rows))
+    if settings.out is not None:
+        write_atomically(settings.out, json.dumps(rows, indent=1) + "\n")
+    wrong = {"outside the box": failed["guaranteed outside box"]}
+    if settings.mode != "lookahead":
+        wrong["outside S"] = failed["guaranteed outside S"]
+    if settings.mode != "monitor":
+        wrong["no longer guaranteed though the contracts were kept"] = failed["lost"]
+    if any(wrong.values()):
+        say("ncs: of guaranteed states " + ", ".join(f"{count:,} were {what}" for what, count in wrong.items()))
+        sys.exit(1)
 
 
-def _envs_in(folder: Path) -> int | None:
-    """Returns the episodes of a batch of the campaign that a folder has; None for none."""
-    try:
-        envs = json_values(read_file(folder / "settings.json"))["settings"]["envs"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return envs if type(envs) is int and envs >= FEWEST_ENVS else None
+def channels_of(own: Channel, contract: ChannelContract | None) -> dict[str, Channel]:
+    """Returns a channel, and those that use a contract up by delays and by losses; without one a blackout."""
+    if contract is None:
+        return {"own": own, "blackout": Channel(loss=1.0)}
+    age, step = contract.max_age, contract.quantization_step
+    rare = Channel(loss=1.0, max_consecutive_losses=age, quantization_step=step)
+    return {"own": own, "late": Channel(delay=age, quantization_step=step), "rare": rare}
 
 
-def shortened(settings: AttackSettings) -> AttackSettings:
-    """Returns the settings of the short version if `--smoke` is given, otherwise the same settings."""
-    chosen = {"channel": settings.channel or _SMOKE_CHANNEL} if settings.env is settings.plant is None else {}
-    return short_version(settings, **_SMOKE, **chosen)
+def worst_case(certificate: Certificate, mode: str = "project") -> dict[str, Any]:
+    """Returns the noise and disturbance of an environment that push the next state farthest out of the safe set.
 
-
-def _with_covariances(cases: dict[str, AttackCase]) -> dict[str, AttackCase]:
-    """Returns the cases whose plants have Gaussian noise; raises ValueError if there is none."""
-    kept, refusal = {}, ""
-    for name, case in cases.items():
-        try:
-            as_noise("gaussian", case.plant)
-        except ValueError as error:
-            refusal = reason_of(error)
-        else:
-            kept[name] = case
-    if not kept:
-        raise ValueError(refusal)
-    if len(kept) < len(cases):
-        print(wrapped(f"{len(cases) - len(kept)} of {len(cases)} cases have no Gaussian noise and are left out."))
-    return kept
-
-
-def _require_claims(cases: dict[str, AttackCase]) -> None:
-    """Raises unless something is claimed of every case."""
-    for name, case in cases.items():
-        if downlink_protocol(case.downlink, case.downlink_contract).contract is None:
-            raise ValueError(
-                f"{name}: nothing is claimed behind a downlink without a contract, so that there is nothing to attack; "
-                "give it max_consecutive_losses, or the environment downlink_contract=ChannelContract(c)"
-            )
-
-
-def _certificates(cases: dict[str, AttackCase], folder: Path, safe_set: str | None = None) -> dict[str, Certificate]:
-    """Returns the certificate of each case; those that the folder lacks are synthesized and written there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    found = {}
-    for name, case in tqdm(cases.items(), desc="certificates", leave=False, disable=None):
-        contract = case.certificate_contract
-        suffix = "" if contract is None else f"-{contract.max_age}-{contract.quantization_step:g}"
-        suffix += f"-{safe_set}" if safe_set else ""
-        file = folder / f"{case.plant.fingerprint[:16]}{suffix}.json"
-        if not file.exists():
-            case.certificate(safe_set).save(file)
-        found[name] = Certificate.load(file)
-    return found
-
-
-def _numbers_of_batches(cases: int, count: int, least: int) -> list[int]:
-    """Returns the number of batches of each case, as even as possible, more for earlier cases, `count` in all.
-
-    One at least is run. The `least` kinds of batches take turns: where not all cases can have each kind, some have all.
+    In mode "lookahead", which may leave that set, they push it out of the box.
     """
-    count = max(count, 1)
-    attacked = min(cases, -(-count // least))
-    each, extra = divmod(count, attacked)
-    return [each + (number < extra) if number < attacked else 0 for number in range(cases)]
+    push = {"M": certificate.M} if certificate.polytope is None else {"rows": certificate.polytope.rows}
+    return {"noise": "extreme", "disturbance": AdversarialDisturbance(**({} if mode == "lookahead" else push))}
+
+
+def starts(certificate: Certificate, rng: np.random.Generator, count: int, reach: float = _INWARD) -> np.ndarray:
+    """Returns starts on the boundary of the safe set, shape (count, n), pulled in towards the state of rest."""
+    center = certificate.resting_state
+    return center + reach * (certificate.safe_set.sample_boundary(rng, count) - center)
+
+
+def hostile_agents(
+    certificate: Certificate, plant: LinearPlant, count: int, rng: np.random.Generator
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns the actions (N, m) of agents that see estimates (N, n).
+
+    They are, a quarter each, random, outwards, the certified gain turned round, and bang-bang.
+    """
+    outwards = (plant.B.T @ certificate.M @ plant.A).T
+    turned = -1e3 * (certificate.K / plant.input_half[:, None]).T
+    signs, kinds = rng.choice([-1.0, 1.0], (count, plant.m)), 4 * np.arange(count)[:, None] // count
+
+    def act(estimates: np.ndarray) -> np.ndarray:
+        away = estimates - certificate.resting_state
+        choices = rng.uniform(-1.0, 1.0, signs.shape), np.sign(away @ outwards), np.clip(away @ turned, -1.0, 1.0)
+        return np.choose(kinds, [*choices, signs]).astype(np.float32)
+
+    return act
+
+
+def attacked(shield: VectorSafetyShield, rng: np.random.Generator) -> Iterator[Counter[str]]:
+    """Plays an episode in each environment behind a shield, from the boundary of the safe set.
+
+    Yields what is counted at the start and in each step; "lost" is a guarantee that ended although the channels kept
+    their contracts.
+    """
+    certificate, plant, count = shield.certificate, shield.filter.plant, shield.num_envs
+    reach = _INWARD if shield.env.unwrapped.single.downlink is None else _BEHIND_DOWNLINK
+    _, info = shield.reset(seed=int(rng.integers(2**31)), options={"state": starts(certificate, rng, count, reach)})
+    act, kept = hostile_agents(certificate, plant, count, rng), info["shield_guaranteed"].copy()
+    yield Counter(episodes=count)
+    for _ in range(EPISODE_STEPS):
+        *_, info = shield.step(act(info["estimate"]))
+        guaranteed = info["shield_guaranteed"]
+        kept &= ~(info["contract_broken"] | info["downlink_broken"])
+        where = {
+            "steps": np.ones(count, np.bool_),
+            "outside S": ~(certificate.safe_set.gauge(info["state"]) <= 1.0),
+            "outside box": info["cost"] != 0.0,
+            "no claim": ~guaranteed,
+            "lost": kept & ~guaranteed,
+            "overridden": info["shield_intervened"],
+        }
+        where |= {f"guaranteed {name}": guaranteed & where[name] for name in ("outside S", "outside box")}
+        yield Counter({name: int(np.count_nonzero(found)) for name, found in where.items()})
+
+
+def table_of(rows: dict[str, Counter[str]]) -> str:
+    """Returns the counts of each case and their sum, with a legend."""
+    total = sum(rows.values(), Counter[str]())
+    columns = ("steps", "episodes", "outside S", "outside box", "no claim")
+    table = [["", "", "", "outside", "outside", "no", "over-"]]
+    table += [["case", "steps", "episodes", "S", "box", "claim", "ridden"]]
+    env_id = ""
+    for name, counts in [*rows.items(), ("all", total)]:
+        before, (env_id, comma, kind) = env_id, name.rpartition(", ")
+        table += [[env_id]] if comma and env_id != before else []
+        numbers = [f"{counts[column]:,}" for column in columns]
+        table.append([comma[1:] + kind, *numbers, f"{counts['overridden'] / counts['steps']:.1%}"])
+    text = text_table(table, rules=(2, len(table) - 1))
+    return "\n".join([f"{counted(EPISODE_STEPS, 'step')} in each episode\n", text, *map(wrapped, _LEGEND)])

@@ -31,7 +31,7 @@ from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import TrainingRun
+from experiments.runs.training_run import RunResult, TrainingRun
 from experiments.settings import CompareSettings
 from experiments.settings.arguments import id_alone
 from experiments.terminal import say, wrapped
@@ -54,10 +54,12 @@ class Comparison(NamedTuple):
     Attributes:
         episodes: A row per evaluation episode (`episodes_table`).
         summary: What summary.json holds.
+        results: Results of the runs, with the agents that were trained.
     """
 
     episodes: pd.DataFrame
     summary: dict[str, Any]
+    results: Sequence[RunResult]
 
 
 def compare(settings: CompareSettings) -> Comparison:
@@ -96,7 +98,7 @@ def compare(settings: CompareSettings) -> Comparison:
     print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
     short = [_smoke_text(settings)] if settings.smoke else []
     print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
-    return Comparison(episodes, summary)
+    return Comparison(episodes, summary, results)
 
 
 def shortened(settings: CompareSettings) -> CompareSettings:

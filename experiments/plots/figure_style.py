@@ -125,11 +125,8 @@ ARM_COLORS_AND_MARKERS = {
 }
 # Markers of policies that are not trained, in the color of what they are behind.
 _CONTROLLER_MARKERS = {
-    "proportional": "*",
     "lqr": "H",
-    "governor": "^",
     "mpc": "x",
-    "greedy": "D",
     "random": "8",
     "K x_hat": "1",
     "zero input": "2",
@@ -137,7 +134,7 @@ _CONTROLLER_MARKERS = {
     "pretrained": "4",
 }
 # Filters that share the color of another one.
-_HOLLOW = ("trusting:lookahead", "psf:tube")
+_HOLLOW = ("psf:tube",)
 _SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
 # Dashes, and size of the marker [points], of an arm with a price of its own per violating step.
 _PRICED, _PRICED_SIZE = (0, (12.0, 1.6)), 13.0
@@ -167,7 +164,7 @@ class ArmStyle:
 
         Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
         is the unshielded one and whose curves lie on that arm's. A price of one's own has long dashes and
-        a large marker. Of fixed policies that share a color, the one behind a trusting lookahead is hollow.
+        a large marker.
 
         Raises:
             ValueError: If the arm is unknown.
@@ -181,7 +178,7 @@ class ArmStyle:
             return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy.partition(":")[0]], hollow, size=9.0)
         if arm.violation_weight is not None:
             return cls(color, _PRICED, marker, hollow=True, size=_PRICED_SIZE)
-        changed = arm.penalizes_interventions or arm.is_residual or str(arm.mode).startswith(_HOLLOW)
+        changed = arm.penalizes_interventions or str(arm.mode).startswith(_HOLLOW)
         return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
 
     @property

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import cache
 
 from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import with_changes
-from agents.loop import BasePolicy, LoopConfig, ShieldSettings
+from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import (
     CONTROLLERS,
     FILTERS,
+    MARGINS,
     REGULATORS,
     EstimateFilterSettings,
     tuned_training,
@@ -22,19 +22,17 @@ from experiments.runs.loops import other_scenarios, registered_env, under
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.training_run import RunResult, TrainingRun, require_trainable
 from experiments.settings import LearningSettings
-from ncs_gym.envs.env import ncs_env
 from shields import Certificate
 from shields.runtime.safety_filter import MODES
 
 _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
-# Modes whose filter plans ahead, with or without a margin behind.
-_PLANNING = ("lookahead", "trusting:lookahead")
-_PENALIZED, _RESIDUAL = "penalized", "+residual"
+# What acts where no agent is trained.
+_POLICIES = (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED)
 _KNOWN_ARMS = (
-    "unshielded, monitor, penalized, penalized:WEIGHT, lagrangian, FILTER, 'FILTER at test', FILTER+penalty, each also "
-    "with +residual; CONTROLLER and CONTROLLER+FILTER, with FILTER one of shielded, shielded:MODE, "
-    f"lookahead, {', '.join(FILTERS)} (modes: {', '.join(_SHIELD_MODES)}) and CONTROLLER one of untrained, "
-    f"{', '.join((PRETRAINED, *CONTROLLERS, *REGULATORS))}"
+    "unshielded, monitor, penalized[:WEIGHT], lagrangian, FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
+    f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, trusting[:MARGIN], psf[:MARGIN], psf:tube and "
+    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr, mpc[:MARGIN] (modes: "
+    f"{', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
 )
 
 # Results of the training runs of each arm, in the order of their indices.
@@ -54,7 +52,6 @@ class Arm:
         violation_weight: Price of a violating step; None for that of the settings.
         adapts_penalty: Whether that price is adapted during training.
         filters_training: Whether shield or filter act in training too.
-        is_residual: Whether the agent adds to the action of u = K x_hat.
     """
 
     name: str
@@ -65,7 +62,6 @@ class Arm:
     violation_weight: float | None = None
     adapts_penalty: bool = False
     filters_training: bool = True
-    is_residual: bool = False
 
     @classmethod
     def of(cls, name: str, mode: str = "project") -> Arm:
@@ -98,16 +94,16 @@ class Arm:
 
         Args:
             loop: The bare control loop.
-            certificate: Certificate of the shield or filter, which also gives the gain of residual agents.
+            certificate: Certificate of the shield or filter.
             settings: Horizon and penalties.
         """
-        horizon = settings.horizon if self.mode is not None and self.mode.startswith(_PLANNING) else None
 
         def filtered(penalty: float = 0.0) -> LoopConfig:
             if self.mode is None:
                 return loop
             if self.mode in FILTERS:
-                return replace(loop, filter=EstimateFilterSettings(self.mode, certificate, penalty, horizon))
+                return replace(loop, filter=EstimateFilterSettings(self.mode, certificate, penalty))
+            horizon = settings.horizon if self.mode == "lookahead" else None
             return replace(loop, shield=ShieldSettings(certificate, self.mode, penalty, horizon, on_unproved="ignore"))
 
         training = filtered(settings.intervention_penalty * self.penalizes_interventions)
@@ -118,9 +114,6 @@ class Arm:
         elif self.penalizes_violations:
             given = self.violation_weight
             training = replace(training, violation_penalty=settings.violation_penalty if given is None else given)
-        if self.is_residual:
-            base = BasePolicy.of(certificate.fallback, ncs_env(loop.single()).plant)
-            training = replace(training, base_policy=base)
         return training, filtered()
 
 
@@ -157,42 +150,33 @@ def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
 
 
 @cache
-def _parsed(name: str, mode: str) -> Arm:
-    known, kind = _arms(mode), name.replace(" ", "-").replace("+residual+penalty", "+penalty+residual")
-    if kind in known:
-        return known[kind]
-    kind, colon, weight = kind.removesuffix(_RESIDUAL).partition(":")
-    if kind == _PENALIZED and colon and _is_weight(weight):
-        kind += _RESIDUAL if name.endswith(_RESIDUAL) else ""
-        return replace(known[kind], name=name, violation_weight=float(weight))
-    near = get_close_matches(name, known, 1)
-    hint = " (several are separated by spaces)" if "," in name else f" (did you mean {near[0]!r}?)" if near else ""
-    raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
-
-
-@cache
-def _arms(mode: str) -> dict[str, Arm]:
-    """Returns all arms, but for the weights of "penalized", by their names with hyphens."""
-    filters = {"shielded": mode} | {f"shielded:{each}": each for each in _SHIELD_MODES}
-    filters |= {name: name for name in ("lookahead", *FILTERS)}
-    trained = list(_trained_arms(filters))
-    arms = [*trained, *(replace(arm, name=arm.name + _RESIDUAL, is_residual=True) for arm in trained)]
-    for policy in (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED):
-        arms += [Arm(policy, policy=policy)]
-        arms += [Arm(f"{policy}+{name}", own, policy) for name, own in filters.items()]
-    return {arm.name.replace(" ", "-"): arm for arm in arms}
-
-
-def _trained_arms(filters: dict[str, str]) -> Iterator[Arm]:
-    yield Arm("unshielded")
-    yield Arm("monitor", "monitor")
-    yield Arm(_PENALIZED, penalizes_violations=True)
-    yield Arm("lagrangian", penalizes_violations=True, adapts_penalty=True)
-    for name, mode in filters.items():
-        yield Arm(name, mode)
-        yield Arm(f"{name}+penalty", mode, penalizes_interventions=True)
-    for name, mode in (filters | {"shield": filters["shielded"]}).items():
-        yield Arm(f"{name} at test", mode, filters_training=False)
+def _parsed(text: str, mode: str) -> Arm:
+    kind, colon, weight = text.partition(":")
+    if kind == "penalized" and (not colon or _is_weight(weight)):
+        return Arm(text, penalizes_violations=True, violation_weight=float(weight) if colon else None)
+    name = text.replace("-", " ")
+    alone = {
+        "unshielded": Arm(name),
+        "monitor": Arm(name, "monitor"),
+        "lagrangian": Arm(name, penalizes_violations=True, adapts_penalty=True),
+        "shield at test": Arm(name, mode, filters_training=False),
+    }
+    if name in alone:
+        return alone[name]
+    if name in _POLICIES:
+        return Arm(name, policy=name)
+    modes = {"shielded": mode, "lookahead": "lookahead"} | {f"shielded:{each}": each for each in _SHIELD_MODES}
+    modes |= {each: each for each in FILTERS}
+    if name in modes:
+        return Arm(name, modes[name])
+    if (tested := name.removesuffix(" at test")) != name and tested in modes:
+        return Arm(name, modes[tested], filters_training=False)
+    first, _, last = name.partition("+")
+    if last == "penalty" and first in modes:
+        return Arm(name, modes[first], penalizes_interventions=True)
+    if first in _POLICIES and last in modes:
+        return Arm(name, modes[last], first)
+    raise ValueError(f"unknown arm {text!r}; known are {_KNOWN_ARMS}")
 
 
 def _is_weight(text: str) -> bool:

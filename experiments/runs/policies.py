@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from agents.agent import Agent
 
 # Controllers that need neither training nor a certificate, and the short name of one.
-UNTRAINED_POLICIES = ("greedy", "zero", "random", *REGULATORS)
+UNTRAINED_POLICIES = ("zero", "random", *REGULATORS)
 _SHORT = {"zero": "zero input"}
 # Stands for the agent of the environment that comes with the package.
 PRETRAINED = "pretrained"

@@ -16,7 +16,6 @@ from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
     LearningSettings,
-    StudySettings,
     SweepSettings,
     TrainSettings,
 )
@@ -34,7 +33,6 @@ __all__ = [
     "RenderSettings",
     "ReproduceSettings",
     "RequirementsSettings",
-    "StudySettings",
     "SweepSettings",
     "SynthesizeSettings",
     "TrainSettings",

@@ -12,7 +12,6 @@ import tyro
 from experiments.settings.arguments import StepCount, require_horizon, require_limits
 from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA
 from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
@@ -99,78 +98,37 @@ def _refuse_both(env: str | None, plant: Path | None) -> None:
         raise ValueError("give either --env or --plant, not both")
 
 
-# Episodes of a batch, at least.
-FEWEST_ENVS = 4
-
-
 @dataclass(frozen=True, kw_only=True)
-class AttackSettings(BackendSettings):
-    """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set or box.
+class AttackSettings:
+    """Attacks shielded loops with worst-case disturbances and agents, and counts states outside the safe set or box.
 
-    The plants are those of the registered environments (--env attacks those with other environments inside) and random
-    ones, behind every kind of channel. Disturbances push
-    the next state farthest out, initial states and first estimation errors lie on the boundaries of their sets, sensor
-    noise has full size in random directions, and agents are random or hostile.
+    Every environment is attacked on its own channel and on those that use its contract up. Disturbances push the next
+    state farthest out, first errors and sensor noise have full size, and agents are random or hostile. Ends with exit
+    code 1 if a guaranteed state is outside.
 
     Attributes:
-        steps: Budget, by default one of about two minutes; the campaign whose results the documentation reports has
-            1e9, of which 1e8 take twenty minutes. Whole batches of `envs` episodes are run as long as they fit. Where
-            it does not allow one per attack case and mode of the shield, batches are smaller, and cases are left out if
-            they get too small. Batches of a folder keep their size when steps are added.
-        out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
-        random_plants: Number of random plants, each behind four kinds of channels.
-        envs: Number of episodes in a batch, simulated side by side.
-        mode: Mode of the shield; by default project, switch and boundary in turn. The claim of lookahead is the box:
-            states may leave S, and half of the episodes are drawn from all of the box.
-        safe_set: What the shields keep; see `ncs synthesize`. By default the polytope, where there is one.
+        env: Id of the only environment to attack; module:id first imports the module, which registers one of your own.
+            By default all registered ones.
+        steps: Simulated steps in all, at least 8 episodes of each environment and channel.
+        mode: Mode of the shield; "monitor" only watches. In mode lookahead states may leave the safe set.
+        safe_set: What the shields keep; by default the polytope, where there is one.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
-        unshielded: Let the shield only watch, to see what happens without it.
-        noise: "truncated" is the worst noise within the bounds; "gaussian" noise has none: it is drawn, next to
-            the worst of the other disturbances, and the bound on the probability of an exit is printed.
-        delta: Level at which the certificates' ellipsoids hold for a draw of Gaussian noise, in place of the plants'.
-        env: Id of the only environment to attack, behind its own channel and those that use its contract up, or every
-            kind of channel without one; module:id first imports the module, which registers one of your own. By default
-            all of the above.
-        plant: File of the only plant to attack, which `LinearPlant.save` wrote: behind channels that use its contract
-            up, or every kind of channel without one.
-        max_age: Largest measurement age of the contract of --plant [steps]; no contract by default.
-        quantization_step: Coarsest quantization that the contract of --plant allows.
-        channel: Only kind of channel to attack, by its name in the table: "on request", say; all by default.
-        force: Replace the finished results of another campaign in the output folder, which otherwise is refused.
-        seed: Seed of the campaign, >= 0.
-        smoke: Run a short version, to see that everything works: the registered environments behind their own channels,
-            unless others are asked for, and no random plants; in runs/attack-smoke unless `--out` differs.
+        out: File for the counts (JSON).
+        seed: Seed of the attack, >= 0.
+        smoke: Attack one environment a little, to see that everything works.
     """
 
-    steps: float = 5e6
-    out: Path = Path("runs/attack")
-    random_plants: int = 4
-    envs: int = 4096
-    mode: Literal["project", "lookahead", "switch", "boundary"] | None = None
+    env: str | None = None
+    steps: StepCount = 1_000_000
+    mode: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     horizon: int | None = None
-    unshielded: bool = False
-    noise: Literal["truncated", "gaussian"] = "truncated"
-    delta: float | None = None
-    env: str | None = None
-    plant: Path | None = None
-    max_age: int | None = None
-    quantization_step: float | None = None
-    channel: str | None = None
-    force: bool = False
+    out: Path | None = None
     seed: int = 0
     smoke: bool = False
 
     def __post_init__(self) -> None:
-        BackendSettings.__post_init__(self)
-        _refuse_both(self.env, self.plant)
-        if self.plant is None and (self.max_age is not None or self.quantization_step is not None):
-            raise ValueError("--max-age and --quantization-step belong to --plant: environments have contracts already")
-        if not 1.0 <= self.steps < 1e15:
-            raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
-        require_limits(self, random_plants=0, envs=FEWEST_ENVS, seed=0, delta=(SMALLEST_DELTA, 0.5))
-        if self.unshielded and self.mode is not None:
-            raise ValueError(f"give either --mode {self.mode} or --unshielded, not both")
+        require_limits(self, steps=1, seed=0)
         require_horizon(self, self.mode)
 
 
@@ -321,9 +279,8 @@ class RenderSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         out: File to write: .gif, or .png for the last frame alone.
-        policy: "greedy" (toward the task's target as hard as it can, gently to rest where it has none), "zero",
-            "random", a regulator ("lqr", "governor", "mpc"), "pretrained" (the small agent that comes with the
-            package), or the folder of a trained agent.
+        policy: "lqr", "mpc", "zero", "random", "pretrained" (the small agent of the package), or the folder of a
+            trained agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
@@ -338,7 +295,7 @@ class RenderSettings:
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Path = Path("episode.gif")
-    policy: str = "greedy"
+    policy: str = "lqr"
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None
     side_by_side: bool = False

@@ -11,7 +11,6 @@ import tyro
 
 from agents.hyperparams import DEFAULTS, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
-from experiments.baselines import MARGINS
 from experiments.settings.arguments import (
     Assignments,
     OptionalStepCount,
@@ -157,9 +156,9 @@ class CompareSettings(LearningSettings):
         seeds: Number of paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would do), penalized (a penalty per violation),
             penalized:WEIGHT, lagrangian (adapts it), shielded, shielded:MODE, lookahead, trusting (no error set), psf
-            (predictive filter), also with a margin in percent, psf:20; shield-at-test; also with +penalty, +residual.
-            Untrained: proportional, lqr, governor, mpc, random, K-x_hat, zero-input, untrained, pretrained, alone or
-            behind a filter, lqr+shielded (docs/experiments.md).
+            (predictive filter), also with a margin in percent, psf:20, psf:tube; shield-at-test; also with +penalty.
+            Untrained: lqr, mpc, mpc:20, random, K-x_hat, zero-input, untrained, pretrained, alone or behind a filter,
+            lqr+shielded (docs/experiments.md).
         baselines: Arms that are listed below the others and not drawn.
         scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
             attacked-on-an-ideal-channel, gaussian (docs/experiments.md).
@@ -175,9 +174,9 @@ class CompareSettings(LearningSettings):
         "zero input",
         "K x_hat",
         "untrained",
-        "proportional",
-        "proportional+trusting",
-        "proportional+shielded",
+        "lqr",
+        "lqr+trusting",
+        "lqr+shielded",
     )
     scenarios: tuple[str, ...] = ("as trained",)
     tuned_arms: tyro.conf.Suppress[bool] = False
@@ -250,27 +249,6 @@ class EvaluateSettings:
             require_horizon(self, self.shield)
 
 
-# Environments in which the network decides.
-NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
-# What the shield is compared with and needs no training, margins in percent: a regulator alone, with a governor of its
-# references, or behind a filter, and model predictive control. The weights of each are tuned by themselves
-# (`benchmarks.learning`).
-_MARGINS = ("", *(f":{margin}" for margin in MARGINS))
-REGULATED_ARMS = (
-    "lqr",
-    *(f"governor{margin}" for margin in _MARGINS),
-    *(f"mpc{margin}" for margin in ("", ":20", ":40", ":50")),
-    *(f"lqr+{name}{margin}" for name in ("psf", "trusting", "trusting:lookahead") for margin in _MARGINS),
-    "lqr+psf:tube",
-    "lqr+shielded",
-    "lqr+lookahead",
-)
-
-
-# Agents, each trained with what was tuned for it by itself.
-TRAINED_ARMS = ("unshielded", "penalized", "lagrangian", "trusting:20", "shielded", "lookahead")
-
-
 @dataclass(frozen=True, kw_only=True)
 class SweepSettings(LearningSettings):
     """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
@@ -307,66 +285,3 @@ class SweepSettings(LearningSettings):
     burst_lengths: tuple[float, ...] = (0.0,)
     mass_factors: tuple[float, ...] = ()
     downlink_losses: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudySettings(BackendSettings):
-    """Compares arms in several environments and under several scenarios, with the statistics to judge them by.
-
-    Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
-    of that command; then linear controllers and trained agents are attacked with every impairment of the channel on and
-    off. Leaves report.html, a page of Markdown (docs/results.md is one) beside all tables (results.txt), figures,
-    summary.json and episodes.parquet. Started again with the same folder, finished runs are kept: a long study can be
-    run in parts.
-
-    Attributes:
-        out: Output folder; created if it does not exist.
-        envs: Ids of the environments; the first one comes first in the report.
-        seed: Seed of the study, >= 0.
-        seeds: Number of paired training runs per arm and environment.
-        budget: Fraction of the training steps of each environment, in (0, 1].
-        episodes: Evaluation episodes per run and scenario.
-        algo: Learning algorithm.
-        arms: Trained arms; see `ncs compare`.
-        baselines: Arms in which nothing is trained.
-        scenarios: What policies are evaluated under besides "as trained".
-        safe_set: What shields keep, and the filters beside them end in: the polytope, or the ellipsoid inside it.
-        channel_episodes: Episodes per arm and combination of impairments; 0 leaves them out.
-        page: Also write the page of Markdown to this file, its figures into the folder images beside it, all tables
-            and their numbers into the files with the endings .txt and .json.
-        quote: Pages in which the marked tables are replaced by those of this study.
-        smoke: Run a short version, whatever else is asked for, to see that everything works; unless `--out`
-            names another folder than the usual one, in that with -smoke at the end of its name.
-        force: Replace finished results of other settings in the output folder, which otherwise is refused.
-    """
-
-    out: Path = Path("runs/study")
-    envs: tuple[str, ...] = NETWORK_ENVS
-    seed: int = 0
-    seeds: int = 5
-    budget: float = 1.0
-    episodes: int = 50
-    algo: Algorithm = "PPO"
-    arms: tuple[str, ...] = TRAINED_ARMS
-    baselines: tuple[str, ...] = REGULATED_ARMS
-    scenarios: tuple[str, ...] = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
-    safe_set: Literal["polytope", "ellipsoid"] = "polytope"
-    channel_episodes: int = 25
-    page: Path | None = None
-    quote: tuple[Path, ...] = ()
-    smoke: bool = False
-    force: bool = False
-
-    def __post_init__(self) -> None:
-        BackendSettings.__post_init__(self)
-        counts = {"seeds": 1, "episodes": 1, "channel_episodes": 0}
-        require_limits(self, **counts, seed=0)
-        if not 0.0 < self.budget <= 1.0:
-            raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
-        if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):
-            raise ValueError(f"--envs must be ids that differ, at least one, got {' '.join(self.envs) or 'none'}")
-
-
-def short_name(env_id: str) -> str:
-    """Returns an environment's id without its namespace and module, as in names of folders."""
-    return id_alone(env_id).rpartition("/")[2]

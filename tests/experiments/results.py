@@ -9,7 +9,6 @@ import numpy as np
 from agents.loop import LoopConfig, ShieldSettings
 from agents.results import Episode, TrainingPoint, Trajectory
 from experiments.analysis.episodes import arm_summaries, episodes_table, paired_differences
-from experiments.attack.safety_counts import SafetyCounts
 from experiments.runs.training_run import RunResult, TrainingRun
 from shields import Certificate
 
@@ -18,21 +17,8 @@ ALL_ARMS = [
     "monitor",
     "penalized",
     *(f"shielded{mode}{penalty}" for mode in ("", ":project", ":switch", ":boundary") for penalty in ("", "+penalty")),
-    *("penalized:10", "lagrangian", "lookahead", "trusting", "trusting:lookahead", "psf", "shield at test"),
+    *("penalized:10", "lagrangian", "lookahead", "trusting", "psf:tube", "psf", "shield at test"),
 ]
-
-# Larger numbers than those of any campaign, whose channels keep their contracts.
-LONG_CAMPAIGN = SafetyCounts(
-    steps=40_000_000,
-    episodes=2_000_000,
-    exits=2_500_000,
-    violations=1_200_000,
-    broken_episodes=400_000,
-    interventions=40_000_000,
-    level=1.25,
-    planned=40_000_000,
-    outside_starts=1_000_000,
-)
 
 
 def trajectory(

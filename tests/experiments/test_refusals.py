@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.attack.monte_carlo_batch import cases_of
 from experiments.baselines.requests import best_period
 from experiments.plots.figure_style import ArmStyle
 from experiments.runs.arms import Arm
@@ -19,24 +18,21 @@ from experiments.settings import (
     ChannelSettings,
     CompareSettings,
     RenderSettings,
-    StudySettings,
     SweepSettings,
 )
 from experiments.settings.certificates import AttackSettings
-from experiments.study.study import quoted
 from ncs_gym import Channel, ChannelContract
 from tests.certificates import feasible_bounds_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
-RAY, ATTACK = partial(BackendSettings, engine="ray"), partial(AttackSettings, random_plants=1)
+RAY = partial(BackendSettings, engine="ray")
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 HORIZON = "--horizon must be at least 1 and at most 50, got"
-PAGES = {"agents": "new"}
 
 SETTINGS = [
     *((kind, {"steps": 0}, "--steps must be at least 1") for kind in (CompareSettings, SweepSettings)),
-    *((kind, {"jobs": 0}, "--jobs must be at least 1") for kind in (BackendSettings, CompareSettings, ATTACK)),
+    *((kind, {"jobs": 0}, "--jobs must be at least 1") for kind in (BackendSettings, CompareSettings)),
     *((RAY, {"ray_address": text}, "--ray-address must be local, auto or HOST:PORT, got") for text in ("head", "")),
     (RAY, {"ray_address": "ray://head:10001"}, "--ray-address must be"),
     (BackendSettings, {"ray_address": "auto"}, "--ray-address is a setting of --engine ray"),
@@ -49,18 +45,10 @@ SETTINGS = [
       for given in ({"plant": "p", "env": "e"}, {"certificate": "c"}, {"certificate": "c", "plant": "p", "env": "e"})),
     (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield of --env"),
     (CompareSettings, {"horizon": 6}, "--horizon 6 is for mode lookahead, which is not asked for"),
-    *((StudySettings, {name: value}, f"--{name.replace('_', '-')}")
-      for name, value in [("budget", 0.0), ("budget", 1.5), ("seeds", 0), ("envs", ()), ("envs", (CRUISE, CRUISE)),
-                          ("channel_episodes", -1)]),
-    *((ATTACK, {name: value}, f"--{name.replace('_', '-')} must be at least")
-      for name, value in [("steps", 0.5), ("steps", NAN), ("envs", 3), ("seed", -1), ("random_plants", -1)]),
-    *((ATTACK, {"delta": value}, "--delta must be at least 1e-12 and at most 0.5") for value in (0.0, 0.6)),
-    *((ATTACK, {"horizon": value, "mode": "lookahead"}, f"{HORIZON} {value}") for value in (0, 51)),
-    *((ATTACK, {"horizon": 6} | mode, "--horizon 6 is for mode lookahead") for mode in ({}, {"mode": "project"})),
-    (ATTACK, {"unshielded": True, "mode": "switch"}, "give either --mode switch or --unshielded"),
-    (ATTACK, {"env": "ncs_gym/CartPole-v0", "plant": "p.json"}, "give either --env or --plant"),
-    (ATTACK, {"max_age": 3}, "--max-age and --quantization-step belong to --plant"),
-    (ATTACK, {"env": "ncs_gym/CartPole-v0", "quantization_step": 0.1}, "--max-age and --quantization-step belong to"),
+    *((AttackSettings, {name: value}, f"--{name} must be at least")
+      for name, value in [("steps", 0), ("steps", NAN), ("seed", -1)]),
+    *((AttackSettings, {"horizon": value, "mode": "lookahead"}, f"{HORIZON} {value}") for value in (0, 51)),
+    (AttackSettings, {"horizon": 6}, "--horizon 6 is for mode lookahead"),
     *((ChannelSettings, {"file": Path("packets.csv"), "sampling_period": period},
        "--sampling-period must be a number > 0") for period in (0.0, -0.02, NAN, INF)),
     *((RenderSettings, {name: value}, words)
@@ -70,8 +58,8 @@ SETTINGS = [
 
 ARMS = ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor", "penalized:", "penalized:-1"]
 ARMS += ["penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1", "trusting:project", "psf:switch"]
-ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "proportional+", "lqr+penalty"]
-ARMS += ["proportional+monitored", "lqr+residual", "+shielded", "K x_hat+K x_hat"]
+ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "lqr+", "lqr+penalty"]
+ARMS += ["lqr+monitored", "shielded+residual", "+shielded", "K x_hat+K x_hat", "governor", "trusting:7", "mpc:tube"]
 BURSTS = [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, NAN), (0.3, INF)]
 
 CALLS = [
@@ -80,12 +68,9 @@ CALLS = [
     ((scenario_named, "worse"), "unknown scenario 'worse'; known are as trained, worst-case disturbance"),
     ((worse_channel, Channel(), ChannelContract(max_age=0)), "no channel within the contract is worse"),
     ((best_period, Channel(0.5), ChannelContract(3)), "any number of packets"),
-    ((cases_of, ATTACK(channel="nowhere")), "channel must be one of"),
     ((changed_channel, Channel(), {"lag": 3}), "--channel lag: a channel has no such setting; known .*burst_length"),
     *(((changed_channel, Channel(), {"loss": loss, "burst_length": length}), "bursts of mean length")
       for loss, length in BURSTS),
-    *(((quoted, page, PAGES), words) for page, words in [("no mark", "no mark"),
-                                                        ("<!-- ncs study: x -->\n<!-- end -->", "'x'")]),
 ]  # fmt: skip
 
 # Most of these the library shows in a box that reads the command line.
@@ -123,19 +108,19 @@ USAGE = [
 ]
 
 ONE_SENTENCE = [
-    ("fly", "unknown command 'fly'; there are compare, study, train, evaluate"),
+    ("fly", "unknown command 'fly'; there are compare, train, evaluate"),
     ("compre --smoke", "unknown command 'compre'; did you mean compare?"),
     ("compare --env CartPole-v1", "unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"),
     ("compare --env ncs_gym/LinearNCS-v0", "has no plant of its own"),
     ("compare --env ncs_gym/CartPol-v0", "'ncs_gym/CartPol-v0'; did you mean 'ncs_gym/CartPole-v0'?"),
     ("compare --env cstr", "'cstr'; did you mean 'ncs_gym/CSTR-v0'?"),
     ("channel nofile.csv", "cannot read packets from nofile.csv: No such file or directory"),
-    ("compare --arms shieled", "unknown arm 'shieled' (did you mean 'shielded'?)"),
+    ("compare --arms shieled", "unknown arm 'shieled'; known are unshielded, monitor, penalized[:WEIGHT]"),
     ("compare --env CSTR-v0", "unknown environment 'CSTR-v0'; did you mean 'ncs_gym/CSTR-v0'?"),
     ("compare --env ncs_gym/CartPole", "unknown environment 'ncs_gym/CartPole'; did you mean 'ncs_gym/CartPole-v0'?"),
-    ("compare --arms shielded hope", "unknown arm 'hope'", "shielded:MODE"),
+    ("compare --arms shielded hope", "unknown arm 'hope'", "shielded[:MODE]"),
     ("compare --arms shielded shielded", "--arms must be arms that differ"),
-    ("compare --arms unshielded,shielded", "'unshielded,shielded' (several are separated by spaces)"),
+    ("compare --arms unshielded,shielded", "unknown arm 'unshielded,shielded'; known are"),
     ("compare --channel loss=1.5", "loss"),
     ("compare --hyperparams gamma=2", "gamma must be in [0, 1], got 2"),
     ("compare --certificate nowhere.json", "cannot read certificate nowhere.json"),
@@ -163,9 +148,9 @@ ONE_SENTENCE = [
     ("render --out a.avi", "--out must end in .gif or .png"),
     ("render --env CartPole-v1", "unknown environment 'CartPole-v1'"),
     ("render --out nowhere/a.gif", "No such file or directory"),
-    ("render --policy nowhere", "no policy nowhere:", "those with a name are greedy, zero, random, lqr"),
+    ("render --policy nowhere", "no policy nowhere:", "those with a name are zero, random, lqr"),
     ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
-    ("attack --env ncs_gym/CSTR-v0 --noise gaussian", "noise=\"gaussian\" needs a covariance"),
+    ("attack --env ncs_gym/Nothing-v0", "unknown environment 'ncs_gym/Nothing-v0'"),
     ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
     ("requirements --env nothing", "unknown environment"),
 ]  # fmt: skip
@@ -173,8 +158,7 @@ ONE_SENTENCE = [
 # Known without a certificate, which may take minutes.
 BEFORE_A_CERTIFICATE = [
     ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
-    ("compare --env ncs_gym/TruckTrailer-v0 --arms lqr governor:10", "arm governor:10: governor:10 clips targets"),
-    ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "arm governor: governor clips targets"),
+    ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "unknown arm 'governor'; known are unshielded"),
 ]  # fmt: skip
 
 # There are a file `file` and a folder `here`.
@@ -188,7 +172,7 @@ UNWRITABLE = [
     ("render --out nowhere/e.gif", "No such file or directory: nowhere;", "check the path"),
     ("reproduce --out file", "File exists: file;", "choose another path"),
     ("compare --smoke --out file", "file"),
-    ("study --quote nowhere.md", "No such file or directory: nowhere.md;", "check the path"),
+    ("attack --out nowhere/a.json", "No such file or directory: nowhere;", "check the path"),
 ]
 
 

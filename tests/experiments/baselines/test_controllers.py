@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from benchmarks.study import ENVS, REGULATED
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
-from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym import Channel, LinearPlant, NCSEnv, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
@@ -57,14 +57,12 @@ def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for(
     plant, target = env_of("ncs_gym/CartPole-v0").plant, Own(output=np.eye(4)[0], reach=0.1, width=0.1)
     own, other, refined = (NCSEnv(plant=plant, task=task) for task in (target, Other(), Refined()))
     rests = Fallback.of_gain(np.zeros((1, 4)))
-    for name in ("lqr", "governor", "mpc", "governor:10", "proportional"):
+    for name in ("lqr", "mpc", "mpc:10"):
         controller(name, own, rests, 0)
         with pytest.raises(ValueError, match=f"{name} does not know what a Other asks for"):
             controller(name, other, rests, 0)
         with pytest.raises(ValueError, match=f"{name} does not know what a Refined asks for"):
             controller(name, refined, rests, 0)
-    with pytest.warns(UserWarning, match="a Other asks for.* brings the state to the operating point"):
-        controller("greedy", other, rests, 0)
     for name in ("zero input", "K x_hat", "random"):
         controller(name, other, rests, 0)
 
@@ -82,31 +80,6 @@ def test_regulator_of_regulation_is_that_of_its_reward(costs):
         np.testing.assert_allclose(actions, states @ gain.T / plant.input_half, rtol=5e-3, atol=1e-6)
 
 
-def test_governor_is_refused_where_there_are_no_targets():
-    resting, rests = env_of("ncs_gym/TruckTrailer-v0"), Fallback.of_gain(np.zeros((1, 2)))
-    for name in ("governor", "governor:20"):
-        with pytest.raises(ValueError, match=f"{name} clips targets, and a Regulation task has none: take lqr"):
-            controller(name, resting, rests, 0)
-
-
-def test_governor_keeps_limits_and_margins_on_the_way_to_another_speed():
-    env, weights = env_of("ncs_gym/TruckTrailerCruise-v0"), RegulatorWeights(1e-3, 0.0)
-    plant, reached = env.plant, {}
-    for name in ("lqr", "governor", "governor:20"):
-        policy, errors = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), []
-        x, error, farthest = np.zeros(plant.n), 20.0, 0.0
-        for _ in range(400):
-            u = inputs_of(plant, policy(np.array([[*x, error]]), {"estimate": x[None]})[0])
-            x, error = plant.A @ x + plant.B @ u, error - plant.dt * u[0]
-            farthest = max(farthest, float(np.abs(plant.box_rows @ x).max()))
-            errors.append(error)
-        reached[name] = farthest
-        assert abs(errors[-1]) < 0.1  # and arrives
-    assert reached["lqr"] > 1.01
-    assert 0.95 < reached["governor"] <= 1.0 + 1e-6
-    assert 0.75 < reached["governor:20"] <= 0.8 + 1e-6
-
-
 @pytest.mark.parametrize("env_id", SETPOINTS)
 def test_equilibrium_is_one_and_has_the_output_asked_for(env_id):
     env = env_of(env_id)
@@ -122,28 +95,23 @@ def test_regulator_with_set_point_reaches_the_target(env_id):
     assert env.task.output @ x == pytest.approx(0.2, abs=2e-3)
 
 
-def test_speed_controllers_remove_the_error():
+def test_regulator_of_the_speed_removes_the_error():
     env = env_of("ncs_gym/TruckTrailerCruise-v0")
-    proportional = controller("proportional", env, Fallback.of_gain(np.zeros((1, 2))), 0)
-    error, estimates = np.array([[0.0, 0.0, 1.5], [0.0, 0.0, -20.0]], np.float32), np.zeros((2, 2))
-    u = env.plant.u_max * proportional(error, {"estimate": estimates})
-    np.testing.assert_allclose(u[0] * env.plant.dt, 1.5)
-    np.testing.assert_allclose(u[1], -env.plant.u_max)
-    more = np.hstack([error, [[3.0, 0.1], [0.0, 0.2]]]).astype(np.float32)  # an age and a half-width, with observe=
-    np.testing.assert_array_equal(proportional(more, {"estimate": estimates}), u / env.plant.u_max)
     regulator, x, left = controller("lqr", env, Fallback.of_gain(np.zeros((1, 2))), 0), np.zeros(2), 8.0
+    error, estimates = np.array([[0.0, 0.0, 1.5], [0.0, 0.0, -20.0]], np.float32), {"estimate": np.zeros((2, 2))}
+    more = np.hstack([error, [[3.0, 0.1], [0.0, 0.2]]]).astype(np.float32)  # an age and a half-width, with observe=
+    np.testing.assert_array_equal(regulator(more, estimates), regulator(error, estimates))
     for _ in range(40):
         u = env.plant.u_max * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]
         x, left = env.plant.A @ x + env.plant.B @ u, left - env.plant.dt * u[0]
     assert abs(left) < 0.05
 
 
-def test_regulation_needs_no_target_and_the_others_their_gain():
+def test_fallback_applies_its_gain_and_zero_nothing():
     env, K = env_of("ncs_gym/TruckTrailer-v0"), np.array([[0.3, -0.2]])
     estimates = np.array([[0.5, -0.1], [9.0, -9.0]])
-    for name in ("proportional", "K x_hat"):
-        actions = controller(name, env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates})
-        np.testing.assert_allclose(actions, np.clip(estimates @ K.T / env.plant.u_max, -1.0, 1.0))
+    actions = controller("K x_hat", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates})
+    np.testing.assert_allclose(actions, np.clip(estimates @ K.T / env.plant.u_max, -1.0, 1.0))
     assert not controller("zero input", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates}).any()
 
 
@@ -196,30 +164,25 @@ def nominal(env, name, weights, steps=150, times=1):
     return reached, np.array(applied)
 
 
-@pytest.mark.parametrize("name", ["governor", "mpc"])
 @pytest.mark.parametrize("env_id", ["ncs_gym/LaneKeeping-v0", "ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0"])
-def test_governor_and_mpc_keep_limits_and_margins_that_the_regulator_leaves(env_id, name):
+def test_mpc_keeps_limits_and_margins_that_the_regulator_leaves(env_id):
     env, weights = env_of(env_id), RegulatorWeights(1e-3, 0.0)
     free, _ = nominal(env, "lqr", weights)
-    kept, _ = nominal(env, name, weights)
-    with_margin, _ = nominal(env, f"{name}:20", weights)
+    kept, _ = nominal(env, "mpc", weights)
+    with_margin, _ = nominal(env, "mpc:20", weights)
     assert kept <= 1.0 + 1e-6
     assert with_margin <= 0.8 + 1e-6
     assert with_margin < free
 
 
-@pytest.mark.parametrize(
-    ("env_id", "name", "limit"),
-    [("ncs_gym/BatchReactor-v0", "governor:20", 0.8), ("ncs_gym/BatchReactor-v0", "mpc", 1.0)],
-)
-def test_governor_and_mpc_keep_the_limits_between_samples_where_they_count(env_id, name, limit):
+def test_mpc_keeps_the_limits_between_samples_where_they_count():
     weights = RegulatorWeights(1e-6, 0.0)
     at_samples, always = (
-        nominal(ncs_env(gym.make(env_id, between_samples=points)), name, weights, 60, times=20)[0]
+        nominal(ncs_env(gym.make("ncs_gym/BatchReactor-v0", between_samples=points)), "mpc", weights, 60, times=20)[0]
         for points in (None, 4)
     )
-    assert at_samples > limit + 1e-3
-    assert always <= limit + 1e-6
+    assert at_samples > 1.0 + 1e-3
+    assert always <= 1.0 + 1e-6
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/CSTR-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"])
@@ -251,8 +214,8 @@ def test_price_of_changes_makes_the_regulator_change_less():
 
 
 def test_every_arm_of_the_study_has_weights_of_its_own():
-    for env_id in NETWORK_ENVS:
-        weights = {arm: tuned_weights(env_id, arm) for arm in REGULATED_ARMS}
+    for env_id in ENVS:
+        weights = {arm: tuned_weights(env_id, arm) for arm in REGULATED}
         assert len(set(weights.values())) > 2
     assert tuned_weights("ncs_gym/CartPole-v0", "lqr") == RegulatorWeights()
 
@@ -281,76 +244,14 @@ def test_actions_stand_for_inputs_between_both_ends(name):
         np.testing.assert_allclose(u, 0.0, atol=1e-12)
     else:
         np.testing.assert_allclose([u.min(), u.max()], plant.input_ends[:, 0], atol=0.1)
-    if name in ("K x_hat", "proportional"):
-        x_c, u_c = ([0.5, 0.25], 0.125) if name == "K x_hat" else ([0.0, 0.0], 0.0)  # the task's rest is another one
-        wanted = u_c + (estimates - x_c) @ fallback.gain.T
+    if name == "K x_hat":
+        wanted = 0.125 + (estimates - [0.5, 0.25]) @ fallback.gain.T
         np.testing.assert_allclose(u, np.clip(wanted, plant.input_low, plant.input_high), atol=1e-12)
 
 
-def test_greedy_inputs_reach_the_target_in_a_step_or_go_to_the_end_on_its_side():
-    env = two_ended(SetpointTracking(output=np.array([1.0, 0.0]), reach=0.5, width=0.5))
-    policy = controller("greedy", env, Fallback.of_gain(np.zeros((1, 2))), 0)
-    targets = np.linspace(-1.0, 1.0, 41, dtype=np.float32)
-    observations = np.stack([np.zeros(41), np.zeros(41), targets], axis=1)
-    u = inputs_of(env.plant, policy(observations, {"estimate": np.zeros((41, 2))}))[:, 0]
-    np.testing.assert_allclose(u, np.clip(targets / 0.114, *env.plant.input_ends[:, 0]), atol=1e-12)
-
-
-def cascade(task, **later):
-    """A pump that fills an upper tank, which fills a lower one."""
-    bounds = {"disturbance_bound": [0.02, 0.03], "sensor_bound": 0.05, "initial_bound": 0.1}
-    model = {"A": [[0.96, 0.03], [0.0, 0.94]], "B": [[0.0], [0.12]], "H": np.eye(2), "dt": 2.0}
-    plant = LinearPlant(**model, box=[5.0, 8.0], u_max=3.0, **bounds, **later)
-    tracking = SetpointTracking(output=np.eye(plant.n)[task or 0], reach=1.5, width=1.5)
-    return NCSEnv(plant=plant, channel=Channel(), task=Regulation() if task is None else tracking)
-
-
-@pytest.mark.parametrize(("task", "later"), [(0, {}), (1, {"input_delay": 1}), (0, {"input_delay": 2, "du_max": 5.0})])
-def test_greedy_inputs_reach_the_target_as_soon_as_they_reach_the_output(task, later):
-    env = cascade(task, **later)
-    plant, x, target = env.plant, np.zeros(env.plant.n), np.array([0.005])
-    policy = controller("greedy", env, Fallback.of_gain(np.zeros((1, plant.n))), 0)
-    observation = np.concatenate([x, target])[None].astype(np.float32)
-    (u,) = inputs_of(plant, policy(observation, {"estimate": x[None]}))
-    assert 0.0 < u[0] < 3.0
-    steps = 1 + later.get("input_delay", 0) + (task == 0)
-    for k in range(steps):
-        assert x[task] == 0.0
-        x = plant.A @ x + plant.B @ u * (k == 0)
-    np.testing.assert_allclose(x[task], target, rtol=1e-6)
-    far = np.concatenate([np.zeros(plant.n), [-1.4]])[None].astype(np.float32)
-    assert policy(far, {"estimate": np.zeros((1, plant.n))})[0] == -1.0
-
-
-def test_greedy_takes_no_rounding_for_an_effect():
-    plant = LinearPlant(
-        A=np.diag([0.9, 0.8]), B=[[0.1 * 3, 0.1], [0.3, 0.0]], dt=1.0, box=[5.0, 5.0], u_max=1.0,
-        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-    )  # fmt: skip
-    assert plant.B[0, 0] != plant.B[1, 0]
-    env = NCSEnv(plant, task=SetpointTracking(output=np.array([1.0, -1.0]), reach=0.05, width=0.05))
-    policy = controller("greedy", env, Fallback.of_gain(np.zeros((2, 2))), 0)
-    (u,) = policy(np.array([[0.0, 0.0, 0.05]], np.float32), {"estimate": np.zeros((1, 2))})
-    np.testing.assert_allclose(u, [0.0, 0.5], atol=1e-7)
-
-
-def test_greedy_brings_late_states_to_rest_and_is_refused_where_no_input_moves_them():
-    late, prompt = cascade(None, input_delay=1), cascade(None)
-    K = {}
-    for name, env in {"late": late, "prompt": prompt}.items():
-        policy = controller("greedy", env, Fallback.of_gain(np.zeros((1, env.plant.n))), 0)
-        states = 1e-3 * np.eye(env.plant.n)
-        K[name] = inputs_of(env.plant, policy(states, {"estimate": states}))[:, 0] / 1e-3
-    A, B = prompt.plant.A, prompt.plant.B
-    np.testing.assert_allclose(K["late"], K["prompt"] @ np.hstack([A, B]), atol=1e-9)
-    still = NCSEnv(plant=replace(prompt.plant, A=np.diag([0.9, 0.9]), box=[[0.2, 0.0]]), channel=Channel())
-    with pytest.raises(ValueError, match="no input moves what the task asks for"):
-        controller("greedy", still, Fallback.of_gain(np.zeros((1, 2))), 0)
-
-
-@pytest.mark.parametrize("name", ["governor", "governor:20", "mpc", "mpc:20"])
+@pytest.mark.parametrize("name", ["mpc", "mpc:20"])
 @pytest.mark.parametrize("target", [-4.0, 4.0])
-def test_governor_and_mpc_come_close_to_both_ends_and_no_further(name, target):
+def test_mpc_comes_close_to_both_ends_and_no_further(name, target):
     env, weights = (
         two_ended(SetpointTracking(output=np.array([0.0, 1.0]), reach=0.5, width=0.5)),
         RegulatorWeights(1e-4, 0.0),

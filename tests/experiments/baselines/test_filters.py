@@ -36,9 +36,9 @@ def cases(certificate, loaded):
 
 
 def played(certificate, **filters):
-    """The proportional controller on the cruise, always with the same seed."""
+    """The regulator on the cruise, always with the same seed."""
     loop = LoopConfig(env=CRUISE, **filters)
-    policy = controller("proportional", ncs_env(loop.single()), certificate.fallback, 0)
+    policy = controller("lqr", ncs_env(loop.single()), certificate.fallback, 0)
     return evaluate(loop, policy, 20, 7, certificate.M).episodes
 
 
@@ -71,12 +71,6 @@ def violating(loop, certificate, name, episodes=40, **settings):
     return sum(
         each.violation_steps > 0 for each in evaluate(loop.with_kwargs(**settings), policy, episodes, 7).episodes
     )
-
-
-def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
-    loop, _, certificate = tank()
-    assert violating(loop, certificate, "trusting:lookahead") >= 3
-    assert violating(loop, certificate, "lookahead") == 0
 
 
 @pytest.mark.slow
@@ -148,26 +142,6 @@ def test_trusting_filter_decides_as_the_shield_without_an_error(certificate, loa
     for estimate, proposed, chosen in zip(*cases, applied, strict=True):
         np.testing.assert_array_equal(chosen, shield.decide(estimate, nothing, proposed).input)
     assert 20 < np.count_nonzero(applied != cases[1]) < 380
-
-
-def test_trusting_lookahead_keeps_its_plans_and_leaves_the_safe_set_on_purpose(certificate, loaded):
-    shield, trusting = (
-        SafetyFilter(certificate, loaded, "lookahead"),
-        CertaintyEquivalentFilter(certificate, loaded, "lookahead"),
-    )
-    state, stored, reasons = np.zeros(2), (), set()
-    proposals = loaded.u_max * np.sign(np.repeat(np.random.default_rng(2).standard_normal(8), 6))[:, None]
-    farthest = 0.0
-    for k, proposed in enumerate(proposals):
-        decision = shield.decide(state, np.zeros((2, 2)), proposed, stored)
-        u = trusting(state[None], proposed[None], np.array([k == 0]))[0]
-        np.testing.assert_allclose(u, decision.input, atol=1e-6)
-        stored, state = decision.plan, loaded.A @ state + loaded.B @ decision.input
-        reasons.add(decision.reason)
-        farthest = max(farthest, state @ certificate.M @ state)
-        assert np.abs(loaded.box_rows @ state).max() <= 1.0
-    assert {"safe", "planned"} <= reasons
-    assert farthest > 0.9
 
 
 def test_trusting_filter_still_keeps_the_disturbance_out_if_the_estimate_is_true(certificate, loaded, trusting, cases):

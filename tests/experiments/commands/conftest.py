@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant
-from tests.command import ATTACK, SMOKE, Run, ncs
+from tests.command import SMOKE, Run, ncs
 from tests.workers import no_worker_processes
 
 
@@ -51,9 +51,3 @@ def record(tmp_path: Path) -> Callable[..., Path]:
 def smoke(made_once: Callable) -> tuple[Path, Run]:
     """The folder of a short comparison, and what it printed; tests that change the folder copy it."""
     return _made("smoke", SMOKE, made_once)
-
-
-@pytest.fixture(scope="session")
-def attacked(made_once: Callable) -> tuple[Path, Run]:
-    """The folder of a short campaign, and what it printed; tests that change the folder copy it."""
-    return _made("attacked", ATTACK, made_once)

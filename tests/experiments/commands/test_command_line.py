@@ -25,7 +25,7 @@ from tests.workers import no_worker_processes
 
 ARM_KEYS = {"train_steps", "train_violation_steps", "eval_episodes", "eval_violation_steps", "eval_violating_episodes"}
 ARM_KEYS |= {"eval_violation_rate_ci95", "eval_return_mean", "eval_return_ci95", "intervention_rate"}
-TRAINED, FIXED = ("unshielded", "shielded"), ("zero-input", "proportional+shielded")
+TRAINED, FIXED = ("unshielded", "shielded"), ("zero-input", "lqr+shielded")
 RUNS = 2 * (len(TRAINED) + len(FIXED))
 
 
@@ -85,7 +85,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert "shielded" in run.stdout
     lines = run.stdout.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if "training:" in line) :]
-    assert all(name in {line.split("  ")[0] for line in table} for name in ("unshielded", "proportional+shielded"))
+    assert all(name in {line.split("  ")[0] for line in table} for name in ("unshielded", "lqr+shielded"))
     prose = run.prose
     assert "% of the largest ellipsoid in the box)" in prose
     assert "evaluation episodes; the true state came to" in prose

@@ -90,9 +90,9 @@ def test_each_arm_has_its_shield_and_its_penalties(certificate):
         "zero input": None,
         "K x_hat": None,
         "untrained": None,
-        "proportional": None,
-        "proportional+trusting": None,
-        "proportional+shielded": "switch",
+        "lqr": None,
+        "lqr+trusting": None,
+        "lqr+shielded": "switch",
     }
     penalized = {name for name, loop in loops.items() if loop.shield and loop.shield.penalty == 0.3}
     assert penalized == {"shielded:switch+penalty"}

@@ -56,9 +56,9 @@ def test_command_writes_a_gif_of_both_arms_below_two_megabytes(tmp_path, certifi
     assert str(file) in saved
 
 
-@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/CSTR-v0"])
 def test_episode_that_ends_early_ends_the_animation(env_id, tmp_path, capsys):
-    render(settings(env=env_id, shield="none", steps=100, out=tmp_path / "a.gif"))
+    render(settings(env=env_id, policy="random", shield="none", steps=100, out=tmp_path / "a.gif"))
     with Image.open(tmp_path / "a.gif") as image:
         assert 2 < image.n_frames < 100
     assert "1 with a violation" in capsys.readouterr().out
@@ -113,12 +113,12 @@ def test_small_red_things_stay_red_in_a_gif(tmp_path):
     assert (np.abs(pixels - np.array(theme.DANGER)).max(axis=-1) < 8).sum() > 500
 
 
-def violations_of_greedy(env_id, certificate=None, shielded=False):
+def violations_of_lqr(env_id, certificate=None, shielded=False):
     env = gym.make(env_id)
     inner = env.unwrapped
     if shielded:
         env = SafetyShield(env, certificate)
-    policy, (observation, info) = policy_by_name("greedy", env_id, inner, 0), env.reset(seed=0)
+    policy, (observation, info) = policy_by_name("lqr", env_id, inner, 0), env.reset(seed=0)
     for _ in range(60):
         action = policy(observation, info)
         np.testing.assert_array_equal(action, policy(observation, info))
@@ -128,31 +128,14 @@ def violations_of_greedy(env_id, certificate=None, shielded=False):
     return info["episode_violations"]
 
 
-def test_greedy_policy_violates_unless_shielded(certificate):
-    assert violations_of_greedy(CRUISE) > 0
-    assert violations_of_greedy(CRUISE, certificate, shielded=True) == 0
+def test_regulator_violates_unless_shielded(certificate):
+    assert violations_of_lqr(CRUISE) > 0
+    assert violations_of_lqr(CRUISE, certificate, shielded=True) == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
-def test_greedy_policy_violates_unless_shielded_on_unstable_plants(env_id):
-    assert violations_of_greedy(env_id) > 0
-    assert violations_of_greedy(env_id, shielded=True) == 0
-
-
-def test_greedy_policy_uses_no_more_input_than_it_takes():
-    policy = policy_by_name("greedy", CRUISE, gym.make(CRUISE).unwrapped, 0)
-    for error, action in ((10.0, 1.0), (-10.0, -1.0), (1.0, 0.5), (-0.5, -0.25), (0.0, 0.0)):
-        assert policy(np.array([0.0, 0.0, error]), {"estimate": np.zeros(2)}) == pytest.approx([action])
-
-
-def test_greedy_policy_regulates_where_nothing_is_tracked():
-    env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
-    policy = policy_by_name("greedy", "ncs_gym/TruckTrailer-v0", env, 0)
-    action = policy(np.zeros(2), {"estimate": np.ones(2)})
-    plant = env.plant
-    sizes = [np.linalg.norm(plant.A @ [1.0, 1.0] + plant.B @ [4.0 * a]) for a in (action[0], 0.0, 1.0, -1.0)]
-    assert sizes[0] <= min(sizes[1:])
+def test_regulator_violates_unless_shielded_on_an_unstable_plant():
+    assert violations_of_lqr("ncs_gym/CartPole-v0") > 0
+    assert violations_of_lqr("ncs_gym/CartPole-v0", shielded=True) == 0
 
 
 def test_random_policy_follows_the_seed():

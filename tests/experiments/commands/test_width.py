@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import io
-import json
-from dataclasses import replace
+from collections import Counter
 
 import numpy as np
 import pytest
 
 from experiments import settings
 from experiments.__main__ import COMMANDS
-from experiments.attack.attack_cases import attack_cases
-from experiments.attack.safety_counts import counts_table, gaussian_table
 from experiments.commands import reproduce
+from experiments.commands.attack import table_of
 from experiments.report.text_tables import sweep_table
-from experiments.study.study import results_tables
-from experiments.study.tables import QUOTABLE
 from experiments.terminal import progress_bar, say, text_table, warnings_as_sentences
+from ncs_gym.registration import registered_ids
 from tests.command import ROOT, ncs, succeeded
-from tests.experiments.results import LONG_CAMPAIGN, run, summary_of
+from tests.experiments.results import run, summary_of
 
 WIDTH = 80
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
-LAPSED = {"lapsed": 40_000_000, "lapsed_violations": 1_234_567}
-LONGEST_CAMPAIGN = replace(LONG_CAMPAIGN, packets=40_000_000, forced=40_000_000, overdue=1_000_000, **LAPSED)
+IDS = registered_ids()
 
 
 def printed(*arguments):
@@ -47,11 +43,6 @@ class Shown:
 
     def compare(self):
         return self.request.getfixturevalue("smoke")[1].stdout.partition("files: ")[0]
-
-    def study(self):
-        summary = json.loads((ROOT / "docs" / "results.json").read_text())
-        tables = [table(summary) for name, table in QUOTABLE.items() if name != "budget"]
-        return "\n".join([results_tables(summary), *tables])
 
     def train(self):
         small = ("n_envs=2", "n_steps=64", "batch_size=64", 'policy_kwargs={"net_arch": [8, 8]}')
@@ -96,10 +87,9 @@ class Shown:
         return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r")
 
     def attack(self):
-        cases = dict.fromkeys(attack_cases(0, 4), LONGEST_CAMPAIGN)
-        every = [counts_table(cases, looks_ahead=looks_ahead) for looks_ahead in (False, True)]
-        shown = self.request.getfixturevalue("attacked")[1].stdout
-        return "\n".join([*every, gaussian_table(cases, dict.fromkeys(cases, 0.5)), shown])
+        names = ("steps", "episodes", "outside S", "outside box", "no claim", "overridden")
+        rows = {f"{each.partition('/')[2]}, blackout": Counter(dict.fromkeys(names, 9_999_999)) for each in IDS}
+        return table_of(rows)
 
     def audit(self):
         """`tests/experiments/commands/test_audit.py` has every claim, which takes longer."""
@@ -150,14 +140,6 @@ def test_overview_has_a_sentence_for_every_command_in_80_columns(arguments, code
     for command, (kind, *_) in COMMANDS.items():
         first = " ".join(getattr(settings, kind).__doc__.partition("\n\n")[0].split())
         assert f" {command} {first}" in text
-
-
-def test_rows_of_a_campaign_that_breaks_nothing_are_whole():
-    none = {"exits": 0, "violations": 0, "broken_episodes": 0, "level": 0.9, "lapsed": 0, "lapsed_violations": 0}
-    cases = attack_cases(0, 4)
-    counts = dict.fromkeys(cases, replace(LONGEST_CAMPAIGN, episodes=5_000_000 // len(cases), **none))
-    text = counts_table(counts, looks_ahead=False)
-    assert sum(line.startswith("case ") for line in text.splitlines()) == 1
 
 
 def test_columns_that_find_no_room_stand_below_behind_their_keys():

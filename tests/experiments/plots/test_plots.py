@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 
 from agents.results import TrainingPoint
+from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
     comparison_figures,
@@ -17,7 +18,6 @@ from experiments.plots.comparison_figures import (
     training_figure,
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
-from experiments.runs.arms import _arms
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
 
@@ -52,7 +52,9 @@ def by_color(axis):
 
 
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
-    assert all(ArmStyle.of(arm.name).marker for arm in _arms("project").values())
+    policies = (*CONTROLLERS, *REGULATORS, "untrained", "pretrained")
+    assert all(ArmStyle.of(f"{policy}{each}").marker for policy in policies for each in ("", "+shielded", "+psf:tube"))
+    assert all(ArmStyle.of(f"{each}{kind}").marker for each in FILTERS for kind in ("", "+penalty", " at test"))
     looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
@@ -61,7 +63,7 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
 
 def test_markers_tell_a_price_apart_and_filters_of_a_fixed_policy():
     assert ArmStyle.of("penalized").size != ArmStyle.of("penalized:10").size
-    policies = [ArmStyle.of(f"lqr+{name}") for name in ("trusting", "trusting:lookahead", "shielded", "lookahead")]
+    policies = [ArmStyle.of(f"lqr+{name}") for name in ("trusting", "psf:tube", "shielded", "lookahead")]
     assert len({(style.color, style.hollow) for style in policies}) == len(policies)
 
 

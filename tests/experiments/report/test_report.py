@@ -238,7 +238,7 @@ def test_the_shield_is_explained_as_its_mode_acts(mode):
     ("arm", "words"),
     [
         ("lqr+psf:20", "no disturbance, and no proof. A margin of 20 percent of box and safe set is kept."),
-        ("trusting:lookahead:40", "the shield's lookahead, with the estimate taken for the true state"),
+        ("trusting:40", "the shield's test, with the estimate taken for the true state"),
         ("psf:tube", "whose limits are tightened by a tube; no proof."),
         ("pretrained+shielded", "the small agent that comes with the package;"),
     ],

@@ -5,12 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.analysis.episodes import episodes_table
 from experiments.commands.compare import findings_of
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import proofs_text, scenario_text, summary_text, sweep_table
-from experiments.study.summary import study_summary
-from experiments.study.tables import comparisons_table, evaluation_table, margins_table, prices_table
 from shields import Report
 from shields.verification.condition import flag
 from tests.experiments.results import run, summary_of
@@ -53,10 +50,6 @@ def test_arms_that_nothing_filters_in_training_have_no_share_of_overridden_train
 @pytest.mark.parametrize("runs", [1, 2])
 def test_no_table_prints_a_negative_zero(runs):
     summary = comparison(runs)
-    results = results_of(runs, ("unshielded", "lookahead", "lqr+psf", "lqr+psf:10", "lqr+lookahead"))
-    episodes = episodes_table(each for group in results.values() for each in group)
-    study = study_summary({"Plant-v0": summary_of(results, seeds=runs)}, {"Plant-v0": episodes})
-    env = study["environments"]["Plant-v0"]
     page = comparison_report(summary, Report((flag("(S)", True),)), {}, [])
     printed = [
         summary_text(summary["arms"], {}),
@@ -64,7 +57,6 @@ def test_no_table_prints_a_negative_zero(runs):
         *findings_of(summary),
         run("shielded", violations=(0, 0), returns=TINY).outcome,
         sweep_table([cell()]),
-        *(evaluation_table(env), comparisons_table(study), prices_table(study), margins_table(study)),
         re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL),
     ]
     assert [text for text in printed if NEGATIVE_ZERO.search(text)] == []
@@ -123,7 +115,7 @@ def test_columns_of_a_wide_table_stand_closer_together():
     arm = summary_of({"lookahead": [run("lookahead", returns=(-10.0, -30.0)) for _ in range(2)]})["arms"]["lookahead"]
     arm |= {"eval_violation_rate": 0.95, "eval_violation_rate_ci95": [0.751, 0.999], "train_violation_steps": 123_456}
     narrow = summary_text({"lookahead": arm}, {})
-    wide = summary_text({"lookahead": arm, "proportional+lookahead": arm}, {})
+    wide = summary_text({"lookahead": arm, "pretrained+lookahead": arm}, {})
     assert "  95.0 [75.1, 99.9]  " in narrow
     assert "lookahead 95.0 [75.1, 99.9]     0    0" in wide
     assert 70 < max(map(len, wide.splitlines())) <= 80

@@ -1,15 +1,14 @@
 """Names of arms, and the control loops that their agents are trained and evaluated in."""
 
-import numpy as np
 import pytest
 
 from agents.hyperparams import DEFAULTS, with_changes
-from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
+from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
+from benchmarks.study import ENVS, TRAINED
 from experiments.baselines import EstimateFilter, tuned_training
 from experiments.runs.arms import Arm, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.settings import CompareSettings
-from experiments.settings.learning import NETWORK_ENVS, TRAINED_ARMS
 from shields import VectorSafetyShield
 
 
@@ -38,16 +37,16 @@ def layers(env):
         ("psf+penalty", "psf", "trained"),
         ("lookahead", "lookahead", "trained"),
         ("lookahead at test", "lookahead", "trained"),
-        ("lqr+trusting:lookahead", "trusting:lookahead", "lqr"),
+        ("mpc:20+psf:tube", "psf:tube", "mpc:20"),
         ("shield at test", "boundary", "trained"),
         ("trusting at test", "trusting", "trained"),
-        ("shielded+penalty+residual", "boundary", "trained"),
+        ("shielded+penalty", "boundary", "trained"),
         ("zero input", None, "zero input"),
         ("K x_hat+shielded", "boundary", "K x_hat"),
         ("lqr+psf", "psf", "lqr"),
         ("random+shielded:project", "project", "random"),
         ("untrained+trusting", "trusting", "untrained"),
-        ("proportional", None, "proportional"),
+        ("mpc:50", None, "mpc:50"),
     ],
 )
 def test_name_says_which_filter_and_which_policy(name, mode, policy):
@@ -57,12 +56,8 @@ def test_name_says_which_filter_and_which_policy(name, mode, policy):
     assert Arm.of(name.replace(" ", "-"), "boundary") == arm
 
 
-def test_penalty_and_residual_are_told_in_any_order():
-    assert Arm.of("shielded+residual+penalty", "boundary") == Arm.of("shielded+penalty+residual", "boundary")
-
-
-@pytest.mark.parametrize("env_id", NETWORK_ENVS)
-@pytest.mark.parametrize("arm", TRAINED_ARMS)
+@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("arm", TRAINED)
 def test_arm_of_the_study_is_trained_with_what_was_tuned_for_it(env_id, arm):
     loop = LoopConfig(env=env_id)
     certificate = certificate_of(loop)
@@ -106,16 +101,8 @@ def test_lagrangian_has_its_settings_and_starts_at_its_multiplier(run_of):
     assert run_of("unshielded", lagrangian=settings).training_loop.lagrangian is None
 
 
-def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of, certificate, loaded):
-    run = run_of("shielded+residual")
-    assert layers(run.training_loop.vector(2)) == [ResidualActions, VectorSafetyShield]
-    assert layers(run.loop.vector(2)) == [VectorSafetyShield]
-    np.testing.assert_allclose(run.training_loop.base_policy.gain, certificate.K / loaded.u_max)
-    np.testing.assert_array_equal(run.training_loop.base_policy.offset, 0.0)
-
-
 @pytest.mark.cases(2)
-@pytest.mark.parametrize("name", ["trusting", "shield at test", "lagrangian", "shielded+residual", "lqr+trusting"])
+@pytest.mark.parametrize("name", ["trusting", "shield at test", "lagrangian", "lqr+trusting"])
 def test_every_arm_plays(run_of, name):
     tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
     result = run_of(name, steps=256, episodes=2, hyperparams=tiny).execute(lambda steps: None)

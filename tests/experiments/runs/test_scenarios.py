@@ -74,15 +74,15 @@ def test_worse_channel_uses_what_the_contract_leaves_and_bursts_get_denser():
 
 @pytest.fixture(scope="module")
 def results(certificate):
-    names = ("proportional", "proportional+trusting", "proportional+shielded", "random")
+    names = ("lqr", "lqr+trusting", "lqr+shielded", "random")
     return {name: run_of(certificate, name).execute(lambda steps: None) for name in names}
 
 
 @pytest.mark.slow
 def test_scenarios_are_stored_beside_the_evaluation_as_trained(certificate, results, tmp_path):
-    run, result = run_of(certificate, "proportional+shielded"), results["proportional+shielded"]
+    run, result = run_of(certificate, "lqr+shielded"), results["lqr+shielded"]
     assert tuple(result.scenarios) == ALL
-    alone = run_of(certificate, "proportional+shielded", ()).execute(lambda steps: None)
+    alone = run_of(certificate, "lqr+shielded", ()).execute(lambda steps: None)
     assert (alone.episodes, alone.scenarios) == (result.episodes, {})
     for scenario, episodes in result.scenarios.items():
         assert episodes == run_of(certificate, run.arm, (scenario,)).execute(lambda steps: None).scenarios[scenario]
@@ -98,12 +98,10 @@ def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
         name: [sum(each.largest_level > 1.0 for each in result.scenarios[scenario]) for scenario in ALL]
         for name, result in results.items()
     }
-    assert outside["proportional+shielded"] == [0, 0, 0]
-    assert outside["proportional+trusting"][0] >= 6
-    assert outside["proportional+trusting"][0] > sum(
-        each.largest_level > 1.0 for each in results["proportional+trusting"].episodes
-    )
-    assert all(each.guaranteed for each in results["proportional+shielded"].scenarios["worst-case disturbance"])
+    assert outside["lqr+shielded"] == [0, 0, 0]
+    assert outside["lqr+trusting"][0] >= 6
+    assert outside["lqr+trusting"][0] > sum(each.largest_level > 1.0 for each in results["lqr+trusting"].episodes)
+    assert all(each.guaranteed for each in results["lqr+shielded"].scenarios["worst-case disturbance"])
 
 
 def test_random_policy_acts_alike_under_every_scenario(certificate):
@@ -127,22 +125,20 @@ def test_random_policy_acts_alike_under_every_scenario(certificate):
 )
 def test_small_returns_are_printed_with_two_significant_digits(results, mean, half, text):
     interval = None if half is None else [mean - half, mean + half]
-    summary = arm_summary(episodes_table([results["proportional"]]), None, fixed_policy=True)
+    summary = arm_summary(episodes_table([results["lqr"]]), None, fixed_policy=True)
     summary |= {"eval_return_mean": mean, "eval_return_ci95": interval}
-    printed = summary_text({"proportional": summary}, {})
+    printed = summary_text({"lqr": summary}, {})
     assert printed.endswith(f" {text}")
     assert max(map(len, printed.splitlines())) <= 100
 
 
 def test_summary_and_table_have_a_block_per_scenario(results):
-    modes = {"proportional": None, "proportional+trusting": "trusting", "proportional+shielded": "project"}
+    modes = {"lqr": None, "lqr+trusting": "trusting", "lqr+shielded": "project"}
     arms = {name: arm_summary(episodes_table([results[name]]), mode, fixed_policy=True) for name, mode in modes.items()}
     json.dumps(arms, allow_nan=False)
-    assert {name: arm["shielded"] for name, arm in arms.items()} == dict.fromkeys(modes, False) | {
-        "proportional+shielded": True
-    }
-    pushed = arms["proportional+trusting"]["conditions"]["worst-case disturbance"]
-    assert pushed["eval_violation_steps"] > arms["proportional+trusting"]["eval_violation_steps"]
+    assert {name: arm["shielded"] for name, arm in arms.items()} == dict.fromkeys(modes, False) | {"lqr+shielded": True}
+    pushed = arms["lqr+trusting"]["conditions"]["worst-case disturbance"]
+    assert pushed["eval_violation_steps"] > arms["lqr+trusting"]["eval_violation_steps"]
     text = scenario_text("worst-case disturbance", arms, {})
     assert text.startswith("worst-case disturbance:")
     assert f" {pushed['eval_violation_steps']:,} " in text

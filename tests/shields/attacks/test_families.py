@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from experiments.attack.attack_cases import plant_cases
-from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
+from experiments.commands.attack import hostile_agents, starts, worst_case
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSVectorEnv, Packet, Remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from shields import SafeLoop, VectorSafetyShield
@@ -49,18 +48,19 @@ def members(family, count, rng):
 def attacked(name, plant, certificate, count, steps, mode="project", seed=0, process=None):
     """Counts of an attack on a certificate, of members that are chosen; their steps are compared with the equations."""
     rng, settings, family = np.random.default_rng(seed), FAMILIES[name][1], FAMILIES[name][0]().remainder.family
-    many = WorstCaseVectorEnv(count, certificate, plant=plant, process=process, **settings)
+    many = NCSVectorEnv(count, plant=plant, process=process, **settings, **worst_case(certificate))
     shield = VectorSafetyShield(many, certificate, mode, on_unproved="ignore")
     chosen = members(family, count, rng)
     fixed = {"parameters": {each: chosen[:, k] for k, each in enumerate(family.names)}}
-    _, info = shield.reset(seed=seed, options=None if process else fixed)
-    agents, declared = HostileAgents(count, plant, certificate, rng), plant.without_remainder.disturbance
+    begun = {"state": starts(certificate, rng, count)}
+    _, info = shield.reset(seed=seed, options=begun if process else begun | fixed)
+    act, declared = hostile_agents(certificate, plant, count, rng), plant.without_remainder.disturbance
     m, n = plant.m, plant.n
     truth = [expm(plant.dt * np.vstack([derivatives(name, each), np.zeros((m, n + m))]))[:n] for each in chosen]
     held = outside = left = unsafe = alarms = 0
     for _ in range(steps):
         before = info["state"]
-        *_, info = shield.step(agents.act(info["estimate"]))
+        *_, info = shield.step(act(info["estimate"]))
         proved, broken = info["shield_guaranteed"], info["cost"] > 0.0
         held, outside = held + np.count_nonzero(proved), outside + np.count_nonzero(proved & broken)
         left += np.count_nonzero(proved & (certificate.safe_set.gauge(info["state"]) > 1.0))
@@ -165,9 +165,9 @@ def test_members_keep_limits_of_every_kind(kind, count, steps):
     shield = VectorSafetyShield(many, certificate, on_unproved="ignore")
     rng = np.random.default_rng(0)
     _, info = shield.reset(seed=0, options={"parameters": {"member": np.arange(count) % 3}})
-    agents, held, near, overridden = HostileAgents(count, plant, certificate, rng), 0, -1.0, 0
+    act, held, near, overridden = hostile_agents(certificate, plant, count, rng), 0, -1.0, 0
     for _ in range(steps):
-        *_, info = shield.step(agents.act(info["estimate"]))
+        *_, info = shield.step(act(info["estimate"]))
         proved, worst = info["shield_guaranteed"], info["worst_constraint_values"].max(axis=1)
         assert not (proved & ((info["cost"] > 0.0) | info["assumption_violated"])).any()
         low, high = plant.input_ends
@@ -208,10 +208,3 @@ def test_a_tank_that_rests_elsewhere_keeps_its_levels(k, outward, every):
         arrived = [Packet(step, measured, loop.episode)] if step % every == 0 else []
         level = level * np.exp(-0.5 * k) + q * 0.5 * (1.0 - np.exp(-0.5 * k)) / k + 0.01 * outward
     assert reached > 0.3
-
-
-def test_the_cases_of_a_file_move_the_members_that_it_holds(tmp_path):
-    varying_truck().save(tmp_path / "truck.json")
-    (attack_case, *_) = plant_cases(tmp_path / "truck.json", None).values()
-    env = NCSVectorEnv(8, plant=attack_case.plant, channel=attack_case.channel, process=attack_case.process)
-    assert {*env.reset(seed=0)[1]["parameters"][:, 0]} == {3800.0, 4200.0}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from experiments.published.plants import channel_of, contract_of_plant, plant_of, published
+from benchmarks.published import channel_of, contract_of_plant, plant_of, published
 from ncs_gym import (
     AdversarialDisturbance,
     ChannelContract,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.published.plants import contract_of_plant, plant_of
+from benchmarks.published import contract_of_plant, plant_of
 from ncs_gym import ChannelContract, Ellipsoid, ErrorSetError, LinearPlant, certified_error_set
 from shields import Infeasible, synthesize
 from shields.synthesis import certification

@@ -1,7 +1,8 @@
-"""The figures of a study, from the numbers that pages show."""
+"""The figures of the study, from the numbers that its pages show; the pages say what they are."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import matplotlib
@@ -9,16 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.figure_style import (
-    STYLE,
-    ArmStyle,
-    CaptionedFigure,
-    label,
-    thousands,
-)
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, thousands
 from experiments.runs.loops import AS_TRAINED
-from experiments.study.summary import ATTACKED
 
+ATTACKED = "attacked"
 # Smaller margins are not drawn: with them arms do nearly what they do with none.
 _LEAST_MARGIN = 20
 # Width of the panels of an environment, height of a row, what names and axes take, and the least height of all rows
@@ -31,30 +26,25 @@ _LANE = 0.3
 _MEAN_SIZE = 7.0
 
 
-def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name, of what `study_summary` returns."""
+def study_figures(summary: dict[str, Any]) -> dict[str, bytes]:
+    """Returns the PNG file of every figure by name."""
     figures = {"return": return_figure(summary)}
     if any(_trained(env) for env in summary["environments"].values()):
-        figures |= {"runs": runs_figure(summary), "training": training_figure(summary)}
-    return {name: (figure.caption, figure.png) for name, figure in figures.items()}
+        figures["runs"] = _by_run_figure(summary, "violating under attack [%]", _draw_attacked)
+        figures["training"] = _by_run_figure(summary, "violating training steps", _draw_training)
+    return {name: figure.png for name, figure in figures.items()}
 
 
 def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
     """Returns violating episodes under attack and the mean return as trained, two panels per environment."""
-    caption = (
-        "Violating episodes under attack, and mean return as trained. Bars are 95 % intervals over runs and episodes. "
-        "Arms above the line were trained. The number behind a filter or governor is its margin in percent; those "
-        f"below {_LEAST_MARGIN} are left out."
-    )
     environments = summary["environments"]
     names = list(dict.fromkeys(name for env in environments.values() for name in env["arms"] if _is_drawn(name)))
-    figure, axes = _figure(len(environments), len(names), caption, panels=2)
+    figure, axes = _figure(len(environments), len(names), panels=2)
     with matplotlib.rc_context(STYLE):
         for (left, right), (title, env) in zip(axes, environments.items(), strict=True):
             for name in env["arms"].keys() & names:
                 scenarios, height = env["arms"][name]["scenarios"], len(names) - names.index(name)
-                style, own = ArmStyle.of(name), scenarios[AS_TRAINED]
-                attacked = scenarios.get(ATTACKED, own)
+                style, own, attacked = ArmStyle.of(name), scenarios[AS_TRAINED], scenarios[ATTACKED]
                 _draw_interval(left, style, attacked["rate_ci95"], height, 100.0)
                 _draw_mean(left, style, 100.0 * attacked["rate"], height)
                 _draw_interval(right, style, own["return_ci95"], height)
@@ -72,41 +62,13 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
     return figure
 
 
-def runs_figure(summary: dict[str, Any]) -> CaptionedFigure:
-    """Returns the violating episodes of every trained run under attack, a panel per environment."""
-    caption = (
-        "Violating episodes under attack, by training run. Large dots are means, bars 95 % intervals over runs and "
-        "episodes, small dots below them the runs."
-    )
-
-    def draw(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
-        attacked = arm["scenarios"].get(ATTACKED, arm["scenarios"][AS_TRAINED])
-        _draw_interval(axis, style, attacked["rate_ci95"], height, 100.0)
-        _draw_runs(axis, style, [100.0 * rate for rate in attacked["rate_by_run"]], height)
-        axis.set_xlim(-5.0, 105.0)
-
-    return _by_run_figure(summary, caption, "violating under attack [%]", draw)
-
-
-def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
-    """Returns the violating steps of every training run, a panel per environment."""
-    caption = (
-        "Violating steps while the agents learned, on a scale that is linear up to 1 and logarithmic beyond. Large "
-        "dots are means, small dots below them the runs. These violations do not appear in the evaluation."
-    )
-
-    def draw(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
-        _draw_runs(axis, style, arm["train_violation_steps_by_run"], height)
-        axis.set_xscale("symlog", linthresh=1.0)
-        axis.set_xlim(-0.3, max(1.0, axis.dataLim.x1) * 2.0)
-
-    return _by_run_figure(summary, caption, "violating training steps", draw)
-
-
-def _by_run_figure(summary: dict[str, Any], caption: str, quantity: str, draw: Any) -> CaptionedFigure:
+def _by_run_figure(
+    summary: dict[str, Any], quantity: str, draw: Callable[[Axes, ArmStyle, dict[str, Any], int], None]
+) -> CaptionedFigure:
+    """Returns something of every trained run, a panel per environment."""
     environments = summary["environments"]
     names = list(dict.fromkeys(name for env in environments.values() for name in _trained(env)))
-    figure, axes = _figure(len(environments), len(names), caption)
+    figure, axes = _figure(len(environments), len(names))
     with matplotlib.rc_context(STYLE):
         for (axis,), (title, env) in zip(axes, environments.items(), strict=True):
             for name in _trained(env):
@@ -116,11 +78,23 @@ def _by_run_figure(summary: dict[str, Any], caption: str, quantity: str, draw: A
     return figure
 
 
-def _figure(environments: int, rows: int, caption: str, panels: int = 1) -> tuple[CaptionedFigure, list[list[Axes]]]:
+def _draw_attacked(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
+    attacked = arm["scenarios"][ATTACKED]
+    _draw_interval(axis, style, attacked["rate_ci95"], height, 100.0)
+    _draw_runs(axis, style, [100.0 * rate for rate in attacked["rate_by_run"]], height)
+    axis.set_xlim(-5.0, 105.0)
+
+
+def _draw_training(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
+    _draw_runs(axis, style, arm["train_violation_steps_by_run"], height)
+    axis.set_xscale("symlog", linthresh=1.0)
+    axis.set_xlim(-0.3, max(1.0, axis.dataLim.x1) * 2.0)
+
+
+def _figure(environments: int, rows: int, panels: int = 1) -> tuple[CaptionedFigure, list[list[Axes]]]:
     """Returns a figure, and the panels of each environment, which share named rows."""
     with matplotlib.rc_context(STYLE):
-        size = _MARGINS[0] + _PANELS * environments, _MARGINS[1] + max(_ROW * rows, _LEAST_HEIGHT)
-        figure = CaptionedFigure(size, caption)
+        figure = CaptionedFigure((_MARGINS[0] + _PANELS * environments, _MARGINS[1] + max(_ROW * rows, _LEAST_HEIGHT)))
         axes = figure.subplots(1, panels * environments, squeeze=False, sharey=True)[0]
     return figure, [list(axes[i : i + panels]) for i in range(0, len(axes), panels)]
 

@@ -1,33 +1,38 @@
-import json
+"""The study: declared comparisons, intervals over runs, tables of exact numbers, and impairments on and off."""
 
+import json
+import re
+
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.statistics import clopper_pearson
-from experiments.study.channel_switches import SWITCHES
-from experiments.study.figures import return_figure, study_figures
-from experiments.study.study import quoted
-from experiments.study.summary import (
+from benchmarks import study as script
+from benchmarks.study import (
+    ENVS,
     PRIMARY,
-    Comparison,
-    difference,
-    margins_needed,
-    members,
-    outer_interval,
-    study_summary,
-)
-from experiments.study.tables import (
+    SWITCHES,
+    all_tables,
     comparisons_table,
+    difference,
+    environment,
     evaluation_table,
     impairments_table,
     margins_table,
     network_table,
+    outer_interval,
     prices_table,
-    switches_table,
-    tables_by_name,
+    quotable,
+    quoted,
+    switched,
 )
+from benchmarks.study_figures import return_figure, study_figures
+from experiments.analysis.episodes import episodes_table
+from experiments.analysis.statistics import clopper_pearson
+from experiments.runs.loops import changed_channel
+from ncs_gym.envs.env import ncs_env
 from tests.experiments.results import run, summary_of
+from tests.workers import no_worker_processes
 
 # Mean return, and the share of runs of which every second episode violates: as trained, and under attack.
 ARMS = {
@@ -65,7 +70,18 @@ def study(**changed):
     comparison = json.loads(json.dumps(summary_of(results, seeds=RUNS)))
     comparison["references"] = {name: comparison["arms"].pop(name) for name in ARMS if name not in TRAINED}
     episodes = episodes_table(each for runs in results.values() for each in runs)
-    return json.loads(json.dumps(study_summary({"Plant-v0": comparison}, {"Plant-v0": episodes}))), episodes
+    summary = {"environments": {"Plant-v0": environment(comparison, episodes)}, "channels": {"Plant-v0": switches()}}
+    return json.loads(json.dumps(summary)), episodes
+
+
+def switches():
+    """Rows of impairments: the regulator violates in as many of four episodes as are on."""
+    points = [[], *([each] for each in SWITCHES), [*SWITCHES]]
+    return [
+        {"on": on, "arm": arm, "episodes": 4, "violating": len(on) * (arm == "lqr")}
+        for on in points
+        for arm in ("lqr", "lookahead")
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -83,14 +99,12 @@ def row(table, name):
 
 
 def test_differences_are_taken_run_by_run_and_resampled_by_runs(made):
-    found = difference(made[1], Comparison("trusting:20", "lookahead", "attacked"))
+    found = difference(made[1], ("trusting:20", "lookahead", "attacked"))
     assert found["mean"] == 0.25
-    assert found["by_run"] == [0.5, 0.5, 0.0, 0.0]
     assert found["interval"][0] == pytest.approx(0.0, abs=0.01)
     assert 0.4 < found["interval"][1] <= 0.7
-    opposite = difference(made[1], Comparison("lookahead", "trusting:20", "attacked"))
-    assert opposite["mean"] == -0.25
-    assert difference(made[1], Comparison("psf:20", "lookahead", "attacked")) is None
+    assert difference(made[1], ("lookahead", "trusting:20", "attacked"))["mean"] == -0.25
+    assert difference(made[1], ("psf:20", "lookahead", "attacked")) is None
 
 
 def test_primary_comparison_comes_first_and_secondary_ones_share_a_level(made):
@@ -134,13 +148,12 @@ def test_rates_are_percentages(made):
 
 
 def test_margins_are_the_smallest_without_a_violation(made):
-    env = env_of(made)
-    assert list(members(env, "lqr+psf")) == ["lqr+psf", "lqr+psf:10", "lqr+psf:20"]  # a tube is no margin
-    assert margins_needed(env, "lqr+psf", "as trained") == "lqr+psf:10"
-    assert margins_needed(env, "lqr+psf", "attacked") == "lqr+psf:20"
-    assert row(margins_table(made[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", "20", "%", "-1.5", "-2.0"]
+    def cells(summary):
+        return row(margins_table(summary), "Plant-v0 lqr+psf").split()[2:]
+
+    assert cells(made[0]) == ["10", "%", "20", "%", "-1.5", "-2.0"]  # a tube is no margin
     never = study(**{"lqr+psf:20": (12.0, 0.0, 1.0)})
-    assert row(margins_table(never[0]), "Plant-v0 lqr+psf").split()[2:] == ["10", "%", ">", "20", "%", "-0.5", "-1.0"]
+    assert cells(never[0]) == ["10", "%", ">", "20", "%", "-0.5", "-1.0"]
 
 
 def test_effect_of_the_network_is_shown_of_the_filter_that_trusts_its_estimate_and_of_the_proof(made):
@@ -149,29 +162,8 @@ def test_effect_of_the_network_is_shown_of_the_filter_that_trusts_its_estimate_a
     assert sound[:5] == ["Plant-v0", "lookahead", "0.0", "0.0", "0.0"]
 
 
-def test_switches_are_a_row_per_combination():
-    rows = [
-        {"on": on, "arm": arm, "episodes": 4, "violating": len(on) * (arm == "lqr")}
-        for on in ([], ["loss"], ["loss", "delay"], ["loss", "delay", "rate", "rounding"])
-        for arm in ("lqr", "lookahead")
-    ]
-    table = switches_table(rows)
-    assert [line.split()[-2:] for line in table.splitlines()[3:]] == [
-        ["0", "0"],
-        ["25", "0"],
-        ["50", "0"],
-        ["100", "0"],
-    ]
-    assert table.splitlines()[-1].startswith("all four")
-
-
 def test_impairments_alone_are_a_row_per_arm():
-    rows = [
-        {"on": on, "arm": arm, "episodes": 4, "violating": len(on) * (arm == "lqr")}
-        for on in ([], *([each] for each in SWITCHES), ["loss", "delay"], [*SWITCHES])
-        for arm in ("lqr", "lookahead")
-    ]
-    table = impairments_table({"Plant-v0": rows, "Other-v0": rows}).splitlines()
+    table = impairments_table({"Plant-v0": switches(), "Other-v0": switches()}).splitlines()
     assert table[0].split()[3:] == ["ideal", "loss", "delay", "rate", "rounding", "all", "four"]
     assert table[2].split() == ["Plant-v0", "lqr", "0", "25", "25", "25", "25", "100"]
     assert [line.split()[:2] for line in table[3:]] == [
@@ -181,15 +173,27 @@ def test_impairments_alone_are_a_row_per_arm():
     ]
 
 
-def test_pages_show_the_same_after_their_numbers_were_stored(made):
-    assert tables_by_name(json.loads(json.dumps(made[0]))) == tables_by_name(made[0])
+def test_tables_have_every_arm_and_no_negative_zero(made):
+    tiny = study(**{"lookahead": (-2.0, 0.0, 0.0), "trusting:20": (-2.0 + 1e-9, 0.0, 0.5)})[0]
+    for summary in (made[0], tiny):
+        text = all_tables(summary)
+        assert all(f"\n{name} " in text for name in ARMS)
+        assert not re.search(r"(?<![\d.])-0(\.0+)?(?![\d.])", text)
+        assert max(map(len, text.splitlines())) <= 80
+    assert quotable(json.loads(json.dumps(made[0]))) == quotable(made[0])
 
 
 def test_quoted_tables_replace_what_stands_between_the_marks():
-    page = "before\n<!-- ncs study: agents -->\n```\nold\n```\n<!-- end -->\nafter <!-- end -->"
+    page = "before\n<!-- study: agents -->\n```\nold\n```\n<!-- end -->\nafter <!-- end -->"
     once = quoted(page, {"agents": "new"})
-    assert once == "before\n<!-- ncs study: agents -->\n```\nnew\n```\n<!-- end -->\nafter <!-- end -->"
+    assert once == "before\n<!-- study: agents -->\n```\nnew\n```\n<!-- end -->\nafter <!-- end -->"
     assert quoted(once, {"agents": "new"}) == once
+
+
+@pytest.mark.parametrize("page", ["no mark", "<!-- study: x -->\n<!-- end -->"])
+def test_a_page_without_a_known_mark_is_refused(page):
+    with pytest.raises(ValueError, match="a page must quote tables between"):
+        quoted(page, {"agents": "new"})
 
 
 def test_rows_of_the_figure_have_names_and_small_margins_are_left_out():
@@ -217,5 +221,55 @@ def test_names_of_the_rows_do_not_cover_one_another(made, environments):
 def test_figures_show_every_arm_and_every_run(made):
     figures = study_figures(made[0])
     assert figures.keys() == {"return", "runs", "training"}
-    assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
-    assert np.all([caption for caption, _ in figures.values()])
+    assert all(png.startswith(b"\x89PNG") for png in figures.values())
+
+
+@pytest.mark.parametrize("env_id", [*ENVS, "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CartPole-v0"])
+def test_every_impairment_keeps_the_contract_and_has_what_is_on(env_id):
+    env = ncs_env(gym.make(env_id))
+    for on in ((), *((each,) for each in SWITCHES), SWITCHES):
+        channel = changed_channel(env.channel, switched(env.channel, env.contract, on)) or env.channel
+        assert env.contract is None or env.contract.is_kept_by(channel)
+        assert (
+            channel.loss > 0.0,
+            channel.delay > 0,
+            channel.send_period > 1,
+            channel.quantization_step > 0.0,
+        ) == tuple(name in on for name in SWITCHES)
+
+
+@pytest.mark.slow
+def test_a_small_study_shows_that_losses_decide_for_the_regulator_and_nothing_breaks_lookahead(tmp_path):
+    def made():
+        script.compare(
+            env=ENVS[:1],
+            arms=("unshielded", "lookahead"),
+            baselines=("lqr", "lqr+trusting", "lqr+shielded", "lqr+lookahead"),
+            seeds=2,
+            steps=1500,
+            episodes=2,
+            channel_episodes=12,
+            jobs=1,
+            out=tmp_path / "out",
+            numbers=tmp_path / "results.json",
+        )
+        return json.loads((tmp_path / "results.json").read_text())
+
+    with no_worker_processes():
+        summary = made()
+        assert made() == summary  # finished runs are kept
+    env = summary["environments"]["CSTR-v0"]
+    assert env["steps"] == 1500
+    assert [each["first"] for each in env["comparisons"]] == ["unshielded"]
+    assert len(env["arms"]["unshielded"]["scenarios"]["attacked"]["rate_by_run"]) == 2
+    assert len(env["arms"]["unshielded"]["scenarios"]) == 5
+    sound = [env["arms"][name]["scenarios"].values() for name in ("lookahead", "lqr+lookahead", "lqr+shielded")]
+    assert not any(each["violating"] for scenarios in sound for each in scenarios)
+    rows = summary["channels"]["CSTR-v0"]
+    violating = {(tuple(each["on"]), each["arm"]): each["violating"] for each in rows}
+    assert violating[(), "lqr"] == 0
+    assert violating[("loss",), "lqr"] >= 3
+    assert all(count == 0 for (_, arm), count in violating.items() if arm.endswith("lookahead"))
+    assert all(each["episodes"] == 12 for each in rows)
+    assert np.isfinite([arm["scenarios"]["attacked"]["return"] for arm in env["arms"].values()]).all()
+    assert "CSTR-v0 lookahead" in network_table(summary) + all_tables(summary)

@@ -1,0 +1,174 @@
+"""What certificates keep of plants that people published: `python -m benchmarks.published COMMAND`.
+
+Commands: shares, attack.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import sparse
+from scipy.optimize import linprog
+
+from benchmarks.commands import run, table
+from experiments.commands.attack import attacked, channels_of, worst_case
+from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv
+from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.registration import EPISODE_STEPS
+from shields import Certificate, Infeasible, VectorSafetyShield, synthesize, verify
+from shields.synthesis.invariant_polytope import points_of_box
+
+# From so many points, a power of two, inputs are sought that keep the limits for so many steps.
+_POINTS_LOG2, _STEPS = 9, 60
+_SIDES = {"low": -np.inf, "high": np.inf}
+Names = tyro.conf.Positional[tuple[str, ...]]
+
+
+@cache
+def published() -> dict[str, dict[str, Any]]:
+    """Returns what was published of each plant by its name: source, model, limits, disturbance, sensors and network."""
+    return json.loads(Path(__file__).with_name("published_plants.json").read_text("utf-8"))
+
+
+def plant_of(name: str) -> LinearPlant:
+    """Returns a published plant with its limits as they are.
+
+    Disturbances of a model in continuous time are constant over a step. Where no state has a published limit, all have
+    those that the file invents.
+    """
+    p = published()[name]
+    A, n, dt = np.array(p["A"]), len(p["A"]), p["dt"]
+    state = np.zeros(n) if p["operating_state"] is None else np.array(p["operating_state"])
+    low, high = _ends(p["state_low"], -np.inf), _ends(p["state_high"], np.inf)
+    if not (np.isfinite(low) | np.isfinite(high)).any():
+        widths = np.array([p["invented_half_widths"].get(str(i), np.inf) for i in range(n)])
+        low, high = state - widths, state + widths
+    is_continuous = p["time"] == "continuous"
+    E = np.array(p["disturbance_matrix"])
+    E = zero_order_hold(A, E, dt)[1] if is_continuous else E
+    outputs = [
+        (row := each["row"], *(_end(each[side], infinite) + np.dot(row, state) for side, infinite in _SIDES.items()))
+        for each in p["output_rows"]
+    ]
+    return LinearPlant.from_statespace(
+        (A, p["B"], p["C"], 0) if is_continuous else (A, p["B"], p["C"], 0, dt),
+        dt,
+        operating_state=state,
+        operating_input=p["operating_input"],
+        state_limits=(low, high),
+        input_limits=(p["input_low"], p["input_high"]),
+        output_limits=outputs or None,
+        disturbance_bound=(E, p["disturbance_low"], p["disturbance_high"]),
+        sensor_bound=p["sensor_half_widths"],
+        initial_bound=p["first_error_half_widths"],
+    )
+
+
+def _ends(ends: list[float | None], infinite: float) -> np.ndarray:
+    return np.array([_end(each, infinite) for each in ends])
+
+
+def _end(end: float | None, infinite: float) -> float:
+    return infinite if end is None else end
+
+
+def contract_of_plant(name: str) -> ChannelContract:
+    """Returns what the network of a published plant promises."""
+    return ChannelContract(max_age=published()[name]["max_age"])
+
+
+def channel_of(name: str) -> Channel:
+    """Returns a channel that keeps this contract."""
+    return Channel(**published()[name]["channel"])
+
+
+def shares(names: Names = ()) -> None:
+    """What share of the published box a certificate keeps, and how long its synthesis takes with two verifications.
+
+    The last line says how many of the plants have a certificate.
+    """
+    show = table("plant", "n, m", "age", "limits", "share", "at most", "rows", "time [s]", first=18, width=11)
+    found = 0
+    for name in names or published():
+        began, plant = time.perf_counter(), plant_of(name)
+        free = plant.n - int(np.linalg.matrix_rank(plant.box))
+        limits = f"{free} free" if free else "symmetric" if plant.is_symmetric else "two ends"
+        known = f"{plant.n}, {plant.m}", published()[name]["max_age"], limits
+        try:
+            certificate = certified(name, plant)
+        except Infeasible as infeasible:
+            show(name, *known, f"none ({infeasible.binding})", "", "", f"{time.perf_counter() - began:.1f}")
+            continue
+        took, found = f"{time.perf_counter() - began:.1f}", found + 1
+        share, at_most = certificate.provenance.get("polytope_share_of_box"), largest_share(plant)
+        kept = ("no box", "") if share is None or at_most is None else (f"{share:.3f}", f"{at_most:.2f}")
+        show(name, *known, *kept, "" if certificate.polytope is None else len(certificate.polytope.rows), took)
+    print(f"{found} of {len(names or published())} have a certificate")
+
+
+def attack(names: Names = (), steps: int = 45_000) -> None:
+    """Attacks the certificate of each plant as `ncs attack` does: steps that left the set, or broke a limit."""
+    show, total = table("plant", "steps", "outside S", "outside box", "no claim", first=18, width=11), Counter[str]()
+    for name in names or published():
+        plant, counts, rng = plant_of(name), Counter[str](), np.random.default_rng(0)
+        try:
+            certificate = certified(name, plant)
+        except Infeasible:
+            continue
+        channels = channels_of(channel_of(name), contract := contract_of_plant(name))
+        count = -(-steps // (len(channels) * EPISODE_STEPS))
+        for channel in channels.values():
+            settings = {"plant": plant, "contract": contract, "channel": channel} | worst_case(certificate)
+            shield = VectorSafetyShield(NCSVectorEnv(count, **settings), certificate, on_unproved="ignore")
+            counts += sum(attacked(shield, rng), Counter[str]())
+        show(name, *(f"{counts[each]:,}" for each in ("steps", "outside S", "outside box", "no claim")))
+        total += counts
+    outside = total["outside S"] + total["outside box"]
+    print(f"{outside} of {total['steps']:,} attacked steps left a set or broke a limit")
+
+
+def certified(name: str, plant: LinearPlant) -> Certificate:
+    """Returns a certificate of a published plant that verifies; raises Infeasible if none is found."""
+    certificate = synthesize(plant, contract=contract_of_plant(name))
+    assert verify(certificate, plant).valid
+    return certificate
+
+
+def largest_share(plant: LinearPlant) -> float | None:
+    """Returns the share of the safe box from which some sequence of inputs keeps the limits of a plant for 60 steps.
+
+    Without disturbance, errors and limits of states and inputs together: no invariant set has a larger share. It is
+    counted at 512 points, to about .02. None where the box is no product of intervals.
+    """
+    points = points_of_box(plant, _POINTS_LOG2)
+    if points is None:
+        return None
+    n = plant.n
+    # Of u_0, ..., u_(N-1), x_1, ..., x_N: x_(k+1) - A x_k - B u_k is A x_0 in the first step and 0 in the others.
+    pushed = sparse.kron(sparse.eye(_STEPS), -plant.B)
+    moved = sparse.eye(n * _STEPS) - sparse.kron(sparse.eye(_STEPS, k=-1), plant.A)
+    model = sparse.hstack([pushed, moved]).tocsr()
+    row = np.abs(plant.box).argmax(axis=0)  # of each state
+    states = np.sort(plant.box_ends[:, row] / plant.box.sum(axis=0), axis=0)
+    inputs = np.stack([plant.input_low, plant.input_high])
+    ends = np.concatenate([np.tile(inputs, _STEPS), np.tile(states, _STEPS)], axis=1).T
+    first = np.zeros(n * _STEPS)
+    kept = 0
+    for point in points:
+        first[:n] = plant.A @ point
+        found = linprog(np.zeros(len(ends)), A_eq=model, b_eq=first, bounds=ends, method="highs")
+        kept += found.status == 0
+    return kept / len(points)
+
+
+COMMANDS = (shares, attack)
+
+if __name__ == "__main__":
+    run(__doc__, COMMANDS)

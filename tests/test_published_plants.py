@@ -1,0 +1,50 @@
+"""Published plants under attack: limits with two ends and limits of rates, and what share of a box could be kept."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import published as script
+from experiments.commands.attack import attacked, worst_case
+from ncs_gym import LinearPlant, NCSVectorEnv
+from shields import VectorSafetyShield
+from tests.certificates import certificate_of
+from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
+
+
+@pytest.mark.parametrize(
+    "name", ["rates", *(pytest.param(name, marks=pytest.mark.slow) for name in ("angle", "coupled"))]
+)
+def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
+    plant, certificate = PLANTS[name], certificate_of(PLANTS[name], CONTRACT, "polytope")
+
+    def counts_of(mode):
+        settings = {"plant": plant, "contract": CONTRACT, "channel": CHANNEL} | worst_case(certificate)
+        shield = VectorSafetyShield(NCSVectorEnv(100, **settings), certificate, mode, on_unproved="ignore")
+        return sum(attacked(shield, np.random.default_rng(0)), Counter())
+
+    counts = counts_of("project")
+    assert counts["steps"] == 20_000
+    assert counts["outside S"] == counts["outside box"] == counts["no claim"] == 0
+    assert counts["overridden"] > 1_000
+    assert counts_of("monitor")["outside box"] > 1_000
+
+
+def test_a_plant_has_a_row_of_its_share_and_one_of_its_attack(capsys):
+    script.shares(("ctms_cruise",))
+    script.attack(("ctms_cruise",), steps=600)
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[1].split()[:8] == ["ctms_cruise", "1,", "1", "1", "two", "ends", "1.000", "1.00"]
+    assert printed[2] == "1 of 1 have a certificate"
+    assert printed[4].split() == ["ctms_cruise", "600", "0", "0", "0"]
+    assert printed[5] == "0 of 600 attacked steps left a set or broke a limit"
+
+
+def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
+    """x+ = 1.25 x + u with |u| <= 1: from |x| <= 4; that of the other state is kept, whatever the sign of its row."""
+    exact = {"dt": 0.1, "disturbance_bound": 0.01, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=np.diag([1.25, 0.5]), B=np.eye(2, 1), box=np.diag([0.1, -1.0]), u_max=1.0, **exact)
+    assert script.largest_share(plant) == pytest.approx(0.4, abs=0.01)
+    assert script.largest_share(replace(plant, box=np.array([[0.1, 0.0]]))) is None
