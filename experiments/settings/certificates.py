@@ -26,8 +26,6 @@ class SynthesizeSettings:
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
             keeps in the safe box, which leaves the policy more room. By default the polytope.
-        search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
-            takes about as long again, longer for polytopes of many rows, and keeps the polytope alone.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
             own; 1 for the sampling instants alone (docs/shield.md).
         out: File for the certificate (JSON).
@@ -41,7 +39,6 @@ class SynthesizeSettings:
     env: str | None = None
     plant: Path | None = None
     safe_set: Literal["polytope", "ellipsoid"] | None = None
-    search_gain: bool = False
     between_samples: int | None = None
     out: Path = Path("certificate.json")
     max_age: int | None = None

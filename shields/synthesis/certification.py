@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.validation import as_flag, as_vector, own_error_state, shown
+from ncs_gym.validation import as_vector, own_error_state, shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.design_problem import Rest, design_problem
@@ -23,7 +23,6 @@ from shields.synthesis.polytope_certificates import (
     fallbacks_around,
     most_tolerant_polytope,
     polytope_share,
-    with_largest_polytope,
     with_polytope,
 )
 from shields.synthesis.resting_point import needs_resting_point, resting_at
@@ -46,7 +45,6 @@ def synthesize(
     *,
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
-    search_gain: bool = False,
     resting_state: ArrayLike | None = None,
     progress: Progress | None = None,
     candidates: Sequence[Certificate] = (),
@@ -63,8 +61,6 @@ def synthesize(
         safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
             time the ellipsoid stays, and the printed certificate says why. None is "polytope".
-        search_gain: Also seek the gain whose polytope is the largest, which takes about as long again, longer for
-            polytopes of many rows. That gain keeps the polytope alone.
         resting_state: Equilibrium around which the fallback works, shape (n,) [deviations from the operating point],
             for a polytope; by default the operating point where limits are symmetric about it, else one that leaves
             much of the box.
@@ -86,9 +82,6 @@ def synthesize(
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
     if not all(isinstance(each, Certificate) for each in candidates):
         raise ValueError("candidates must be certificates")
-    as_flag(search_gain, "search_gain")
-    if safe_set == "ellipsoid" and search_gain:
-        raise ValueError("search_gain is for polytopes: the search for an ellipsoid finds its gain")
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
@@ -104,7 +97,7 @@ def synthesize(
             )
         rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
         try:
-            return around_resting_point(plant, contract, report, known, clock, rest, search_gain=search_gain)
+            return around_resting_point(plant, contract, report, known, clock, rest)
         except Infeasible as infeasible:
             if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
                 raise Infeasible(
@@ -118,8 +111,7 @@ def synthesize(
     largest, *others = _certificates(plant, contract, report, known, clock, polytope=safe_set != "ellipsoid")
     if safe_set == "ellipsoid":
         return largest
-    found = (with_largest_polytope if search_gain else with_polytope)(largest, plant, report)
-    return max([found, *(with_polytope(each, plant, report) for each in others)], key=polytope_share)
+    return max((with_polytope(each, plant, report) for each in (largest, *others)), key=polytope_share)
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -241,7 +233,7 @@ def _second_search(
     if polytope and LOST in infeasible.details:
         progress("no ellipsoid holds in exact arithmetic: seeking a polytope")
         try:
-            return around_resting_point(plant, contract, progress, (), clock, search_gain=False)
+            return around_resting_point(plant, contract, progress, (), clock)
         except Infeasible:
             raise infeasible from None
     was_sought = "share_of_radii" in infeasible.details
