@@ -66,7 +66,6 @@ def agent_card(agent: Agent, shield: ShieldSettings | None, evaluation: Evaluati
     known = ""
     if shield is not None:
         horizon = "" if shield.horizon is None else f", horizon={shield.horizon}"
-        horizon += f", least_safe_steps={shield.least_safe_steps}" if shield.least_safe_steps else ""
         known = f'\n    shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"{horizon}),'
     imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
     return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
@@ -82,7 +81,6 @@ def _loop_rows(loop: LoopConfig) -> dict[str, str]:
     if shield is not None:
         mode = f'mode "{shield.mode}"'
         mode += "" if shield.horizon is None else f", plans of at most {counted(shield.horizon, 'step')}"
-        mode += f", {shield.least_safe_steps} safe steps sought" if shield.least_safe_steps else ""
     return {
         "environment": f"`{loop.env}`",
         "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`{kept}",

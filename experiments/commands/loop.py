@@ -39,8 +39,6 @@ from ncs_gym.reading import LARGEST_KEY, read_file
 from ncs_gym.rendering.phase_plane import range_of
 from shields import Certificate, Infeasible, certificate_for
 from shields.atomic_write import write_atomically
-from shields.certificate_text import counted
-from shields.runtime.guarantee import KEPT_FOR_NOW
 from shields.verification import require_valid
 
 # Budget of `--smoke`.
@@ -184,9 +182,7 @@ class LiveView:
         if now < self._next:
             return
         self._next = now + (_PERIOD if self._live is None else _PERIOD / 8)
-        proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason'].removesuffix(KEPT_FOR_NOW)}"
-        if row["safe_steps"]:
-            proved = f"{proved}, the box kept for {counted(row['safe_steps'], 'step')}"
+        proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason']}"
         counts = f"overridden {self._seen['overridden']}, missing {row['missing']}, late {row['skipped']}"
         counts += f", unanswered {unanswered}" if (unanswered := self._seen["unanswered"]) else ""
         known = f"margin {row['margin']:.2f}, age {row['age']}; {counts}, refused {row['refused']}"
@@ -230,7 +226,6 @@ def summary_of(folder: Path) -> dict[str, Any]:
         proved[row["episode"], row["step"]] = row["guaranteed"]
         counts["steps"] += 1
         counts["proved"] += row["guaranteed"] == "1"
-        counts["promised"] += row["safe_steps"] != "0"
         counts["overridden" if _is_answered(row) else "unanswered"] += row["intervened"] == "1"
         counts["reason: " + row["reason"]] += bool(row["reason"])
         ages[int(row["age"])] += 1
@@ -250,7 +245,6 @@ def summary_of(folder: Path) -> dict[str, Any]:
         summary |= {
             "steps of the controller": counts["steps"],
             "proved": counts["proved"],
-            **({"box promised for a step or more": counts["promised"]} if counts["promised"] else {}),
             "overridden": counts["overridden"],
             "not answered in time by the policy": counts["unanswered"],
             "decided too late": int(last["skipped"]),

@@ -265,7 +265,6 @@ async def _controller(
         uplink,
         settings.shield,
         settings.horizon,
-        least_safe_steps=settings.least_safe_steps,
         downlink=downlink,
         echo_age=age,
         on_unproved="ignore",
@@ -274,7 +273,7 @@ async def _controller(
     start, known = np.zeros(plant.n), not settings.restarted
     node = ControllerNode(safe_loop, wire, transport, StepClock(loop.dt(env)), start, known=known)
     inputs = plant.input_names
-    columns = ["time", "episode", "step", "guaranteed", "safe_steps", "reason"]
+    columns = ["time", "episode", "step", "guaranteed", "reason"]
     columns += [f"x_hat_{name}" for name in plant.state_names]
     columns += [*(f"proposed_{name}" for name in inputs), *(f"u_{name}" for name in inputs)]
     columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "refused_why"]
@@ -289,7 +288,7 @@ async def _controller(
         safe, decision = node.loop, node.decision
         estimate = safe.estimate.tolist()
         values = [None] * plant.m if proposed is None else np.asarray(proposed, dtype=np.float64).tolist()
-        row = [f"{time.time():.6f}", node.episode, safe.steps, int(safe.guaranteed), safe.safe_steps, safe.reason]
+        row = [f"{time.time():.6f}", node.episode, safe.steps, int(safe.guaranteed), safe.reason]
         row += [*estimate, *values]
         row += [*decision.input.tolist(), int(decision.intervened), float(decision.margin), safe.measurement_age]
         took = node.clock.time_of(safe.steps), asyncio.get_running_loop().time()

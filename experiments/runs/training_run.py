@@ -286,7 +286,7 @@ def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, 
         yield name, indices, indices == list(range(run.episodes))
         for each in episodes:
             counts = each.violation_steps, each.estimate_violation_steps, each.interventions
-            counts += each.planned, each.proved, each.promised
+            counts += each.planned, each.proved
             counted = 1 <= each.steps <= _LARGEST_COUNT and 0 <= min(counts) <= max(counts) <= each.steps
             numbers = abs(each.episode_return) < LARGEST_NUMBER and 0.0 <= each.largest_level < LARGEST_NUMBER
             yield name, each, counted and numbers

@@ -13,7 +13,6 @@ from experiments.settings.arguments import Assignments, StepCount, require_horiz
 from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA
-from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,8 +287,6 @@ class ChannelSettings:
         plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
         committed_ahead: Steps by which inputs are committed ahead behind a downlink, of --certificate, whose contract
             counts them, too: samples may be so many steps less old (docs/contracts.md).
-        least_safe_steps: Steps that a shield of it in mode "lookahead" promises while the contract is kept: the command
-            counts longer silences. Whether it promises them is to be seen in `info["shield_safe_steps"]`.
         out: File for the numbers (JSON).
     """
 
@@ -301,17 +298,14 @@ class ChannelSettings:
     certificate: Path | None = None
     plant: Path | None = None
     committed_ahead: int = 0
-    least_safe_steps: int = 0
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1), committed_ahead=0)
+        require_limits(self, committed_ahead=0)
         if self.committed_ahead and self.certificate is None:
             raise ValueError("--committed-ahead is of --certificate: an environment knows its own")
         if (self.certificate and not self.plant) or (self.env and self.plant):
             raise ValueError("give --certificate and --plant, or --env, whose contract and certificate are known")
-        if self.least_safe_steps and self.env is None and self.certificate is None:
-            raise ValueError("--least-safe-steps are those of a shield of --env, or of --certificate: give one")
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")
@@ -381,8 +375,6 @@ class LoopSettings:
         vec_normalize: For such a zip: its statistics, as `ncs evaluate` takes them.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; without
-            --horizon plans become long enough for them.
         certificate: Certificate file to use instead of synthesizing one; both machines need the same.
         steps: Steps of the controller.
         speed: How much faster than the plant's own time the loop runs; below 1 for slow machines.
@@ -411,7 +403,6 @@ class LoopSettings:
     vec_normalize: Path | None = None
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     horizon: int | None = None
-    least_safe_steps: int = 0
     certificate: Path | None = None
     steps: StepCount = 3000
     speed: float = 1.0

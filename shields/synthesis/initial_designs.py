@@ -19,8 +19,8 @@ _INITIAL_INPUT_MULTIPLIER = 0.8
 _LARGEST_ENLARGEMENT = 100.0
 # Exact verification needs a margin a little above 1.
 SUFFICIENT_MARGIN = 1.0 + 1e-5
-# A design whose log det is within this of the box ellipsoid's cannot be improved noticeably, nor can its polytope.
-VOLUME_TOLERANCE = 1e-5
+# A design whose log det is within this of the box ellipsoid's cannot be improved noticeably.
+VOLUME_TOLERANCE = 2e-4
 
 # Called with the stage that the search is in, and the design of the largest set so far.
 ProgressCallback = Callable[[str, CandidateDesign | None], None]

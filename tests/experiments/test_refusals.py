@@ -22,7 +22,7 @@ from experiments.settings import (
     StudySettings,
     SweepSettings,
 )
-from experiments.settings.certificates import AttackSettings, LoopSettings
+from experiments.settings.certificates import AttackSettings
 from experiments.study.study import quoted
 from ncs_gym import Channel, ChannelContract
 from tests.certificates import feasible_bounds_not_sought
@@ -53,11 +53,6 @@ SETTINGS = [
     (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
     *((ChannelSettings, {"file": "f"} | given, "give --certificate and --plant, or --env")
       for given in ({"plant": "p", "env": "e"}, {"certificate": "c"}, {"certificate": "c", "plant": "p", "env": "e"})),
-    (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield of --env"),
-    *((LoopSettings, given, f"--least-safe-steps {message}")
-      for given, message in [({"least_safe_steps": 50}, "must be at least 0 and at most 49"),
-                             ({"least_safe_steps": 5}, "5 is for mode lookahead, which is not asked for"),
-                             ({"least_safe_steps": 5, "shield": "lookahead", "horizon": 5}, "5 takes plans of 6")]),
     (CompareSettings, {"horizon": 6}, "--horizon 6 is for mode lookahead, which is not asked for"),
     *((StudySettings, {name: value}, f"--{name.replace('_', '-')}")
       for name, value in [("budget", 0.0), ("budget", 1.5), ("seeds", 0), ("envs", ()), ("envs", (CRUISE, CRUISE)),
@@ -117,7 +112,7 @@ USAGE = [
     ("evaluate nowhere --episodes 0", "--episodes must be at least 1"),
     ("evaluate nowhere --shield lookahead --horizon 51", "--horizon must be at least 1 and at most"),
     ("evaluate nowhere --shield project --horizon 6", "--horizon 6 is for mode lookahead"),
-    ("evaluate nowhere --shield project --least-safe-steps 6", "--least-safe-steps 6 is for mode lookahead"),
+    ("evaluate nowhere --shield project --horizon 6", "--horizon 6 is for mode lookahead"),
     ("render --horizon 6", "--horizon 6 is for mode lookahead"),
     ("train --horizon 6", "--horizon 6 is for mode lookahead"),
     ("train --violation-penalty 7", "--violation-penalty 7 is for an arm penalized, which is not asked for"),

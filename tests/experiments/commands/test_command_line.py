@@ -279,8 +279,6 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
         assert (document["arms"][f"shield: {mode}"]["plan_rate"] > 0.0) is (mode == "lookahead")
         assert ("from a" in evaluated.stdout) is (mode == "lookahead")
         assert "The guarantee held after 600 of 600 steps." in evaluated.prose
-    asked = ncs("evaluate", out, "--episodes", "3", "--least-safe-steps", "2").prose
-    assert "held after 600 of 600 steps; after 600 the box was promised for one step more at least" in asked
 
 
 @pytest.mark.slow

@@ -116,7 +116,7 @@ def test_channel_compares_a_record_with_a_certificate_of_one_s_own_as_with_that_
     certificate_for(env.plant, env.certificate_contract).save(tmp_path / "certificate.json")
     own = ("--certificate", tmp_path / "certificate.json", "--plant", tmp_path / "plant.json")
     both = own, ("--env", "ncs_gym/CartPole-v0")
-    texts = [succeeded("channel", file, *given, "--least-safe-steps", 3).prose for given in both]
+    texts = [succeeded("channel", file, *given).prose for given in both]
     behind = " Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, which"
     behind += " --committed-ahead takes off."
     assert behind in texts[0]
@@ -159,13 +159,11 @@ def test_samples_have_what_inputs_committed_ahead_leave_of_a_certificate_s_contr
         assert words in refused.stderr
 
 
-def test_channel_counts_silences_beyond_the_steps_that_a_shield_promises(record):
+def test_channel_counts_silences_after_which_the_box_may_be_left(record):
     # Samples at every step of .02 s; five silences of 20 steps and one of 60.
     sent = np.cumsum([0.02] * 99 + [0.42] * 5 + [0.02] * 99 + [1.22] + [0.02] * 99)
-    for least, times in ((10, "6 times"), (30, "once"), (49, "once")):
-        said = succeeded("channel", record(sent), "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", least).prose
-        assert f"the box is kept at least until the newest sample is {4 + least} steps old" in said
-        assert f"In the record it was older {times}" in said
+    said = succeeded("channel", record(sent), "--env", "ncs_gym/CartPole-v0").prose
+    assert "is 5 steps old, in every mode that protects; the record exceeds that 6 times" in said
     kept = succeeded("channel", record(0.02 * np.arange(500)), "--env", "ncs_gym/CartPole-v0").prose
     assert "is 5 steps old, in every mode that protects; the record exceeds that at no time" in kept
     assert "was broken at no time; a record of this length excludes more than" in kept
@@ -176,8 +174,7 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_pat
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["wifi_record.py", str(tmp_path / "packets.csv")])
     runpy.run_path(str(ROOT / "examples" / "wifi_record.py"), run_name="__main__")
-    found = succeeded("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0", "--least-safe-steps", 35)
-    promised = "    If a shield" + found.stdout.partition("If a shield")[2].replace("\n", "\n    ")
+    found = succeeded("channel", tmp_path / "packets.csv", "--env", "ncs_gym/CartPole-v0")
     for name in ("contracts.md", "requirements.md"):
         page = (ROOT / "docs" / name).read_text()
         block = page.partition("    ncs channel packets.csv")[2].partition("\n\n    ")[2]
@@ -185,9 +182,7 @@ def test_pages_show_what_the_command_prints_of_the_record_of_the_example(tmp_pat
         shown = shown[: next(n for n, line in enumerate(shown) if "in 0.169 % of steps" in line) + 1]
         assert [line for line in shown if line and line != "..." and line not in found.stdout.splitlines()] == []
         kept = "    From any belief" + found.stdout.partition("From any belief")[2].replace("\n", "\n    ")
-        assert ([promised.rstrip() in page, kept.partition("If a shield")[0].rstrip() in page]) == (
-            [name == "contracts.md"] * 2
-        )
+        assert (kept.rstrip() in page) == (name == "contracts.md")
 
 
 def test_channel_does_not_call_a_contract_kept_that_a_pause_broke(record):

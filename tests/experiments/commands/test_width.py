@@ -89,7 +89,6 @@ class Shown:
             "missing": 12_345,
             "skipped": 12_345,
             "refused": 12_345,
-            "safe_steps": 12,
         }
         row |= {f"x_hat_{name}": -123.4 for name in env.plant.state_names}
         row |= {"intervened": 12_345, "guaranteed": False, "reason": "the state is not known to have stayed " * 3}

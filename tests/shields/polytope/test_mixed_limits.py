@@ -166,11 +166,10 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     assert guaranteed > 200
 
 
-@pytest.mark.parametrize("least", [0, 1, 6])
 @pytest.mark.parametrize("name", ["rates", "rates of a late input"])
-def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it_also_where_steps_are_asked_for(name, least):
+def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it(name):
     plant, found = PLANTS[name], certificate(name)
-    loop = SafeLoop(found, plant, Channel(), mode="lookahead", least_safe_steps=least)
+    loop = SafeLoop(found, plant, Channel(), mode="lookahead")
     loop.start(np.zeros(plant.n))
     loop.receive()
     for proposed in (plant.input_high, plant.input_low):
