@@ -15,7 +15,7 @@ from ncs_gym.validation import as_vector, own_error_state, shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.design_problem import Rest, design_problem
-from shields.synthesis.diagnosis import Clock, infeasibility, is_feasible, with_feasible_bounds
+from shields.synthesis.diagnosis import Clock, infeasibility, is_feasible, with_age_that_helps
 from shields.synthesis.ellipsoid_certificates import LOST, Progress, certify, largest_ellipsoid, nearby_ellipsoid
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
@@ -29,7 +29,7 @@ from shields.synthesis.resting_point import needs_resting_point, resting_at
 from shields.verification import verify
 
 # A refusal should take so long at most [s], of its thread's own time: searches after the first for a polytope, and then
-# for changes that would help, begin no later than so much earlier. One that is under way goes on: where polytopes have
+# for an age that would help, begin no later than so much earlier. One that is under way goes on: where polytopes have
 # very many rows, a refusal has been seen to take 82 s.
 LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # Alternations of a search that begins near the design of a similar problem.
@@ -269,7 +269,7 @@ def _with_hints(
     *,
     polytope: bool,
 ) -> Infeasible:
-    """Returns the exception with the changes that would help, where no ellipsoid was found.
+    """Returns the exception with an age that would help, where no ellipsoid was found.
 
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
@@ -290,18 +290,16 @@ def _with_changes(
     *,
     polytope: bool,
 ) -> Infeasible:
-    """Returns the exception with single changes that have a certificate.
+    """Returns the exception with an age of samples that has a certificate.
 
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
 
-    def certifies(changed: LinearPlant, promised: ChannelContract | None, within: Clock) -> bool:
-        return nearby_certificate(changed, promised, polytope=polytope, progress=within.check) is not None
+    def certifies(promised: ChannelContract) -> bool:
+        return nearby_certificate(plant, promised, polytope=polytope, progress=clock.check) is not None
 
     try:
-        return with_feasible_bounds(
-            infeasible, plant, contract, progress, polytope=polytope, certifies=certifies, clock=clock
-        )
+        return with_age_that_helps(infeasible, plant, contract, certifies, clock, progress, polytope=polytope)
     except KeyboardInterrupt as interrupt:
-        raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt
+        raise SynthesisInterrupted(f"interrupted while feasible ages were sought: {infeasible}") from interrupt

@@ -9,7 +9,7 @@ import pytest
 from ncs_gym import Channel, ChannelContract, LinearPlant, certified_error_set, truck_trailer
 from shields import Infeasible, SafetyShield, synthesize, verify
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
-from tests.certificates import certificate_of, feasible_bounds_not_sought
+from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import NAMED, named, random_plant
 from tests.verdicts import verified
 
@@ -84,7 +84,7 @@ def test_state_that_no_output_shows_is_named():
     system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[0.0, 1.0]], [[0.0]])
     plant = LinearPlant.from_statespace(system, **CART, state_names=("place", "speed"))
     with (
-        feasible_bounds_not_sought(),
+        feasible_age_not_sought(),
         pytest.raises(Infeasible, match="no error set exists: the outputs do not show place, whose errors"),
     ):
         synthesize(plant, contract=ChannelContract(0))
@@ -129,7 +129,7 @@ def test_input_limits_too_wide_to_bind_do_not_spoil_the_programs(u_max):
 def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
     plant = truck_trailer(gamma=0.5)
     with (
-        feasible_bounds_not_sought(),
+        feasible_age_not_sought(),
         pytest.raises(Infeasible, match=r"disturbance and error radii shrink to .*%") as caught,
     ):
         synthesize(plant, safe_set="ellipsoid")
@@ -159,7 +159,7 @@ def test_weak_input_is_what_binds():
     contract = ChannelContract(1)
     certificate = synthesize(with_limit(1.0), contract=contract, safe_set="ellipsoid")
     assert verified(certificate, with_limit(1.0)).valid
-    with feasible_bounds_not_sought(), pytest.raises(Infeasible) as caught:
+    with feasible_age_not_sought(), pytest.raises(Infeasible) as caught:
         synthesize(with_limit(1e-3), contract=contract)
     assert caught.value.binding == "U"
 
@@ -199,7 +199,7 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
         return program
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
-    with feasible_bounds_not_sought():
+    with feasible_age_not_sought():
         with pytest.raises(Infeasible):
             synthesize(plant, safe_set="ellipsoid")
         if answer is not None:  # the others of these are as the first
@@ -227,7 +227,7 @@ def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(n, m
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
     try:
-        with feasible_bounds_not_sought():
+        with feasible_age_not_sought():
             certificate = synthesize(plant, safe_set="ellipsoid")
     except Infeasible:
         return
