@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from shields.nodes import ActuatorNode, ControllerNode, SensorNode
     from shields.silence import Silence, silence_of
     from shields.synthesis import (
-        Network,
-        Requirement,
         Requirements,
         certify,
         requirements,
@@ -40,11 +38,9 @@ __all__ = [
     "GuaranteeLostWarning",
     "Infeasible",
     "Multipliers",
-    "Network",
     "Polytope",
     "Proof",
     "Report",
-    "Requirement",
     "Requirements",
     "SafeLoop",
     "SafetyFilter",
@@ -64,10 +60,7 @@ __all__ = [
 
 # Imported at first use: these need the solver, or asyncio.
 _NAMES = {
-    "synthesis": (
-        *("Network", "Requirement", "Requirements"),
-        *("certify", "requirements", "synthesize"),
-    ),
+    "synthesis": ("Requirements", "certify", "requirements", "synthesize"),
     "silence": ("Silence", "silence_of"),
     "nodes": ("ActuatorNode", "ControllerNode", "SensorNode"),
 }

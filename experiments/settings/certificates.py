@@ -211,63 +211,32 @@ class ReproduceSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RequirementsSettings(BackendSettings):
-    """Finds which networks leave a plant certifiable: how slow, late, lossy and coarse the network may be.
+class RequirementsSettings:
+    """Finds under which contracts of the network a plant is certifiable: how old and how coarse its samples may be.
 
-    Every combination of the values below is a network. Prints what share of the safe box a certificate keeps, - where
-    none was found (which does not prove that there is none), and the cheapest network that keeps enough; leaves
-    summary.json with every network's packets and bits per second, the certificates, and a figure. Started again with
-    the same folder, finished searches are kept.
+    Prints what share of the safe box a certificate keeps, - where none was found (which does not prove that there is
+    none).
 
     Attributes:
         env: Id of an environment with a plant of its own, or module:id, which first imports the module. By default
             ncs_gym/CartPole-v0.
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
-        out: Output folder; created if it does not exist.
-        sampling_periods: Durations of a control step [s]; others than the plant's for one with a model in continuous
-            time.
-        send_periods: Steps between samples.
-        losses: Most packets lost in a row; "any" for no limit, which only stable plants can bear.
-        delays: Fixed delays of a sample [steps].
-        jitters: Largest further delays [steps].
-        input_delays: Steps from a decision until its input takes effect, as behind a network to the actuator, by which
-            the newest sample must be less old.
-        quantization_steps: Steps of the quantizer, in the units of the measurements; 0 for none.
-        disturbances: Factors on the radii of the disturbances.
-        noises: Factors on the radii of sensor noise and first errors.
-        tolerance: Also seek the factor by which all radii may grow in each network.
-        keep: Percentage of the largest share that the cheapest network is to keep.
-        log: Record of packets, as `ncs channel` reads it: also says how often its newest sample was older than
-            certificates allow.
-        ignore: Names of columns of --log that are not looked at.
-        force: Replace finished results of other settings in the output folder, which otherwise is refused.
+        ages: Largest ages of the newest sample when an input takes effect [steps]; by default up to 32, and the
+            environment's.
+        resolutions: Quantization steps, in the units of the measurements, 0 for none; by default the environment's.
+        out: File for the table with its certificates (JSON).
         seed: Not used, since the search is deterministic; every command takes it.
     """
 
     env: str | None = None
     plant: Path | None = None
-    out: Path = Path("runs/requirements")
-    sampling_periods: tuple[float, ...] = ()
-    send_periods: tuple[int, ...] = ()
-    losses: tuple[int | Literal["any"], ...] = ()
-    delays: tuple[int, ...] = ()
-    jitters: tuple[int, ...] = ()
-    input_delays: tuple[int, ...] = ()
-    quantization_steps: tuple[float, ...] = ()
-    disturbances: tuple[float, ...] = (1.0,)
-    noises: tuple[float, ...] = (1.0,)
-    tolerance: bool = False
-    keep: float = 90.0
-    log: Path | None = None
-    ignore: tuple[str, ...] = ()
-    force: bool = False
+    ages: tuple[int, ...] = ()
+    resolutions: tuple[float, ...] = ()
+    out: Path | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
-        BackendSettings.__post_init__(self)
         _refuse_both(self.env, self.plant)
-        if not 0.0 < self.keep <= 100.0:
-            raise ValueError(f"--keep must be a percentage above 0 and at most 100, got {self.keep:g}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from experiments.settings import (
 from experiments.settings.certificates import AttackSettings
 from experiments.study.study import quoted
 from ncs_gym import Channel, ChannelContract
-from tests.certificates import feasible_bounds_not_sought
+from tests.certificates import feasible_age_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
@@ -125,9 +125,8 @@ USAGE = [
     ("loop --role plant", "give both the same --key-file"),
     ("render --side-by-side --shield none", "--side-by-side compares with a shield"),
     ("requirements --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),
-    ("requirements --losses -1", "max_consecutive_losses"),
-    ("requirements --keep 0", "--keep"),
-    ("requirements --delays 1 1", "different values"),
+    ("requirements --ages -1", "an age must be a whole number >= 0"),
+    ("requirements --ages 1 1", "ages must be different values"),
     (f"loop --env {CSTR}", "now 5 + 1 + 0 + 1 by --channel and 5 + 1 + 0 + 1 by --downlink"),
     ("reproduce --starts 0", "--starts must be"),
     ("reproduce --steps -1", "--steps must be"),
@@ -225,7 +224,7 @@ def test_calls_are_refused(call, words):
 
 @pytest.mark.parametrize(("line", "words"), USAGE)
 def test_usage_errors_are_the_parsers(line, words):
-    with feasible_bounds_not_sought():
+    with feasible_age_not_sought():
         run = ncs(*line.split(), COLUMNS="200")
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
