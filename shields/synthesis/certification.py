@@ -145,7 +145,6 @@ def nearby_certificate(
     plant: LinearPlant,
     contract: ChannelContract | None,
     start: Certificate | None = None,
-    alternations: int = _FEW_ALTERNATIONS,
     *,
     polytope: bool = True,
     progress: Progress = lambda line: None,
@@ -156,14 +155,13 @@ def nearby_certificate(
         plant: The plant with its bounds.
         contract: Channel contract; None for none.
         start: Certificate of a similar problem with as many states and inputs, which the search begins near.
-        alternations: How often the set is enlarged at most.
         polytope: Whether a polytope is sought where no ellipsoid is found.
         progress: Called with a line of text now and then.
     """
     if needs_resting_point(plant):
-        return _nearby_around(plant, contract, start, alternations, progress)
+        return _nearby_around(plant, contract, start, progress)
     try:
-        certificate = nearby_ellipsoid(plant, contract, start, alternations, progress)
+        certificate = nearby_ellipsoid(plant, contract, start, _FEW_ALTERNATIONS, progress)
     except Infeasible:
         certificate = None
     carried = None if certificate or start is None else carried_over(start, plant, contract)
@@ -174,13 +172,10 @@ def _nearby_around(
     plant: LinearPlant,
     contract: ChannelContract | None,
     start: Certificate | None,
-    alternations: int,
     progress: Progress,
 ) -> Certificate | None:
     """Returns what `nearby_certificate` does, of a polytope around a resting point."""
     carried = None if start is None else carried_over(start, plant, contract)
-    if carried is not None and not alternations:
-        return carried
     try:
         for each in fallbacks_around(plant, contract, progress, quick=True):
             found = certify_polytope(plant, each.K, contract, progress, each.rest)

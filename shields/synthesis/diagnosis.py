@@ -226,29 +226,12 @@ def is_feasible(plant: LinearPlant, contract: ChannelContract | None, *, polytop
         polytope: Whether it is enough that it keeps a polytope.
     """
     try:
-        return margin_of(plant, contract, polytope=polytope, enough=SUFFICIENT_MARGIN) >= SUFFICIENT_MARGIN
+        if needs_resting_point(plant):
+            return _tolerance_around(plant, contract, SUFFICIENT_MARGIN).margin >= SUFFICIENT_MARGIN
+        problem, _ = design_problem(plant, contract)
+        return _margin(problem, polytope=polytope, enough=SUFFICIENT_MARGIN) >= SUFFICIENT_MARGIN
     except Infeasible:
         return False
-
-
-def margin_of(
-    plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool = True, enough: float = np.inf
-) -> float:
-    """Returns the factor on all radii that the best gain bears that is found; 0 for none.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract, if there is one.
-        polytope: Whether it is enough that it keeps a polytope.
-        enough: A factor beyond which no larger one is sought.
-
-    Raises:
-        Infeasible: If there is no error set, or no equilibrium within limits with two ends.
-    """
-    if needs_resting_point(plant):
-        return _tolerance_around(plant, contract, enough).margin
-    problem, _ = design_problem(plant, contract)
-    return _margin(problem, polytope=polytope, enough=enough)
 
 
 class _Tolerance(NamedTuple):
