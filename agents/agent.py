@@ -53,7 +53,6 @@ class Agent:
         base_policy: Policy to whose action that of the model is added; None for none.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
-        least_safe_steps: Steps for which that shield sought to keep the box whatever the network does.
         is_filtered: Whether it was trained behind another filter (`LoopConfig.filter`), which files do not keep.
         kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
@@ -68,7 +67,6 @@ class Agent:
     base_policy: BasePolicy | None = None
     shield_mode: str | None = None
     horizon: int | None = None
-    least_safe_steps: int = 0
     is_filtered: bool = False
     kwargs: dict[str, Any] = field(default_factory=dict)
 
@@ -151,7 +149,7 @@ class Agent:
             "versions": _versions(),
             "hyperparams": self.hyperparams,
             "channel": to_json(self.channel),
-            "shield": shield_to_json(self.shield_mode, self.horizon, self.least_safe_steps),
+            "shield": shield_to_json(self.shield_mode, self.horizon),
             "plant": None if (plant := _plant_of(self.env, self.kwargs)) is None else plant.fingerprint,
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
@@ -265,7 +263,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs=kwargs | {"channel": content["channel"]})
-    shield_mode, horizon, least_safe_steps = shield_from_json(content.get("shield"))
+    shield_mode, horizon = shield_from_json(content.get("shield"))
     envs = SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
@@ -298,7 +296,6 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         base_policy=base,
         shield_mode=shield_mode,
         horizon=horizon,
-        least_safe_steps=least_safe_steps,
         is_filtered=is_filtered,
         kwargs=kwargs,
     )

@@ -100,19 +100,16 @@ def _pretrained() -> dict[str, Path]:
     return {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
 
 
-def shield_to_json(mode: str | None, horizon: int | None, least_safe_steps: int) -> dict[str, Any] | None:
-    """Returns mode, horizon and, if any are sought, safe steps of a shield as JSON values; None for no shield."""
-    if mode is None:
-        return None
-    return {"mode": mode, "horizon": horizon} | ({"least_safe_steps": least_safe_steps} if least_safe_steps else {})
+def shield_to_json(mode: str | None, horizon: int | None) -> dict[str, Any] | None:
+    """Returns mode and horizon of a shield as JSON values; None for no shield."""
+    return None if mode is None else {"mode": mode, "horizon": horizon}
 
 
-def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None, int]:
-    """Returns mode, horizon and safe steps of the shield that an agent was trained behind; None, None, 0 for none."""
+def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:
+    """Returns mode and horizon of the shield that an agent was trained behind; None for no shield."""
     if content is None:
-        return None, None, 0
-    mode, horizon, least = content["mode"], content["horizon"], content.get("least_safe_steps", 0)
-    fits = horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)
-    if mode not in MODES or not fits or not (type(least) is int and 0 <= least < LONGEST_HORIZON):
-        raise AgentError("the agent is damaged: there is no shield of that mode, horizon and safe steps")
-    return mode, horizon, least
+        return None, None
+    mode, horizon = content["mode"], content["horizon"]
+    if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
+        raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
+    return mode, horizon

@@ -86,7 +86,7 @@ def _played(
     infos, nothing = [info], np.zeros(count, np.bool_)
     running, ended, guaranteed = ~nothing, nothing, ~nothing
     returns, largest = np.zeros(count), np.full(count, np.nan if level_matrix is None else 0.0)
-    names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "proved", "promised")
+    names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "proved")
     totals = {name: np.zeros(count, np.int64) for name in names}
     while True:
         guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
@@ -108,7 +108,6 @@ def _played(
             "interventions": info.get("shield_intervened", nothing).astype(np.bool_),
             "planned": info.get("shield_plan_length", nothing) > 0,
             "proved": info.get("shield_guaranteed", nothing).astype(np.bool_),
-            "promised": info.get("shield_safe_steps", nothing) > 0,
         }
         for name, where in happened.items():
             totals[name] += running & where

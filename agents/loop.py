@@ -39,11 +39,10 @@ class ShieldSettings:
         penalty: Subtracted from the reward for every intervention.
         horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
         on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does.
 
     Raises:
         ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
-            that a shield takes, or mode "lookahead" does not take the horizon or the steps, or the penalty is negative.
+            that a shield takes, or mode "lookahead" does not take the horizon, or the penalty is negative.
     """
 
     certificate: Certificate
@@ -51,13 +50,12 @@ class ShieldSettings:
     penalty: float = 0.0
     horizon: int | None = None
     on_unproved: str = "warn"
-    least_safe_steps: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate, got {type(self.certificate).__name__}")
         object.__setattr__(self, "penalty", as_number(self.penalty, "penalty", low=0.0))
-        object.__setattr__(self, "horizon", plan_horizon(self.mode, self.horizon, self.least_safe_steps))
+        object.__setattr__(self, "horizon", plan_horizon(self.mode, self.horizon))
         LostGuarantee(self.on_unproved)
 
 

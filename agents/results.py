@@ -77,8 +77,6 @@ class Episode(_Totals):
         planned: Steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store; 0 in
             other modes.
         proved: Steps after which the shield's guarantee held; 0 without a shield.
-        promised: Steps after which the shield promised the box for one step more at least, whatever the network does;
-            0 unless it is asked for such steps.
     """
 
     index: int
@@ -91,7 +89,6 @@ class Episode(_Totals):
     largest_level: float
     planned: int = 0
     proved: int = 0
-    promised: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,7 +225,6 @@ def _agent(
         base_policy=loop.base_policy,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
-        least_safe_steps=0 if loop.shield is None else loop.shield.least_safe_steps,
         is_filtered=loop.filter is not None,
         kwargs=loop.other_kwargs,
     )

@@ -1,7 +1,7 @@
 """What mode "lookahead" admits and what it costs: `python -m benchmarks.lookahead COMMAND`.
 
 Commands: admitted, decisions. Plans end in the safe set of the certificate: the polytope, with `--safe-set ellipsoid`
-the ellipsoid in it, with `--safe-set sought` the polytope of a sought gain.
+the ellipsoid in it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from benchmarks.commands import one_of, run, table
 from benchmarks.timing import microseconds
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.envs.env import ncs_env
-from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
+from shields import SafetyFilter, VectorSafetyShield, synthesize
 from shields.runtime.backup_plans import Lookahead
 from shields.runtime.set_test import PredictedErrors
 
 # Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
 CASES = {
-    "sought": (("TruckTrailerCruise", 3), ("CartPole", 6), ("BatchReactor", 6)),
     "ellipsoid": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("BatchReactor", 6)),
     "polytope": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 6), ("BatchReactor", 6)),
 }
@@ -33,12 +32,6 @@ SafeSet = Annotated[str, one_of(tuple(CASES))]
 # Environments side by side, steps before those that are timed, environments of every step whose decisions are timed one
 # by one, and situations that are given to cvxpy.
 ENVS, WARM, ALONE, CVXPY = 64, 50, 4, 60
-
-
-def certified(plant: LinearPlant, contract: Any, safe_set: str) -> Certificate:
-    """Returns the certificate of a plant with a safe set of that kind."""
-    sought = safe_set == "sought"
-    return synthesize(plant, contract=contract, safe_set=None if sought else safe_set, search_gain=sought)
 
 
 def admitted(safe_set: SafeSet = "polytope", situations: int = 2000) -> None:
@@ -53,7 +46,7 @@ def admitted(safe_set: SafeSet = "polytope", situations: int = 2000) -> None:
     show = table("situations admitted", "N", "in S", "one step", "lookahead", "bound", first=20)
     for name, horizon in CASES[safe_set]:
         env = ncs_env(gym.make(f"ncs_gym/{name}-v0", terminate_on_violation=False))
-        plant, certificate = env.plant, certified(env.plant, env.certificate_contract, safe_set)
+        plant, certificate = env.plant, synthesize(env.plant, contract=env.certificate_contract, safe_set=safe_set)
         shape, rng = _median_shape(env), np.random.default_rng(0)
         states = np.empty((0, plant.n))
         while len(states) < situations:
@@ -159,7 +152,7 @@ def decisions(safe_set: SafeSet = "polytope", steps: int = 100) -> None:
     for name, horizon in CASES[safe_set]:
         env, rng = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=ENVS), np.random.default_rng(0)
         single = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
-        certificate = certified(single.plant, single.certificate_contract, safe_set)
+        certificate = synthesize(single.plant, contract=single.certificate_contract, safe_set=safe_set)
         shielded = VectorSafetyShield(env, certificate, "lookahead", horizon=horizon, on_unproved="ignore")
         shielded._filter = Recorded(certificate, single.plant, "lookahead", horizon)
         shielded.reset(seed=0)

@@ -16,7 +16,6 @@ import matplotlib
 import numpy as np
 from gymnasium.vector import VectorEnv
 from matplotlib.artist import Artist
-from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
@@ -241,8 +240,7 @@ def _lost_command() -> CaptionedFigure:
         return figure
 
 
-# Environments, with the steps that are asked for (`python -m benchmarks.silence network`).
-ASKED = {"CartPole": 35, "BatchReactor": 15, "Convoy": 10, "LaneKeeping": 10}
+RECORDED = ("CartPole", "BatchReactor", "Convoy", "LaneKeeping")
 SPAN, PERIOD, EPISODE = 3600.0, 0.02, 60.0
 
 
@@ -279,12 +277,9 @@ NETWORKS: dict[str, Callable[[np.random.Generator, np.ndarray], np.ndarray]] = {
     "car": car,
     "burst": bursts,
 }
-FILTERS = (
-    "none", "mpc", "mpc:20", "trusting", "trusting:20", "psf:20", "psf:tube", "project", "lookahead",
-    "lookahead, asked",
-)  # fmt: skip
-# Which of them claim what.
-CLAIMS = {"ever": ("project", "lookahead", "lookahead, asked"), "promised": ("lookahead, asked",)}
+FILTERS = ("none", "mpc", "mpc:20", "trusting", "trusting:20", "psf:20", "psf:tube", "project", "lookahead")
+# Those that claim something.
+CLAIMING = ("project", "lookahead")
 
 
 # Colors and markers of the networks in the figure, apart for color-blind readers (Okabe and Ito).
@@ -292,21 +287,18 @@ MARKS = {"Wi-Fi": ("#0072b2", "o"), "car": ("#d55e00", "s"), "burst": ("#009e73"
 
 
 class Measured(NamedTuple):
-    """How often the box is left per hour, and at which shares of the steps the two claims are made."""
+    """How often the box is left per hour, and at which share of the steps the guarantee holds."""
 
     left: float
     ever: float
-    promised: float
 
 
-def behind(env: VectorEnv, name: str, least: int) -> VectorEnv:
+def behind(env: VectorEnv, name: str) -> VectorEnv:
     """Returns environments behind a filter."""
     if name == "none" or name in REGULATORS:
         return env
-    if name in ("project", "lookahead"):
+    if name in CLAIMING:
         return VectorSafetyShield(env, mode=name, on_unproved="ignore")
-    if name == "lookahead, asked":
-        return VectorSafetyShield(env, mode="lookahead", least_safe_steps=least, on_unproved="ignore")
     inner = env.unwrapped
     assert isinstance(inner, NCSVectorEnv)
     return EstimateFilterSettings(name, certificate_for(inner.plant, inner.certificate_contract))(env)
@@ -322,8 +314,8 @@ def pushes(rng: np.random.Generator, dt: float, shape: tuple[int, ...]) -> Itera
         yield pushed
 
 
-def measured(env_id: str, network: str, name: str, least: int, count: int, hours: float) -> Measured:
-    """Returns what a filter, or a controller, does over a network, asked for so many least safe steps."""
+def measured(env_id: str, network: str, name: str, count: int, hours: float) -> Measured:
+    """Returns what a filter, or a controller, does over a network."""
     plant = gym.make(env_id).unwrapped
     assert isinstance(plant, NCSEnv)
     dt, rng = plant.plant.dt, np.random.default_rng(0)
@@ -331,27 +323,23 @@ def measured(env_id: str, network: str, name: str, least: int, count: int, hours
     channel = PacketLog(sent, NETWORKS[network](rng, sent)).channel(dt)
     settings = {"disturbance": "adversarial", "terminate_on_violation": True, "channel": channel}
     settings |= {"contract": plant.contract, "max_episode_steps": round(EPISODE / dt)}
-    env = behind(gym.make_vec(env_id, count, **settings), name, least)
+    env = behind(gym.make_vec(env_id, count, **settings), name)
     observation, info = env.reset(seed=0)
     shape = env.action_space.shape
     assert shape is not None
-    agent, kept = pushes(rng, dt, shape), np.zeros(count, np.int64)
+    agent = pushes(rng, dt, shape)
     controls = None
     if name in REGULATORS:
         fallback = certificate_for(plant.plant, plant.certificate_contract).fallback
         controls = controller(name, plant, fallback, 0, tuned_weights(env_id, name.partition(":")[0]))
-    ended, ever, promised, steps = 0, 0, 0, round(hours * 3600.0 / (dt * count))
+    ended, ever, steps = 0, 0, round(hours * 3600.0 / (dt * count))
     for _ in range(steps):
         action = next(agent) if controls is None else controls(observation, info)
         observation, _, terminated, _, info = env.step(action)
-        if np.any(terminated & (kept > 0)):
-            raise AssertionError("the box was left within the steps that were promised")
-        kept = np.where(terminated, 0, info.get("shield_safe_steps", kept))
         ended += np.count_nonzero(terminated)
         ever += np.count_nonzero(info.get("shield_guaranteed", False))
-        promised += np.count_nonzero(info.get("shield_safe_steps", False))
     number = steps * count
-    return Measured(ended / (number * dt / 3600.0), ever / number, promised / number)
+    return Measured(ended / (number * dt / 3600.0), ever / number)
 
 
 def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
@@ -375,15 +363,10 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
                 color, marker = MARKS[network]
                 given = {"color": color, "marker": marker, "linestyle": "", "markersize": 4.5, "clip_on": False}
                 handles[network] = left.plot(each.left, row + offset, **given)[0]
-                for claim, share in (("ever", each.ever), ("promised", each.promised)):
-                    if name in CLAIMS[claim]:
-                        fill = "full" if claim == "ever" else "none"
-                        claimed.plot(100.0 * share, row + offset, fillstyle=fill, **given)
+                if name in CLAIMING:
+                    claimed.plot(100.0 * each.ever, row + offset, **given)
     axes[-1][0].set_xlabel("ends of episodes per hour")
-    axes[-1][1].set_xlabel("steps with a claim [%]")
-    gray: dict[str, Any] = {"color": "#555555", "marker": "o", "linestyle": "", "markersize": 4.5}
-    handles["guaranteed"] = Line2D([], [], **gray)
-    handles["the box is kept for a step at least"] = Line2D([], [], fillstyle="none", **gray)
+    axes[-1][1].set_xlabel("steps at which the guarantee holds [%]")
     legend_below(drawn, handles)
     return drawn
 
@@ -391,7 +374,7 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
 def recorded(
     hours: float = 1.0,
     envs: int = 64,
-    ids: Annotated[Sequence[str], some_of(tuple(ASKED))] = tuple(ASKED),
+    ids: Annotated[Sequence[str], some_of(RECORDED)] = RECORDED,
     filters: Annotated[Sequence[str], some_of(FILTERS)] = FILTERS,
     out: Path | None = None,
 ) -> None:
@@ -404,28 +387,22 @@ def recorded(
 
     The agent pushes in one direction for half a second to two, then in another; "mpc" and "mpc:20" are model predictive
     control of the task instead, without a margin and with one of a fifth. Disturbances are adversarial. An episode ends
-    where the box is left, or after a minute. "left" counts these ends per hour of plant time. "ever" and "promised" are
-    the shares of steps at which the guarantee holds, and at which the box is kept for at least one step whatever the
-    network does. A dash stands for a filter that claims nothing. With --out a figure of it, too.
+    where the box is left, or after a minute. "left" counts these ends per hour of plant time, "ever" is the share
+    of steps at which the guarantee holds. A dash stands for a filter that claims nothing. With --out a figure of it.
     """
     shares_of = "  " + "".join(f"{each:>6}" for each in NETWORKS)
     found: dict[str, dict[str, dict[str, Measured]]] = {}
     for name in ids:
-        print(f"{name:16}{'left per hour':>24}  {'ever [%]':>18}  {'promised [%]':>18}")
-        print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + 2 * shares_of)
+        print(f"{name:16}{'left per hour':>24}  {'ever [%]':>18}")
+        print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + shares_of)
         of_env = found[name] = {}
         for each in filters:
-            given = ASKED[name], envs, hours
             over = of_env[each] = {
-                network: measured(f"ncs_gym/{name}-v0", network, each, *given) for network in NETWORKS
+                network: measured(f"ncs_gym/{name}-v0", network, each, envs, hours) for network in NETWORKS
             }
             text = "".join(f"{one.left:8.1f}" for one in over.values())
-            for claim, names in CLAIMS.items():
-                shares = [
-                    f"{100.0 * getattr(one, claim):6.1f}" if each in names else f"{'-':>6}" for one in over.values()
-                ]
-                text += "  " + "".join(shares)
-            print(f"{each:16}{text}", flush=True)
+            shares = [f"{100.0 * one.ever:6.1f}" if each in CLAIMING else f"{'-':>6}" for one in over.values()]
+            print(f"{each:16}{text}  {''.join(shares)}", flush=True)
         print()
     if out is not None:
         out.write_bytes(_claims_drawn(found).png)

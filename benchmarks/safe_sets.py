@@ -30,7 +30,7 @@ from ncs_gym import LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Infeasible, SafetyFilter, VectorSafetyShield, synthesize
 from shields.synthesis.invariant_polytope import Faces, in_half_ranges, invariant_faces
-from shields.synthesis.polytope_certificates import with_largest_polytope, with_polytope
+from shields.synthesis.polytope_certificates import with_polytope
 from shields.verification import ACTION_ROUNDING
 
 IDS = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum")
@@ -146,11 +146,10 @@ def _behind(name: str, certificate: Certificate, steps: int, **settings: Any) ->
 def polytope(ids: Sequence[str] = IDS, steps: int = 8000) -> None:
     """What a polytope in place of the ellipsoid gives, and what it costs, for registered environments.
 
-    Three safe sets: the ellipsoid, the polytope that its gain keeps in the box, and that of a gain that was sought for
-    it. "share" is the part of the safe box's volume that the set fills, "s" the processor's time for finding and
-    proving it, on top of the set above for a polytope. "x 1", "x 64" and "x 1024" compare a decision to one with the
-    ellipsoid, for one loop and for batches. "overridden" and "reward" (per step) are those of an LQR behind the shield,
-    in the same episodes.
+    Two safe sets: the ellipsoid, and the polytope that its gain keeps in the box. "share" is the part of the safe box's
+    volume that the set fills, "s" the processor's time for finding and proving it, on top of the ellipsoid for the
+    polytope. "x 1", "x 64" and "x 1024" compare a decision to one with the ellipsoid, for one loop and for batches.
+    "overridden" and "reward" (per step) are those of an LQR behind the shield, in the same episodes.
     """
     columns = ("safe set", "rows", "share", "s", "x 1", "x 64", "x 1024", "overridden", "reward")
     show = table("id", *columns, first=20, width=7)
@@ -160,7 +159,6 @@ def polytope(ids: Sequence[str] = IDS, steps: int = 8000) -> None:
         plain, seconds = timed(synthesize, plant, contract=contract, safe_set="ellipsoid")
         made = {"ellipsoid": (plain, seconds)}
         made["polytope"] = timed(with_polytope, plain, plant)
-        made["sought gain"] = timed(with_largest_polytope, plain, plant)
         shields = [SafetyFilter(certificate, plant) for certificate, _ in made.values()]
         inside = made["polytope"][0]
         works = [[_deciding(shield, inside, count) for shield in shields] for count in (1, 64, 1024)]
@@ -293,9 +291,7 @@ def _judged(find: Callable[[Case], np.ndarray], case: Case, longest: int) -> tup
     return f"{seconds:.2f}", str(len(faces)), f"{share:.1%}", verdict
 
 
-def between_samples(
-    ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: int = 8000, search_gain: bool = False
-) -> None:
+def between_samples(ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: int = 8000) -> None:
     """What it costs that the box counts between samples, too, for environments with a model in continuous time.
 
     Each id has two lines: at sampling instants alone, and at all times. "S" and "P" are the shares of the safe box's
@@ -314,7 +310,7 @@ def between_samples(
         found: list[tuple[Certificate, float]] = []
         for plant in plants:
             try:
-                found.append(timed(synthesize, plant, contract=env.certificate_contract, search_gain=search_gain))
+                found.append(timed(synthesize, plant, contract=env.certificate_contract))
             except Infeasible as none:
                 print(f"{name:<26}{plant.between_samples or 1:>3} {none}", flush=True)
                 break

@@ -1,6 +1,6 @@
 """For how many steps the box is kept when the network goes silent: `python -m benchmarks.silence COMMAND`.
 
-Commands: network, back, ways, attack. All are about registered environments with a contract, of which --ids are names.
+Commands: back, ways, attack. All are about registered environments with a contract, of which --ids are names.
 """
 
 from __future__ import annotations
@@ -22,10 +22,8 @@ from ncs_gym.registration import registered_ids
 from shields import Certificate, VectorSafetyShield, certificate_for
 from shields.silence import OUTAGES, silence_of, way_back
 
-IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
-# Steps that the attack asks for, behind a downlink, too.
-ATTACKED = {"CartPole": 35, "CartPoleTwoWay": 20, "CartPoleNonlinear": 20, "BatchReactor": 15, "CSTR": 5}
-ATTACKED |= {"Convoy": 10, "LaneKeeping": 10}
+# What the attack is about.
+ATTACKED = ("CartPole", "CartPoleTwoWay", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping")
 # More samples, and longer ways by a ladder, are not looked for.
 MOST_SAMPLES, LONGEST_LADDER = 30, 10_000
 # Steps of an episode before the network goes silent, and afterwards.
@@ -40,54 +38,6 @@ def with_contracts(ids: Sequence[str]) -> Iterator[tuple[str, NCSEnv, ChannelCon
             yield name, env, env.certificate_contract
 
 
-def network(ids: Sequence[str] = IDS, envs: int = 64, steps: int = 150) -> None:
-    """For how many steps mode "lookahead" may be asked, what that costs, and when a silence leaves the box.
-
-    Disturbances are adversarial. With random actions, "safe" is the largest number of steps of a ladder that is
-    promised at 95 % of the steps over the environment's own network when it is asked for; "overridden" the share of
-    steps overridden when none are asked for, and when these are. "left at" is how old the newest sample had become when
-    a state left the box first, the smallest of all episodes: samples come as rarely as the contract allows for a while
-    and then no more for sixty steps, and the agent pushes all the time, behind mode "project", and behind "lookahead"
-    that is asked for the steps. "never" stands for no state.
-    """
-    print(f"{'':20} {'contract':>8} {'safe':>5} {'':>8} {'overridden [%]':>13} {'left at an age of':>18}")
-    print(f"{'':20} {'[steps]':>8} {'':>5} {'[s]':>8} {'none':>6} {'asked':>6} {'project':>8} {'lookahead':>10}")
-    for name, env, contract in with_contracts(ids):
-        env_id = f"ncs_gym/{name}-v0"
-        free, most = over_its_network(env_id, envs, steps, 0)[1], (0, float("nan"))
-        for least in range(5, 50, 5):
-            promised, overridden = over_its_network(env_id, envs, steps, least)
-            if promised < 0.95:
-                break
-            most = least, overridden
-        texts = ["never" if age is None else age for age in (left_at(env_id, envs, each) for each in (None, most[0]))]
-        seconds = f"{most[0] * env.plant.dt:.2g}" if env.plant.dt else "-"
-        print(
-            f"{name + '-v0':20} {contract.max_age:8} {most[0]:5} {seconds:>8} {100 * free:6.1f} {100 * most[1]:6.1f} "
-            f"{texts[0]:>8} {texts[1]:>10}",
-            flush=True,
-        )
-
-
-def shielded(name: str, count: int, least: int | None, **settings: Any) -> VectorSafetyShield:
-    """Returns environments behind mode "lookahead" that is asked for so many steps; for None behind "project"."""
-    env = gym.make_vec(name, count, disturbance="adversarial", terminate_on_violation=False, **settings)
-    given: dict[str, Any] = {"mode": "project"} if least is None else {"mode": "lookahead", "least_safe_steps": least}
-    return VectorSafetyShield(env, **given, on_unproved="ignore")
-
-
-def over_its_network(name: str, count: int, steps: int, least: int) -> tuple[float, float]:
-    """Returns the shares of steps at which all steps asked for are promised, and at which the shield overrides."""
-    env, rng = shielded(name, count, least), np.random.default_rng(0)
-    env.reset(seed=0)
-    promised, overridden = 0, 0
-    for _ in range(steps):
-        *_, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
-        promised += np.count_nonzero(info["shield_safe_steps"] == least)
-        overridden += np.count_nonzero(info["shield_intervened"])
-    return promised / (count * steps), overridden / (count * steps)
-
-
 def rare_then_silent(name: str) -> TraceChannel:
     """Returns a channel over which samples come as rarely as the contract allows, and then no more."""
     env = ncs_env(gym.make(name))
@@ -95,22 +45,6 @@ def rare_then_silent(name: str) -> TraceChannel:
     period = env.certificate_contract.max_age - env.channel.delay + 1
     heard = [env.channel.delay if k % period == 0 else -1 for k in range(HEARD)]
     return TraceChannel(trace=(*heard, *[-1] * SILENT), quantization_step=env.channel.quantization_step)
-
-
-def left_at(name: str, count: int, least: int | None) -> int | None:
-    """Returns how old the newest sample had become when a state left the box, the least of all; None if none did."""
-    channel = rare_then_silent(name)
-    env, rng = shielded(name, count, least, channel=channel), np.random.default_rng(1)
-    pushed = rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
-    env.reset(seed=1)
-    ages, out, oldest = [], np.zeros(count, np.bool_), np.zeros(count, np.int64)
-    for _ in range(HEARD + SILENT):
-        *_, info = env.step(pushed)
-        now = (info["cost"] > 0.0) & ~out
-        oldest = np.maximum(oldest, info["measurement_age"])
-        ages += oldest[now].tolist()
-        out |= now
-    return min(ages, default=None)
 
 
 def back(ids: Sequence[str] = ()) -> None:
@@ -200,68 +134,49 @@ def by_ladder(recursion: ErrorRecursion, outage: int, gap: int) -> float:
     return np.inf
 
 
-def attack(ids: Sequence[str] = tuple(ATTACKED), envs: int = 64, steps: int = 150) -> None:
-    """How many promises are broken under attack.
+def attack(ids: Sequence[str] = ATTACKED, envs: int = 64, steps: int = 150) -> None:
+    """How often the box is left sooner than `silence_of` says from any belief that the contract allows.
 
     Samples come as rarely as the contract allows for a while and then no more for a while, again and again, an agent
-    pushes one way and then another, and disturbances are adversarial. Counted are states outside the box within the
-    steps that were promised, and promises that fall by more than one per step. In mode "lookahead" the promise is what
-    is asked for, in the others what `silence_of` says from any belief that the contract allows; each with the
-    certificate's own set and with its ellipsoid alone.
+    pushes one way and then another, and disturbances are adversarial; in every mode that protects, with the
+    certificate's own set and with its ellipsoid alone. "silent" are the steps that were promised though the contract
+    was broken, "left" those of them and of the others in which the state was outside the box.
     """
-    print(f"{'':20} {'':10} {'':>9} {'silent and promised':>21} {'broken promises':>17}")
-    print(f"{'':20} {'set':10} {'steps':>9} {'lookahead':>10} {'others':>10} {'lookahead':>10} {'others':>6}")
-    modes = ("lookahead", "project", "switch", "boundary")
+    modes = ("project", "switch", "boundary", "lookahead")
+    print(f"{'':20} {'set':10} {'steps':>9} {'silent':>9} {'left':>6}")
     for name, env, contract in with_contracts(ids):
         own = certificate_for(env.plant, contract)
         for certificate in [own] if own.polytope is None else [own, own.without_polytope()]:
-            given = f"ncs_gym/{name}-v0", certificate
-            found = [broken_promises(*given, mode, ATTACKED[name], envs, steps) for mode in modes]
-            (broken, kept), *others = found
-            others_broken, others_kept = np.sum(others, axis=0)
+            found = [left_in_silence(f"ncs_gym/{name}-v0", certificate, mode, envs, steps) for mode in modes]
+            silent, left = np.sum(found, axis=0)
             kind = "ellipsoid" if certificate.polytope is None else "polytope"
-            print(
-                f"{name:20} {kind:10} {len(found) * envs * steps:9,} {kept:10,} {others_kept:10,} {broken:10} "
-                f"{others_broken:6}",
-                flush=True,
-            )
+            print(f"{name:20} {kind:10} {len(modes) * envs * steps:9,} {silent:9,} {left:6}", flush=True)
 
 
-def broken_promises(
-    name: str, certificate: Certificate, mode: str, least: int, count: int, steps: int
-) -> tuple[int, int]:
-    """Returns how many promises were broken, and at how many steps one counted though the contract was broken."""
+def left_in_silence(name: str, certificate: Certificate, mode: str, count: int, steps: int) -> tuple[int, int]:
+    """Returns at how many steps a promise counted though the contract was broken, and at how many one was broken."""
     settings: dict[str, Any] = {"disturbance": "adversarial", "terminate_on_violation": False}
     env = gym.make_vec(name, count, channel=rare_then_silent(name), **settings)
-    least = least if mode == "lookahead" else 0
-    shield = VectorSafetyShield(env, certificate, mode=mode, on_unproved="ignore", least_safe_steps=least)
+    shield = VectorSafetyShield(env, certificate, mode=mode, on_unproved="ignore")
     inner = shield.unwrapped
     assert isinstance(inner, NCSVectorEnv)
-    silence, rng = silence_of(certificate, inner.plant), np.random.default_rng(2)
-    assert silence is not None
-    held = np.zeros(count, np.bool_)
-
-    def promise(info: dict[str, Any]) -> np.ndarray:
-        """For how many steps the box is promised; in most modes while what was guaranteed under the contract was."""
-        if mode == "lookahead":
-            return np.asarray(info["shield_safe_steps"])
-        held[:] = np.where(info["contract_broken"], held, info["shield_guaranteed"])
-        return held * np.maximum(silence.max_age + silence.anywhere - info["measurement_age"], 0)
-
+    found, rng = silence_of(certificate, inner.plant), np.random.default_rng(2)
+    assert found is not None
+    held, ended, silent, left = np.zeros(count, np.bool_), np.zeros(count, np.bool_), 0, 0
     _, info = shield.reset(seed=2)
-    promised, broken, kept, ended = promise(info), 0, 0, np.zeros(count, np.bool_)
     for k in range(steps):
         if k % 25 == 0:
             pushed = rng.choice([-1.0, 1.0], shield.action_space.shape).astype(np.float32)
+        held = np.where(info["contract_broken"], held, info["shield_guaranteed"])
+        promised = held & (info["measurement_age"] < found.max_age + found.anywhere)
         *_, terminated, truncated, info = shield.step(pushed)
-        now = promise(info)
-        broken += np.count_nonzero(((promised > 0) & (info["cost"] > 0.0) | (now < promised - 1)) & ~ended)
-        kept += np.count_nonzero((promised > 0) & info["contract_broken"])
-        promised, ended = now, terminated | truncated
-    return int(broken), int(kept)
+        silent += np.count_nonzero(promised & info["contract_broken"])
+        left += np.count_nonzero(promised & (info["cost"] > 0.0) & ~ended)
+        ended = terminated | truncated
+    return int(silent), int(left)
 
 
-COMMANDS = (network, back, ways, attack)
+COMMANDS = (back, ways, attack)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

@@ -1,7 +1,4 @@
-"""What network does a position servo need? Saves the plant for `ncs requirements`, and asks a first question here.
-
-Takes about nine seconds on one core.
-"""
+"""What network does a position servo need? Saves the plant for `ncs requirements`, and asks a first question here."""
 
 import shields
 from ncs_gym import LinearPlant
@@ -20,8 +17,6 @@ servo = LinearPlant.from_statespace(
     state_units=["rad", "rad/s"],
 )
 servo.save("servo.json")
-found = shields.requirements(servo, sampling_periods=[0.005, 0.02], losses=[0, 3, 10])
-for point in found.points:
-    network = point.network
-    share = "none found" if point.certificate is None else f"{point.share:.2f} of the box"
-    print(f"a sample every {network.sampling_period:g} s, {network.losses} lost in a row: {share}")
+for sampled in (servo.resampled(0.005), servo.resampled(0.02)):
+    found = shields.requirements(sampled, ages=[0, 1, 3, 6])
+    print(f"a step of {sampled.dt:g} s: the newest sample may be {found.largest_age()} steps old")

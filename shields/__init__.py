@@ -18,8 +18,6 @@ from shields.verification import Condition, Report, verify
 if TYPE_CHECKING:
     from shields.silence import Silence, silence_of
     from shields.synthesis import (
-        Network,
-        Requirement,
         Requirements,
         certify,
         requirements,
@@ -37,11 +35,9 @@ __all__ = [
     "GuaranteeLostWarning",
     "Infeasible",
     "Multipliers",
-    "Network",
     "Polytope",
     "Proof",
     "Report",
-    "Requirement",
     "Requirements",
     "SafeLoop",
     "SafetyFilter",
@@ -60,10 +56,7 @@ __all__ = [
 
 # Imported at first use: these need the solver.
 _NAMES = {
-    "synthesis": (
-        *("Network", "Requirement", "Requirements"),
-        *("certify", "requirements", "synthesize"),
-    ),
+    "synthesis": ("Requirements", "certify", "requirements", "synthesize"),
     "silence": ("Silence", "silence_of"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}

@@ -18,15 +18,12 @@ def size_of(certificate: Certificate) -> str:
     """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it, as far as known."""
     recorded = certificate.provenance
     unknown, polytope_share = recorded.get("share_of_box_unknown"), recorded.get("polytope_share_of_box")
-    other = _text(
-        recorded.get("share_with_gain_of_ellipsoid"), " ({:.3g} % with the gain of the largest ellipsoid)", 100.0
-    )
     past = _text(
         recorded.get("share_of_last_input"),
         " where past inputs are the operating one, while in the set the last input has {:.3g} % of its range",
         100.0,
     )
-    polytope = "{:.3g} % of the safe box's volume" + past + other + "; the ellipsoid "
+    polytope = "{:.3g} % of the safe box's volume" + past + "; the ellipsoid "
     of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
     at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
     if certificate.polytope is not None and not polytope_share:

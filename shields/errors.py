@@ -44,15 +44,10 @@ class Infeasible(ValueError):
             the fraction, in (0, 1], by which the radii of disturbance and estimation error must shrink; for "S" the
             number of unbounded directions; for "C2" 1 - lambda_min(L)/alpha; where only exact verification failed, the
             violation of that condition.
-        details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii for
-            which there is a certificate; nearly the largest value of each bound that the plant declares for which there
-            is one, changed alone: `largest_gamma`, and as a fraction of the given one `disturbance_bound_factor`,
-            `process_noise_cov_factor` and so on; nearly the smallest factors on the box, on each of its sides, on each
-            input limit and on each limit of states and inputs together, changed alone: `box_factor`,
-            `box_row_1_factor`, `u_max_1_factor`, `mixed_limit_1_factor`; where no change alone is enough,
-            `pair_factor`, that of the two changes in the message; `lost_in_exact_arithmetic`, the violation of a
-            candidate's condition where only exact verification failed; under a channel contract also `max_age`. Method
-            "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`,
+        details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii that a
+            gain was found to bear; `max_age`, the age of samples for which there is a certificate;
+            `lost_in_exact_arithmetic`, the violation of a candidate's condition where only exact verification failed.
+            Method "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`,
             `largest_noise_scale` and `largest_scale`, the largest uncertainty for which OP is feasible.
     """
 

@@ -66,10 +66,10 @@ def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certi
 
 
 @contextmanager
-def feasible_bounds_not_sought() -> Iterator[None]:
+def feasible_age_not_sought() -> Iterator[None]:
     """Where nothing is asked of the message of `Infeasible`: that search takes longer than the synthesis."""
     unchanged = mock.Mock(side_effect=lambda infeasible, *others, **more: infeasible)
-    with mock.patch("shields.synthesis.certification.with_feasible_bounds", unchanged):
+    with mock.patch("shields.synthesis.certification.with_age_that_helps", unchanged):
         yield
 
 

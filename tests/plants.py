@@ -86,3 +86,11 @@ NAMED: dict[str, Callable[[], tuple[LinearPlant, ChannelContract | None]]] = {
 def named(name: str) -> tuple[LinearPlant, ChannelContract | None]:
     """A plant of `NAMED`, and the contract of its certificate."""
     return NAMED[name]()
+
+
+def with_radii(plant: LinearPlant, factor: float) -> LinearPlant:
+    """The plant with the radii of its declared disturbances, sensor noise and first errors multiplied."""
+    names = ("disturbance_bound", "sensor_bound", "initial_bound")
+    given = {name: bound for name in names if (bound := getattr(plant, name)) is not None}
+    scaled = {name: Ellipsoid(factor**2 * bound.shape_matrix) for name, bound in given.items()}
+    return replace(plant, gamma=factor**2 * plant.gamma, **scaled)

@@ -32,7 +32,7 @@ def kinds(mode):
     authors = (NCSEnv,) if mode is None else (NCSEnv, SafetyShield)
     described = [row for author in authors for row in rows(inspect.getdoc(author))]
     listed = {key.strip("`"): kind.strip("`") for key, kind, *_ in described}
-    missing = {"parameters"} | ({"shield_plan_length", "shield_safe_steps"} if mode != "lookahead" else set())
+    missing = {"parameters"} | ({"shield_plan_length"} if mode != "lookahead" else set())
     return {key: kind for key, kind in listed.items() if key not in missing}
 
 

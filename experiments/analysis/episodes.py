@@ -66,7 +66,7 @@ def parquet(table: pd.DataFrame, summary: Mapping[str, Any]) -> bytes:
 
 # Columns of which a run has a sum, and a mean over its episodes.
 _COUNTED = ["steps", "violation_steps", "estimate_violation_steps", "interventions", "planned"]
-_COUNTED += ["proved", "promised", "guaranteed", "violating", "outside_set"]
+_COUNTED += ["proved", "guaranteed", "violating", "outside_set"]
 _AVERAGED = ["episode_return", "violating", "outside_set"]
 
 
@@ -94,8 +94,7 @@ def arm_summary(
     episodes. The bootstrap intervals are over the same values. `eval_episodes_outside_set` counts episodes in which the
     true state left the safe set. `plan_rate` is the share of steps that live from a plan: after whose decision inputs
     of a certified plan are in store (mode "lookahead", 0 in others). `eval_proved_steps` counts steps after which the
-    guarantee held, `eval_promised_steps` those after which the box was promised for a step more at least, whatever the
-    network does. `conditions` holds the same numbers of the evaluation in each other scenario.
+    guarantee held. `conditions` holds the same numbers of the evaluation in each other scenario.
 
     Args:
         episodes: Rows of the arm in what `episodes_table` returns.
@@ -135,7 +134,6 @@ def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
         "eval_violation_steps": total["violation_steps"],
         "eval_estimate_violation_steps": total["estimate_violation_steps"],
         "eval_proved_steps": total["proved"],
-        "eval_promised_steps": total["promised"],
         "eval_violating_episodes": total["violating"],
         "eval_violation_rate": total["violating"] / count,
         "eval_violation_rate_ci95": clopper_pearson(total["violating"], count),

@@ -43,7 +43,7 @@ def channel(settings: ChannelSettings) -> None:
     """Runs `ncs channel`."""
     require_place(settings.out)
     plant = None if settings.plant is None else LinearPlant.load(settings.plant)
-    promise, least = _promise(settings, plant), settings.least_safe_steps
+    promise = _promise(settings, plant)
     step = plant.dt if plant is not None else promise.dt if promise is not None else None
     known = settings.sampling_period or step
     if step is not None and known != step:
@@ -55,7 +55,7 @@ def channel(settings: ChannelSettings) -> None:
     dt = known or log.period
     contract = None if promise is None else promise.contract
     oldest = None if promise is None else promise.oldest
-    asked = () if contract is None else (contract.max_age, contract.max_age + least)
+    asked = () if contract is None else (contract.max_age,)
     asked += () if oldest is None else (oldest,)
     found = _numbers(log, dt, asked)
     print(_text(log, found))
@@ -63,8 +63,6 @@ def channel(settings: ChannelSettings) -> None:
         print(wrapped(_compared(promise, found)))
     if oldest is not None:
         print(wrapped(silences_text(oldest, _row(found, oldest))))
-    if least and contract is not None:
-        print(wrapped(_beyond(contract, least, found)))
     if settings.out is not None:
         write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
 
@@ -197,17 +195,6 @@ def _compared(promise: _Promise, found: dict[str, Any]) -> str:
     return (
         f"{text} Behind a downlink the certificate's own also counts the steps by which inputs are committed ahead, "
         "which --committed-ahead takes off."
-    )
-
-
-def _beyond(contract: Any, least: int, found: dict[str, Any]) -> str:
-    """Returns how often samples were older than contract and promised steps allow together."""
-    oldest = contract.max_age + least
-    return (
-        f"If a shield promises {counted(least, 'step')} (shield_safe_steps) at every step at which the contract is "
-        f"kept, the box is kept at least until the newest sample is {counted(oldest, 'step')} old, "
-        f"{in_time(oldest * found['sampling_period'])}. In the record it was older "
-        f"{how_often(_row(found, oldest))}."
     )
 
 

@@ -57,14 +57,9 @@ def evaluate(settings: EvaluateSettings) -> None:
     elif settings.shield == "as-trained" and agent.is_filtered:
         say("the agent was trained behind a filter that is no shield, which its files do not keep: none is used here")
     require_horizon(settings, mode)
-    least, horizon = settings.least_safe_steps, settings.horizon
-    if settings.shield == "as-trained" and mode == "lookahead" and not least and horizon is None:
-        least = agent.least_safe_steps
-    if mode == "lookahead" and horizon is None and least < (agent.horizon or 0):
-        horizon = agent.horizon
+    horizon = agent.horizon if mode == "lookahead" and settings.horizon is None else settings.horizon
     certificate = certificate_of(loop, settings.certificate or certificate_file(folder))
-    given = {"horizon": horizon, "least_safe_steps": least, "on_unproved": "ignore"}
-    shield = None if mode is None else ShieldSettings(certificate, mode, **given)
+    shield = None if mode is None else ShieldSettings(certificate, mode, horizon=horizon, on_unproved="ignore")
     evaluated = evaluation.evaluate(
         replace(loop, shield=shield),
         lambda observations, infos: agent.act(observations),
@@ -85,7 +80,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     print(summary_text(arms, {}))
     if mode is not None:
         (arm,) = arms.values()
-        print(wrapped(_proof_text(arm, least)))
+        print(wrapped(_proof_text(arm)))
     if settings.out is not None:
         content = {
             "arms": arms,
@@ -93,7 +88,6 @@ def evaluate(settings: EvaluateSettings) -> None:
             "channel": loop.channel and asdict(loop.channel),
             "kwargs": others,
             "horizon": shield and shield.horizon,
-            "least_safe_steps": least,
             "episodes": settings.episodes,
             "seed": settings.seed,
             "model": {
@@ -128,8 +122,6 @@ def _of_zip(settings: EvaluateSettings, env_id: str | None) -> tuple[Agent, Path
     return load_sb3_zip(settings.model, env_id, settings.algorithm, statistics), settings.model
 
 
-def _proof_text(arm: dict[str, Any], least: int) -> str:
-    """Returns after how many steps something was proved; of the box for a while only if the shield was asked for it."""
-    held = f"The guarantee held after {arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}"
-    promised = f"after {arm['eval_promised_steps']:,} the box was promised for one step more at least"
-    return f"{held}; {promised}, whatever the network does." if least else f"{held}."
+def _proof_text(arm: dict[str, Any]) -> str:
+    """Returns after how many steps the guarantee held."""
+    return f"The guarantee held after {arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}."

@@ -27,7 +27,6 @@ def synthesize(settings: SynthesizeSettings) -> None:
                 plant,
                 contract=contract,
                 safe_set=settings.safe_set,
-                search_gain=settings.search_gain,
                 progress=show,
             )
     except SynthesisInterrupted as interrupt:

@@ -1,4 +1,4 @@
-"""Heatmaps: that of a sweep, a panel per arm, and that of `ncs requirements`, where certificates end."""
+"""Heatmaps of a sweep, a panel per arm."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.patches import Rectangle
 
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands
 from experiments.runs.loops import losses_text
@@ -26,13 +25,12 @@ _SIDE_LABELS = {"delay": "delay [steps]", "downlink_loss": "loss of commands"}
 # Letters of a title above an inch of a panel.
 _LETTERS_PER_INCH = 11
 # Largest number of panels side by side.
-_COLUMNS, _COLUMNS_OF_NETWORKS = 4, 3
+_COLUMNS = 4
 # The scale of violating episodes reaches at least this far [%].
 _LEAST_TOP = 10.0
 # Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
 _DARK = 0.45
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_BOUNDARY, _TODAY = "#c1272d", "#ff9800"
 
 
 def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> CaptionedFigure:
@@ -59,40 +57,7 @@ def sweep_map(cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> Captioned
     across = -(-len(arms) // -(-len(arms) // _COLUMNS))
     norm = Normalize(0.0, max(_LEAST_TOP, *(float(np.nanmax(panel)) for panel in panels.values())))
     sides: tuple[_Side, _Side] = (_SIDE_LABELS[side], values), ("loss probability", losses)
-    return _maps(panels, *sides, "violating episodes [%]", "OrRd", norm, across, caption)[0]
-
-
-def requirements_map(
-    panels: Mapping[str, np.ndarray],
-    rows: _Side,
-    columns: _Side,
-    today: tuple[str, int, int] | None,
-    quantity: str = "share of the box [%]",
-) -> CaptionedFigure:
-    """Returns a heatmap per panel, with a line around the fields without a certificate.
-
-    Args:
-        panels: Values by title, each of shape (rows, columns); NaN where no certificate was found.
-        rows: Name and values of the vertical axis.
-        columns: Name and values of the horizontal axis.
-        today: Title of the panel, row and column of the channel that the environment has now; None if it is not there.
-        quantity: What the values are.
-    """
-    largest = max((float(np.nanmax(panel)) for panel in panels.values() if np.isfinite(panel).any()), default=1.0)
-    caption = (
-        f"A field is a network, its number the {quantity}, proved by a certificate. In the empty fields, beyond the "
-        "red line, no certificate was found, which does not prove that there is none."
-    )
-    if today is not None:
-        caption += " The orange frame is the channel of today."
-    across = min(len(panels), _COLUMNS_OF_NETWORKS)
-    figure, axes = _maps(panels, rows, columns, quantity, "YlGnBu", Normalize(0.0, largest), across, caption)
-    for title, axis in axes.items():
-        _draw_boundary(axis, np.isfinite(panels[title]))
-        if today is not None and today[0] == title:
-            corner = (today[2] - 0.5, today[1] - 0.5)
-            axis.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, color=_TODAY, linewidth=3.0, zorder=3))
-    return figure
+    return _maps(panels, *sides, "violating episodes [%]", "OrRd", norm, across, caption)
 
 
 def _maps(
@@ -104,8 +69,8 @@ def _maps(
     norm: Normalize,
     across: int,
     caption: str,
-) -> tuple[CaptionedFigure, dict[str, Axes]]:
-    """Returns a figure with a map per panel, `across` of them side by side, and its axes by title."""
+) -> CaptionedFigure:
+    """Returns a figure with a map per panel, `across` of them side by side."""
     down = -(-len(panels) // across)
     width = 1.8 + max(0.66 * len(columns[1]) + 0.3, 1.9) * across
     letters = int(_LETTERS_PER_INCH * (width - 1.8) / across)
@@ -117,8 +82,7 @@ def _maps(
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         figure = CaptionedFigure((width, height), caption)
         axes = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-        named = dict(zip(panels, axes.flat, strict=False))
-        for at, (title, axis) in enumerate(named.items()):
+        for at, (title, axis) in enumerate(zip(panels, axes.flat, strict=False)):
             _draw_field(axis, panels[title], colors, norm)
             axis.set_xticks(range(len(columns[1])), [_shown(value) for value in columns[1]])
             axis.set_yticks(range(len(rows[1])), [_shown(value) for value in rows[1]])
@@ -129,7 +93,7 @@ def _maps(
         for axis in axes.flat[len(panels) :]:
             axis.set_visible(False)
         figure.colorbar(ScalarMappable(norm, colors), ax=axes, label=fill(quantity, 30), format=thousands)
-        return figure, named
+        return figure
 
 
 def _draw_field(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
@@ -141,14 +105,6 @@ def _draw_field(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) ->
             dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ _LUMINANCE < _DARK
             text = f"{value:z.{digits}f}".replace("-", "\N{MINUS SIGN}") if value else "0"
             axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
-
-
-def _draw_boundary(axis: Axes, possible: np.ndarray) -> None:
-    for i, j in zip(*np.nonzero(np.diff(possible, axis=1)), strict=True):
-        axis.plot([j + 0.5] * 2, [i - 0.5, i + 0.5], color=_BOUNDARY, linewidth=2.0)
-    for i, j in zip(*np.nonzero(np.diff(possible, axis=0)), strict=True):
-        axis.plot([j - 0.5, j + 0.5], [i + 0.5] * 2, color=_BOUNDARY, linewidth=2.0)
-    axis.set(xlim=(-0.5, possible.shape[1] - 0.5), ylim=(-0.5, possible.shape[0] - 0.5))
 
 
 def _other(cell: dict[str, Any], side: str) -> _Other:

@@ -121,16 +121,11 @@ def require_limits(settings: Any, **limits: float | tuple[float, float]) -> None
 
 
 def require_horizon(settings: Any, *modes: str | None) -> None:
-    """Raises unless horizon and least safe steps, if there are any, are in range and for one of these modes or arms.
+    """Raises unless a horizon, if there is one, is in range and for one of these modes or arms.
 
     Raises:
         ValueError: If it does not.
     """
-    require_limits(settings, horizon=(1, LONGEST_HORIZON), least_safe_steps=(0, LONGEST_HORIZON - 1))
-    horizon, least = settings.horizon, getattr(settings, "least_safe_steps", 0)
-    given = {"--horizon": horizon, "--least-safe-steps": least or None}
-    for name, value in given.items():
-        if value is not None and not any("lookahead" in (mode or "") for mode in modes):
-            raise ValueError(f"{name} {value} is for mode lookahead, which is not asked for")
-    if horizon is not None and horizon <= least:
-        raise ValueError(f"--least-safe-steps {least} takes plans of {least + 1} steps, got --horizon {horizon}")
+    require_limits(settings, horizon=(1, LONGEST_HORIZON))
+    if settings.horizon is not None and not any("lookahead" in (mode or "") for mode in modes):
+        raise ValueError(f"--horizon {settings.horizon} is for mode lookahead, which is not asked for")

@@ -10,9 +10,7 @@ from typing import Literal
 import tyro
 
 from experiments.settings.arguments import StepCount, require_horizon, require_limits
-from experiments.settings.learning import BackendSettings
 from ncs_gym import ChannelContract
-from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +23,6 @@ class SynthesizeSettings:
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
             keeps in the safe box, which leaves the policy more room. By default the polytope.
-        search_gain: Seek the gain whose polytope is the largest, instead of keeping that of the largest ellipsoid. This
-            takes about as long again, longer for polytopes of many rows, and keeps the polytope alone.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
             own; 1 for the sampling instants alone (docs/shield.md).
         out: File for the certificate (JSON).
@@ -40,7 +36,6 @@ class SynthesizeSettings:
     env: str | None = None
     plant: Path | None = None
     safe_set: Literal["polytope", "ellipsoid"] | None = None
-    search_gain: bool = False
     between_samples: int | None = None
     out: Path = Path("certificate.json")
     max_age: int | None = None
@@ -173,61 +168,32 @@ class ReproduceSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RequirementsSettings(BackendSettings):
-    """Finds which networks leave a plant certifiable: how slow, late, lossy and coarse the network may be.
+class RequirementsSettings:
+    """Finds under which contracts of the network a plant is certifiable: how old and how coarse its samples may be.
 
-    Every combination of the values below is a network. Prints what share of the safe box a certificate keeps, - where
-    none was found (which does not prove that there is none), and the cheapest network that keeps enough; leaves
-    summary.json with every network's packets and bits per second, the certificates, and a figure. Started again with
-    the same folder, finished searches are kept.
+    Prints what share of the safe box a certificate keeps, - where none was found (which does not prove that there is
+    none).
 
     Attributes:
         env: Id of an environment with a plant of its own, or module:id, which first imports the module. By default
             ncs_gym/CartPole-v0.
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
-        out: Output folder; created if it does not exist.
-        sampling_periods: Durations of a control step [s]; others than the plant's for one with a model in continuous
-            time.
-        send_periods: Steps between samples.
-        losses: Most packets lost in a row; "any" for no limit, which only stable plants can bear.
-        delays: Fixed delays of a sample [steps].
-        jitters: Largest further delays [steps].
-        input_delays: Steps from a decision until its input takes effect, as behind a network to the actuator, by which
-            the newest sample must be less old.
-        quantization_steps: Steps of the quantizer, in the units of the measurements; 0 for none.
-        disturbances: Factors on the radii of the disturbances.
-        noises: Factors on the radii of sensor noise and first errors.
-        tolerance: Also seek the factor by which all radii may grow in each network.
-        keep: Percentage of the largest share that the cheapest network is to keep.
-        log: Record of packets, as `ncs channel` reads it: also says how often its newest sample was older than
-            certificates allow.
-        force: Replace finished results of other settings in the output folder, which otherwise is refused.
+        ages: Largest ages of the newest sample when an input takes effect [steps]; by default up to 32, and the
+            environment's.
+        resolutions: Quantization steps, in the units of the measurements, 0 for none; by default the environment's.
+        out: File for the table with its certificates (JSON).
         seed: Not used, since the search is deterministic; every command takes it.
     """
 
     env: str | None = None
     plant: Path | None = None
-    out: Path = Path("runs/requirements")
-    sampling_periods: tuple[float, ...] = ()
-    send_periods: tuple[int, ...] = ()
-    losses: tuple[int | Literal["any"], ...] = ()
-    delays: tuple[int, ...] = ()
-    jitters: tuple[int, ...] = ()
-    input_delays: tuple[int, ...] = ()
-    quantization_steps: tuple[float, ...] = ()
-    disturbances: tuple[float, ...] = (1.0,)
-    noises: tuple[float, ...] = (1.0,)
-    tolerance: bool = False
-    keep: float = 90.0
-    log: Path | None = None
-    force: bool = False
+    ages: tuple[int, ...] = ()
+    resolutions: tuple[float, ...] = ()
+    out: Path | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
-        BackendSettings.__post_init__(self)
         _refuse_both(self.env, self.plant)
-        if not 0.0 < self.keep <= 100.0:
-            raise ValueError(f"--keep must be a percentage above 0 and at most 100, got {self.keep:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,8 +210,6 @@ class ChannelSettings:
         plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
         committed_ahead: Steps by which inputs are committed ahead behind a downlink, of --certificate, whose contract
             counts them, too: samples may be so many steps less old (docs/contracts.md).
-        least_safe_steps: Steps that a shield of it in mode "lookahead" promises while the contract is kept: the command
-            counts longer silences. Whether it promises them is to be seen in `info["shield_safe_steps"]`.
         out: File for the numbers (JSON).
     """
 
@@ -255,17 +219,14 @@ class ChannelSettings:
     certificate: Path | None = None
     plant: Path | None = None
     committed_ahead: int = 0
-    least_safe_steps: int = 0
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_limits(self, least_safe_steps=(0, LONGEST_HORIZON - 1), committed_ahead=0)
+        require_limits(self, committed_ahead=0)
         if self.committed_ahead and self.certificate is None:
             raise ValueError("--committed-ahead is of --certificate: an environment knows its own")
         if (self.certificate and not self.plant) or (self.env and self.plant):
             raise ValueError("give --certificate and --plant, or --env, whose contract and certificate are known")
-        if self.least_safe_steps and self.env is None and self.certificate is None:
-            raise ValueError("--least-safe-steps are those of a shield of --env, or of --certificate: give one")
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")

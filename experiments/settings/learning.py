@@ -214,8 +214,6 @@ class EvaluateSettings:
         shield: Mode of the shield, by default that of the agent's training, which a zip does not tell: none then;
             "none" for no shield; "monitor" changes nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does, by default
-            those of the agent's training, with its mode and horizon; without --horizon plans become long enough.
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
@@ -234,7 +232,6 @@ class EvaluateSettings:
     trust: bool = False
     shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
     horizon: int | None = None
-    least_safe_steps: int = 0
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None

@@ -41,8 +41,6 @@ EXPLANATIONS = (
     OTHER_EPISODE, OUTSIDE_BOUND,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
-# Follows an explanation where `safe_steps` are left.
-KEPT_FOR_NOW = "; the box is kept for as many steps as shield_safe_steps says"
 ON_UNPROVED = ("ignore", "warn", "raise")
 
 
@@ -119,7 +117,7 @@ class GuaranteeMonitor:
         self._input_delay = downlink.input_delay
         self._within_step = plant.grid_rows is not None or len(plant.mixed_rows) > 0
         self._is_promised = downlink.contract is not None
-        self._test, self._least = safety_filter.test, safety_filter.least_safe_steps
+        self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * plant.half_widths / (2.0 if self._input_delay else 1.0)
         # Of the newest sample at present, while the contract of the certificate holds.
@@ -211,23 +209,6 @@ class GuaranteeMonitor:
         reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
         return _first(reason, is_large, LARGE_ERROR)
 
-    def safe_steps(self, state: MonitorState, stored: Any) -> Any:
-        """Returns for how many steps the box is kept whatever the network does, at most as many as are asked for.
-
-        Behind a downlink they are counted from the step at which the next input takes effect. No contract of the
-        samples is assumed, only the bounds and that what is decided is applied. It is 0 once that is `broken`, and
-        while the present state, or the way to it, is not proved to be in the box.
-
-        Args:
-            state: The present one.
-            stored: Number of inputs stored for the steps to come, shape () or (N,).
-        """
-        return (
-            np.minimum(stored, self._least)
-            * ((state.broken == 0) & (state.wait == 0) & state.inside)
-            * self._is_promised
-        )
-
     def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
         if not self._under_way:
             return broken
@@ -317,7 +298,7 @@ class LostGuarantee:
     def tell_of(self, reason: str) -> None:
         """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
         if reason:
-            self.note(CODES[reason.removesuffix(KEPT_FOR_NOW)])
+            self.note(CODES[reason])
             self.tell()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.network import CommittedInputs, DownlinkProtocol
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import EXPLANATIONS, KEPT_FOR_NOW, GuaranteeMonitor, LoopObservation, MonitorState
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState
 from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
 from shields.runtime.starts import StartKnown, first_store, known_inside
 
@@ -113,12 +113,6 @@ class MonitoredFilter:
         return len(self._stored)
 
     @property
-    def safe_steps(self) -> int:
-        """Number of steps for which the box is kept whatever the network does (`GuaranteeMonitor.safe_steps`)."""
-        return int(self._monitor.safe_steps(self._state, len(self._stored)))
-
-    @property
     def reason(self) -> str:
-        """Why the state is not proved safe now, and whether the box is kept for some steps; empty while it is."""
-        reason = EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]
-        return reason + KEPT_FOR_NOW if reason and self.safe_steps else reason
+        """Why the state is not proved safe now; empty while it is."""
+        return EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]

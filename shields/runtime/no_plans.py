@@ -15,11 +15,10 @@ class NoPlans:
 
     Attributes:
         horizon: Longest plan, 0 steps.
-        least: Number of steps for which the box is to be kept whatever the network does, 0.
         needs_shapes: Whether plans need the error shapes themselves.
     """
 
-    horizon, least, needs_shapes = 0, 0, False
+    horizon, needs_shapes = 0, False
 
     def __init__(self, m: int) -> None:
         self._m = m

@@ -110,8 +110,6 @@ class SafeLoop(CopiedWhole):
         on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
             "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" if you read `guaranteed`.
             When one is raised, the call has come to its end: go on with `decide`.
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; see
-            `SafetyFilter`.
 
     Attributes:
         filter: Makes the decisions.
@@ -143,9 +141,8 @@ class SafeLoop(CopiedWhole):
         downlink_contract: ChannelContract | None = None,
         on_unproved: str = "warn",
         echo_age: int | None = None,
-        least_safe_steps: int = 0,
     ) -> None:
-        self._filter = SafetyFilter(certificate, plant, mode, horizon, least_safe_steps)
+        self._filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self._lost = LostGuarantee(on_unproved)
@@ -182,7 +179,6 @@ class SafeLoop(CopiedWhole):
             age += ", older than the contract allows"
         proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
         proved += "" if self._echo_age is not None else ", if everything that is decided is applied"
-        least = self._filter.least_safe_steps
         is_started, delay = self._phase is not _Phase.STOPPED, counted(self._input_delay, "step")
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
@@ -191,7 +187,6 @@ class SafeLoop(CopiedWhole):
             ("downlink", f"inputs take effect {delay} after the decision" if self._input_delay else ""),
             ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
             ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),
-            ("in silence", f"the box is kept for {counted(self.safe_steps, 'step')} at least" if least else ""),
         ]
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
@@ -401,18 +396,6 @@ class SafeLoop(CopiedWhole):
     def plan_length(self) -> int:
         """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
         return 0 if self._phase is _Phase.STOPPED else self._monitored.plan_length
-
-    @property
-    def safe_steps(self) -> int:
-        """Number of steps for which the box is kept whatever the network does; 0 in other modes than "lookahead".
-
-        At most `least_safe_steps`. It falls by at most one per step, unless a measurement contradicts the bounds or
-        another input than the decided one is applied; then it is 0. It takes for granted that what is decided is
-        applied, also where no echo has confirmed that for long.
-        """
-        unknown = self._phase is _Phase.STOPPED or self._unknown is not None
-        unknown = unknown or self._applied.is_other or self._contradicted
-        return 0 if unknown else self._monitored.safe_steps
 
     @property
     def estimate(self) -> np.ndarray:

@@ -56,11 +56,7 @@ class SafetyFilter(ReadOnlyArrays):
             proposed and says whether "switch" would have; it protects nothing. "lookahead" lets an input pass after
             which a certified plan keeps the state in the box until it is in S, and stores that plan
             (docs/lookahead.md).
-        horizon: Longest plan of mode "lookahead", in steps; None is 6, or more if `least_safe_steps` takes more. Other
-            modes take none.
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; 0 asks for
-            none. An input passes if it begins a certified plan that leaves as many inputs stored; where no such plan is
-            found, the longest is followed (docs/lookahead.md, "When the network goes silent"). Other modes take none.
+        horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
 
     Attributes:
         test: The test of an input.
@@ -69,15 +65,13 @@ class SafetyFilter(ReadOnlyArrays):
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
         ValueError: If the mode is unknown, or "boundary" for more than twelve inputs, or the horizon is no whole number
-            from 1 to 50, or `least_safe_steps` none from 0 to one less than the horizon, or either is given for another
-            mode than "lookahead".
+            from 1 to 50, or it is given for another mode than "lookahead".
     """
 
     certificate: Certificate
     plant: LinearPlant
     mode: str = "project"
     horizon: int | None = None
-    least_safe_steps: int = 0
     test: SetTest = field(init=False, repr=False)
     lookahead: Lookahead | NoPlans = field(init=False, repr=False)
     _no_plan: np.ndarray = field(init=False, repr=False)
@@ -87,7 +81,7 @@ class SafetyFilter(ReadOnlyArrays):
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        horizon, least = plan_horizon(self.mode, self.horizon, self.least_safe_steps), int(self.least_safe_steps)
+        horizon = plan_horizon(self.mode, self.horizon)
         if not isinstance(self.certificate, Certificate) or not isinstance(self.plant, LinearPlant):
             kinds = f"{type(self.certificate).__name__} and {type(self.plant).__name__}"
             raise ValueError(
@@ -105,12 +99,11 @@ class SafetyFilter(ReadOnlyArrays):
             object.__setattr__(self, name, read_only(each[:, None]))
         object.__setattr__(self, "_remembered", {})
         object.__setattr__(self, "horizon", horizon)
-        object.__setattr__(self, "least_safe_steps", least)
         object.__setattr__(self, "lookahead", NoPlans(self.plant.m))
         if horizon is not None:
             from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
 
-            object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, least, MARGIN))
+            object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, MARGIN))
 
     @cached_property
     def _single(self) -> tuple[tuple[int], tuple[int]]:
@@ -170,7 +163,7 @@ class SafetyFilter(ReadOnlyArrays):
             if not low <= u <= high:  # neither NaN
                 return None
         test_margin, margin = self.test.margins_alone(estimate, errors, proposed)
-        if test_margin >= MARGIN and not self.least_safe_steps:
+        if test_margin >= MARGIN:
             return Decision(proposed, False, True, False, margin, REASONS[SAFE], self._no_plan)
         if isnan(test_margin):
             return None
@@ -370,26 +363,20 @@ class SafetyFilter(ReadOnlyArrays):
         return expressible(inputs.T, self.plant).T
 
 
-def plan_horizon(mode: str, horizon: int | None, least_safe_steps: int) -> int | None:
+def plan_horizon(mode: str, horizon: int | None) -> int | None:
     """Returns the length of the longest plans of a mode [steps]; None for those that plan nothing.
 
     Raises:
-        ValueError: If there is no such mode, or either number is given for one that plans nothing, or is no whole
-            number in its range, or plans of the horizon are too short for so many safe steps.
+        ValueError: If there is no such mode, or a horizon is given for one that plans nothing, or is no whole number in
+            its range.
     """
     if not (isinstance(mode, str) and mode in MODES):
         raise ValueError(f"mode must be one of {list(MODES)}, got {shown(mode)}")
-    least = as_count(least_safe_steps, "least_safe_steps", low=0, high=LONGEST_HORIZON - 1)
     if mode != "lookahead":
-        for name, given in {"horizon": horizon, "least_safe_steps": least or None}.items():
-            if given is not None:
-                raise ValueError(f'{name} is for mode "lookahead", mode {mode!r} takes none')
+        if horizon is not None:
+            raise ValueError(f'horizon is for mode "lookahead", mode {mode!r} takes none')
         return None
-    given = max(DEFAULT_HORIZON, least + 1) if horizon is None else horizon
-    longest = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
-    if longest <= least:
-        raise ValueError(f"least_safe_steps = {least} takes plans of {least + 1} steps, got horizon = {longest}")
-    return longest
+    return as_count(DEFAULT_HORIZON if horizon is None else horizon, "horizon", low=1, high=LONGEST_HORIZON)
 
 
 def _as_array(value: Any) -> np.ndarray:

@@ -158,11 +158,11 @@ def first_store(
     """
     lookahead = safety_filter.lookahead
     inside = known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN)
-    if inside and not lookahead.least:
+    if inside:
         return np.empty((0, safety_filter.plant.m)), known.in_safe_set
     plan = safety_filter.first_plan(estimate, errors)
     in_box = len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))
-    return plan, known.in_safe_set or in_box
+    return plan, in_box
 
 
 def _moved(plant: LinearPlant, center: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,6 @@ from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
     CODES,
     EXPLANATIONS,
-    KEPT_FOR_NOW,
     OTHER_STEPS,
     GuaranteeMonitor,
     LoopObservation,
@@ -32,8 +31,8 @@ from shields.runtime.set_test import norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 from shields.runtime.wrapper import BaseShield
 
-# Why states are not proved safe: without steps for which the box is kept all the same, and with some.
-REASONS = np.array([EXPLANATIONS, [each and each + KEPT_FOR_NOW for each in EXPLANATIONS]], dtype=object)
+# Why states are not proved safe, by code.
+REASONS = np.array(EXPLANATIONS, dtype=object)
 
 
 class Clock(NamedTuple):
@@ -79,9 +78,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         penalty: float = 0.0,
         horizon: int | None = None,
         on_unproved: str = "warn",
-        least_safe_steps: int = 0,
     ) -> None:
-        self._make(env, certificate, mode, penalty, horizon, least_safe_steps, on_unproved)
+        self._make(env, certificate, mode, penalty, horizon, on_unproved)
         inner = self._inner
         self._look_at({*inner.episode_channels})
         self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
@@ -301,18 +299,16 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         doubted = np.count_nonzero(reasons) > 0
         if doubted:
             self._lost.note(reasons, np.arange(self.num_envs) if chosen is None else chosen)
-        ahead, kept = {}, 0
+        ahead = {}
         if len(self._stored):
-            stored = ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)
-            safe_steps = ahead["shield_safe_steps"] = self._monitor.safe_steps(state, stored)
-            kept = (safe_steps > 0).astype(np.intp)
+            ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)
         return ahead | {
             "shield_intervened": decided.intervened,
             "input_proposed": proposed.T,
             "shield_correction": norms(decided.input - proposed),
             "shield_margin": decided.margin,
             "shield_guaranteed": reasons == 0,
-            "shield_reason": REASONS[kept, reasons] if doubted else self._no_reason[: len(reasons)],
+            "shield_reason": REASONS[reasons] if doubted else self._no_reason[: len(reasons)],
             "episode_interventions": interventions.copy(),
         }
 

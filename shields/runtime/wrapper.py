@@ -47,7 +47,6 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
     filter: SafetyFilter = setting("filter")
     mode: str = setting("mode", "_filter.mode")
     horizon: int | None = setting("horizon", "_filter.horizon")
-    least_safe_steps: int = setting("least_safe_steps", "_filter.least_safe_steps")
     on_unproved: str = setting("on_unproved", "_lost.on_unproved")
     channel: Channel = channel_setting("channel", "_inner.channel")
 
@@ -68,7 +67,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
     env: Any
 
     def _make(
-        self, env: Any, certificate: Any, mode: str, penalty: float, horizon: int | None, least: int, on_unproved: str
+        self, env: Any, certificate: Any, mode: str, penalty: float, horizon: int | None, on_unproved: str
     ) -> None:
         """Records the settings, and makes the filter for the environment inside."""
         if isinstance(certificate, os.PathLike):
@@ -77,8 +76,8 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
             wanted = "a Certificate, its document or path, or None"
             raise ValueError(f"certificate must be {wanted}, got {shown(certificate)}")
         recorded = certificate.document if isinstance(certificate, Certificate) else certificate
-        plan_horizon(mode, horizon, least)
-        given = {"mode": mode, "penalty": penalty, "on_unproved": on_unproved, "least_safe_steps": int(least)}
+        plan_horizon(mode, horizon)
+        given = {"mode": mode, "penalty": penalty, "on_unproved": on_unproved}
         given["horizon"] = None if horizon is None else int(horizon)  # a spec is JSON
         RecordConstructorArgs.__init__(self, certificate=recorded, **given)
         read = None if certificate is None else Certificate.read(certificate)
@@ -90,7 +89,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
         self._wrappers.__init__(self, env)
         self._lost = LostGuarantee(on_unproved, getattr(inner, "num_envs", 1))
         self._certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
-        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon, least)
+        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._input_delay = inner.downlink_protocol.input_delay
         self._channels: set[Channel] = set()
         self._made_for = self._premises(inner)
@@ -197,11 +196,9 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
     | `episode_interventions` | int | steps | number of steps of this episode with `shield_intervened` |
     | `episode_guaranteed` | float | - | share of the states of this episode, the first included, proved as now |
     | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
-    | `shield_safe_steps` | int | steps | in mode "lookahead" only: the box is kept so long, whatever the network does |
 
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
     is in S; `shield_guaranteed` then says whether the state is proved to be in the box now and to stay there.
-    `shield_safe_steps`, at most `least_safe_steps`, needs no contract and falls by at most one per step.
 
     Where the plant models another process, that is proved of the process only if `plant.remainder.proved`; otherwise it
     rests on the assumption that sampling found the largest remainder (docs/beyond_linear.md).
@@ -216,8 +213,6 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         on_unproved: What reset and step do, once per episode and reason, where x in S is not proved: "warn" with a
             `GuaranteeLostWarning`, "raise" a `GuaranteeLostError` after the step, "ignore" if you read the infos.
-        least_safe_steps: Steps for which mode "lookahead" seeks to keep the box whatever the network does; see
-            `SafetyFilter`.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -237,9 +232,8 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         penalty: float = 0.0,
         horizon: int | None = None,
         on_unproved: str = "warn",
-        least_safe_steps: int = 0,
     ) -> None:
-        self._make(env, certificate, mode, penalty, horizon, least_safe_steps, on_unproved)
+        self._make(env, certificate, mode, penalty, horizon, on_unproved)
         self._look_at({self._inner.channel})
         self._monitored = MonitoredFilter(self._filter, self._inner.downlink_protocol)
         self._episode = _Episode()
@@ -328,7 +322,6 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         ahead = {}
         if self._filter.mode == "lookahead":
             ahead["shield_plan_length"] = self._monitored.plan_length
-            ahead["shield_safe_steps"] = self._monitored.safe_steps
         return ahead | {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),

@@ -3,17 +3,14 @@
 `synthesize` looks for the largest certified set: the design problem is scaled, an initial design is found for fixed
 multipliers or from a gain of largest margin, alternation between the linear matrix inequalities and the multipliers
 enlarges the set, and the result is verified exactly. `certify` proves a given set and gain, and `requirements` says
-which networks leave a plant certifiable. Importing this package imports the solver.
+which contracts leave a plant certifiable. Importing this package imports the solver.
 """
 
 from shields.synthesis.certification import synthesize
 from shields.synthesis.ellipsoid_certificates import certify
-from shields.synthesis.network_requirements import Network, Requirement, Requirements
-from shields.synthesis.requirement_search import requirements
+from shields.synthesis.network_requirements import Requirements, requirements
 
 __all__ = [
-    "Network",
-    "Requirement",
     "Requirements",
     "certify",
     "requirements",

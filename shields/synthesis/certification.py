@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.validation import as_flag, as_vector, own_error_state, shown
+from ncs_gym.validation import as_vector, own_error_state, shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.design_problem import Rest, design_problem
-from shields.synthesis.diagnosis import Clock, infeasibility, is_feasible, with_feasible_bounds
+from shields.synthesis.diagnosis import Clock, infeasibility, is_feasible, with_age_that_helps
 from shields.synthesis.ellipsoid_certificates import LOST, Progress, certify, largest_ellipsoid, nearby_ellipsoid
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
@@ -23,14 +23,13 @@ from shields.synthesis.polytope_certificates import (
     fallbacks_around,
     most_tolerant_polytope,
     polytope_share,
-    with_largest_polytope,
     with_polytope,
 )
 from shields.synthesis.resting_point import needs_resting_point, resting_at
 from shields.verification import verify
 
 # A refusal should take so long at most [s], of its thread's own time: searches after the first for a polytope, and then
-# for changes that would help, begin no later than so much earlier. One that is under way goes on: where polytopes have
+# for an age that would help, begin no later than so much earlier. One that is under way goes on: where polytopes have
 # very many rows, a refusal has been seen to take 82 s.
 LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # Alternations of a search that begins near the design of a similar problem.
@@ -46,7 +45,6 @@ def synthesize(
     *,
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
-    search_gain: bool = False,
     resting_state: ArrayLike | None = None,
     progress: Progress | None = None,
     candidates: Sequence[Certificate] = (),
@@ -63,8 +61,6 @@ def synthesize(
         safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
             time the ellipsoid stays, and the printed certificate says why. None is "polytope".
-        search_gain: Also seek the gain whose polytope is the largest, which takes about as long again, longer for
-            polytopes of many rows. That gain keeps the polytope alone.
         resting_state: Equilibrium around which the fallback works, shape (n,) [deviations from the operating point],
             for a polytope; by default the operating point where limits are symmetric about it, else one that leaves
             much of the box.
@@ -86,9 +82,6 @@ def synthesize(
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
     if not all(isinstance(each, Certificate) for each in candidates):
         raise ValueError("candidates must be certificates")
-    as_flag(search_gain, "search_gain")
-    if safe_set == "ellipsoid" and search_gain:
-        raise ValueError("search_gain is for polytopes: the search for an ellipsoid finds its gain")
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
@@ -104,7 +97,7 @@ def synthesize(
             )
         rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
         try:
-            return around_resting_point(plant, contract, report, known, clock, rest, search_gain=search_gain)
+            return around_resting_point(plant, contract, report, known, clock, rest)
         except Infeasible as infeasible:
             if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
                 raise Infeasible(
@@ -118,8 +111,7 @@ def synthesize(
     largest, *others = _certificates(plant, contract, report, known, clock, polytope=safe_set != "ellipsoid")
     if safe_set == "ellipsoid":
         return largest
-    found = (with_largest_polytope if search_gain else with_polytope)(largest, plant, report)
-    return max([found, *(with_polytope(each, plant, report) for each in others)], key=polytope_share)
+    return max((with_polytope(each, plant, report) for each in (largest, *others)), key=polytope_share)
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -153,7 +145,6 @@ def nearby_certificate(
     plant: LinearPlant,
     contract: ChannelContract | None,
     start: Certificate | None = None,
-    alternations: int = _FEW_ALTERNATIONS,
     *,
     polytope: bool = True,
     progress: Progress = lambda line: None,
@@ -164,14 +155,13 @@ def nearby_certificate(
         plant: The plant with its bounds.
         contract: Channel contract; None for none.
         start: Certificate of a similar problem with as many states and inputs, which the search begins near.
-        alternations: How often the set is enlarged at most.
         polytope: Whether a polytope is sought where no ellipsoid is found.
         progress: Called with a line of text now and then.
     """
     if needs_resting_point(plant):
-        return _nearby_around(plant, contract, start, alternations, progress)
+        return _nearby_around(plant, contract, start, progress)
     try:
-        certificate = nearby_ellipsoid(plant, contract, start, alternations, progress)
+        certificate = nearby_ellipsoid(plant, contract, start, _FEW_ALTERNATIONS, progress)
     except Infeasible:
         certificate = None
     carried = None if certificate or start is None else carried_over(start, plant, contract)
@@ -182,13 +172,10 @@ def _nearby_around(
     plant: LinearPlant,
     contract: ChannelContract | None,
     start: Certificate | None,
-    alternations: int,
     progress: Progress,
 ) -> Certificate | None:
     """Returns what `nearby_certificate` does, of a polytope around a resting point."""
     carried = None if start is None else carried_over(start, plant, contract)
-    if carried is not None and not alternations:
-        return carried
     try:
         for each in fallbacks_around(plant, contract, progress, quick=True):
             found = certify_polytope(plant, each.K, contract, progress, each.rest)
@@ -241,7 +228,7 @@ def _second_search(
     if polytope and LOST in infeasible.details:
         progress("no ellipsoid holds in exact arithmetic: seeking a polytope")
         try:
-            return around_resting_point(plant, contract, progress, (), clock, search_gain=False)
+            return around_resting_point(plant, contract, progress, (), clock)
         except Infeasible:
             raise infeasible from None
     was_sought = "share_of_radii" in infeasible.details
@@ -277,7 +264,7 @@ def _with_hints(
     *,
     polytope: bool,
 ) -> Infeasible:
-    """Returns the exception with the changes that would help, where no ellipsoid was found.
+    """Returns the exception with an age that would help, where no ellipsoid was found.
 
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
@@ -298,18 +285,16 @@ def _with_changes(
     *,
     polytope: bool,
 ) -> Infeasible:
-    """Returns the exception with single changes that have a certificate.
+    """Returns the exception with an age of samples that has a certificate.
 
     Raises:
         SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
     """
 
-    def certifies(changed: LinearPlant, promised: ChannelContract | None, within: Clock) -> bool:
-        return nearby_certificate(changed, promised, polytope=polytope, progress=within.check) is not None
+    def certifies(promised: ChannelContract) -> bool:
+        return nearby_certificate(plant, promised, polytope=polytope, progress=clock.check) is not None
 
     try:
-        return with_feasible_bounds(
-            infeasible, plant, contract, progress, polytope=polytope, certifies=certifies, clock=clock
-        )
+        return with_age_that_helps(infeasible, plant, contract, certifies, clock, progress, polytope=polytope)
     except KeyboardInterrupt as interrupt:
-        raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt
+        raise SynthesisInterrupted(f"interrupted while feasible ages were sought: {infeasible}") from interrupt

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,6 @@ from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
 from shields.synthesis.polytope_gain import ellipsoid_margin
-from shields.synthesis.round_numbers import in_round_numbers
 from shields.verification import Report, verify
 
 # Called with a line of text: the stage, and the volume reached so far.
@@ -92,16 +91,16 @@ def largest_ellipsoid(
             found = largest_set(problem, slack, report)
             if found is None:
                 break
-            for design in _finished(problem, found, slack):
-                report("exact verification", design)
-                certificate = certificate_of(plant, problem, design, errors, slack)
-                box_rows = _tightened_box(certificate, plant, tightened)
-                if box_rows is not None:
-                    return largest_ellipsoid(plant, contract, progress, (*tightened, box_rows))
-                verification = verify(certificate, plant)
-                if verification.valid:
-                    return _with_tolerated_scale(certificate, problem)
-                failure = _failed_verification(verification)
+            design = with_best_gain(problem, found)
+            report("exact verification", design)
+            certificate = certificate_of(plant, problem, design, errors, slack)
+            box_rows = _tightened_box(certificate, plant, tightened)
+            if box_rows is not None:
+                return largest_ellipsoid(plant, contract, progress, (*tightened, box_rows))
+            verification = verify(certificate, plant)
+            if verification.valid:
+                return _with_tolerated_scale(certificate, problem)
+            failure = _failed_verification(verification)
     except KeyboardInterrupt as interrupt:
         stage, design = reached
         best = design and certificate_of(plant, problem, with_best_gain(problem, design), errors, slack)
@@ -196,14 +195,6 @@ def _leaves_between_samples(shortfall: float) -> Infeasible:
         "B",
         shortfall,
     )
-
-
-def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> Iterator[CandidateDesign]:
-    """Yields a design of the search in round numbers, if there is one, and then with the gain of most slack."""
-    rounded = in_round_numbers(problem, found, slack)
-    if rounded is not None:
-        yield rounded
-    yield with_best_gain(problem, found)
 
 
 def progress_text(stage: str, design: CandidateDesign | None) -> str:

@@ -39,7 +39,7 @@ from shields.synthesis.invariant_polytope import (
     share_of_points,
 )
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.polytope_gain import gains_of_larger_polytopes, most_tolerant_gain, needs_of, regulators
+from shields.synthesis.polytope_gain import most_tolerant_gain, needs_of, regulators
 from shields.synthesis.resting_point import (
     Farthest,
     at_operating_point,
@@ -59,8 +59,6 @@ _POINTS_OF_REST_LOG2 = 12
 _OF_REST = 1e-14
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
 _NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
-# What a certificate records that does not depend on its gain.
-_OF_THE_PLANT = ("tolerated_scale",)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -90,38 +88,6 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
         raise SynthesisInterrupted(message, certificate) from interrupt
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
-
-
-def with_largest_polytope(
-    certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None
-) -> Certificate:
-    """Returns what `with_polytope` does, with the gain whose polytope is the largest that a search finds.
-
-    Another gain than the certificate's keeps the polytope alone; what the certificate's own would have kept is in the
-    provenance.
-
-    Args:
-        certificate: A verified one.
-        plant: Its plant.
-        progress: Called with a line of text now and then.
-
-    Raises:
-        SynthesisInterrupted: A KeyboardInterrupt with the certificate, and its own gain's polytope if that was found.
-    """
-    own = with_polytope(certificate, plant, progress)
-    try:
-        for K in gains_of_larger_polytopes(feedback_of(certificate), plant, progress):
-            found = certify_polytope(plant, K, certificate.contract, progress)
-            if found is not None and polytope_share(found) > polytope_share(own):
-                kept = {name: certificate.provenance[name] for name in _OF_THE_PLANT if name in certificate.provenance}
-                gained = {"share_with_gain_of_ellipsoid": polytope_share(own)} if own.keeps_ellipsoid else {}
-                return replace(found, provenance=found.provenance | kept | gained)
-    except KeyboardInterrupt as interrupt:
-        message = "interrupted while a gain with a larger polytope was sought; the certificate has the first gain's"
-        raise SynthesisInterrupted(message, own) from interrupt
-    except (ArithmeticError, ValueError, CertificateError):  # a gain whose numbers are out of reach of float64
-        pass
-    return own
 
 
 def certify_polytope(
@@ -215,13 +181,11 @@ def around_resting_point(
     known: Sequence[Certificate],
     clock: Clock,
     fixed: Rest | None = None,
-    *,
-    search_gain: bool,
 ) -> Certificate:
     """Returns a verified certificate of a polytope for limits that are not symmetric about the operating point.
 
     The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
-    fixed one; where the share of the box is known, a better resting point then, and with `search_gain` a better gain.
+    fixed one; where the share of the box is known, a better resting point then.
     Once the clock has run out, no further gain is tried, but for one with the larger margin.
 
     Raises:
@@ -230,11 +194,7 @@ def around_resting_point(
     progress("resting point")
     if fixed is not None:
         known = [each for each in known if np.array_equal(each.resting_state, fixed.state)]
-    tried = fallbacks_around(plant, contract, progress, fixed)
-    if search_gain and tried:
-        larger = gains_of_larger_polytopes(tried[0], plant, progress)
-        tried = [*(tried[0]._replace(K=K) for K in larger), *tried]
-    tried = _different(tried)
+    tried = _different(fallbacks_around(plant, contract, progress, fixed))
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
         larger = []

@@ -1,8 +1,7 @@
-"""Gains for polytopes: those that fill more of the safe box than others, and the one that tolerates most."""
+"""Gains for polytopes: regulators, and the one that tolerates most."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -11,19 +10,14 @@ from scipy.optimize import OptimizeResult, minimize
 from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.lqr import lqr_gain
 from shields.synthesis.design_problem import DesignProblem
-from shields.synthesis.invariant_polytope import Feedback, points_of_box, share_of_points
+from shields.synthesis.invariant_polytope import Feedback
 from shields.synthesis.max_margin_gain import MaxMarginGain
 
 # Weights of the inputs, in units of their limits, against those of the states, in units of the box, in the
-# linear-quadratic regulators that the search begins with.
+# linear-quadratic regulators.
 _INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-# The search begins with changes of a gain's entries by these shares of an input limit over a half-width of the box, in
-# turn, and tries at most so many gains per entry in each.
-_CHANGES, _TRIES_PER_ENTRY = (0.15, 0.08), 25
-# Where it is asked often whether there is a gain at all.
-_FEW_TRIES_PER_ENTRY = 8
-# It counts so many points of the box.
-_POINTS_LOG2 = 13
+# The search for the most tolerant gain tries at most so many gains per entry; fewer where it is asked often.
+_TRIES_PER_ENTRY, _FEW_TRIES_PER_ENTRY = 25, 8
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
 # over no more steps than the second number.
 _LEFT_OVER, _MOST_STEPS = 1e-7, 4000
@@ -35,45 +29,6 @@ _MOST_STEPS_OF_NEEDS = 40_000
 _SMALLEST_NEED = 1e-3
 # Digits of a tolerated factor: a search takes the same steps on every processor.
 _DIGITS = 9
-
-
-def gains_of_larger_polytopes(
-    feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]
-) -> Iterator[np.ndarray]:
-    """Yields gains, shape (m, n), that keep more of the safe box than a fallback's, those that keep most first.
-
-    The search begins with regulators and the fallback's own gain, and goes on from the best of them: Nelder and Mead's
-    simplex search for the entries whose polytope fills the largest share of the box. Nothing is yielded where that
-    share is unknown (`points_of_box`).
-
-    Args:
-        feedback: The gain, the error sets and D.
-        plant: The plant.
-        progress: Called with a line of text now and then.
-    """
-    points = points_of_box(plant, _POINTS_LOG2)
-    if points is None:
-        return
-
-    def lost(entries: np.ndarray) -> float:
-        """Returns the share of the box that a gain, its entries in one row, does not keep."""
-        return 1.0 - share_of_points(feedback._replace(K=entries.reshape(plant.m, plant.n)), plant, points)
-
-    gains = [K.ravel() for K in (feedback.K, *regulators(plant))]
-    losses = [lost(entries) for entries in gains]
-    best = gains[int(np.argmin(losses))]
-    units = np.diag((plant.input_half[:, None] / plant.half_widths).ravel())
-    for change in _CHANGES:
-        progress(f"gain of the polytope: {100.0 * (1.0 - min(losses)):.1f} % of the box")
-        simplex = best + change * np.concatenate([np.zeros((1, len(units))), units])
-        options = {"initial_simplex": simplex, "maxfev": _TRIES_PER_ENTRY * len(units)}
-        found = minimize(lost, best, method="Nelder-Mead", options=options)
-        best = found.x
-        gains.append(best)
-        losses.append(found.fun)
-    for k in np.argsort(losses, kind="stable"):
-        if losses[k] < losses[0]:
-            yield gains[k].reshape(plant.m, plant.n)
 
 
 def regulators(plant: LinearPlant) -> list[np.ndarray]:

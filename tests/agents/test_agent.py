@@ -103,7 +103,7 @@ def test_folder_keeps_how_the_environment_was_made(tmp_path):
     kwargs = {"downlink": downlink, "between_samples": 8, "observe": ("age",), "channel": Channel(loss=0.1)}
     env = gym.make(CRUISE, **kwargs).unwrapped
     certificate = certificate_of(env.plant, env.certificate_contract)
-    shield = ShieldSettings(certificate, "lookahead", least_safe_steps=2)
+    shield = ShieldSettings(certificate, "lookahead", horizon=3)
     loop = LoopConfig(env=CRUISE, kwargs=kwargs, shield=shield)
     agent = train(loop, 64, 0, hyperparams={"n_envs": 2, "n_steps": 32, "batch_size": 32}, checkpoints=tmp_path).agent
     agent.save(tmp_path, shield)
@@ -170,14 +170,13 @@ def test_certificate_of_another_plant_is_not_saved(agent, tmp_path):
 
 def test_saved_agent_keeps_the_shield_it_was_trained_behind(certificate, tmp_path):
     assert (trained().shield_mode, trained().horizon) == (None, None)
-    loop = LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=3, least_safe_steps=2))
+    loop = LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=3))
     result = train(loop, 512, 1, "PPO", SETTINGS["PPO"])
     assert result.violation_steps == 0 < result.interventions
     result.agent.save(tmp_path)
     again = Agent.load(tmp_path)
-    assert (again.shield_mode, again.horizon, again.least_safe_steps) == ("lookahead", 3, 2)
-    least = {"mode": "lookahead", "horizon": 3, "least_safe_steps": -1}
-    for wrong in ({"mode": "hope", "horizon": None}, {"mode": "lookahead", "horizon": 0}, {"mode": "lookahead"}, least):
+    assert (again.shield_mode, again.horizon) == ("lookahead", 3)
+    for wrong in ({"mode": "hope", "horizon": None}, {"mode": "lookahead", "horizon": 0}, {"mode": "lookahead"}):
         change(tmp_path, shield=wrong)
         with pytest.raises(AgentError, match="is damaged"):
             Agent.load(tmp_path)

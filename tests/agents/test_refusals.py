@@ -92,8 +92,7 @@ CALLS = [
      r"^shield must be ShieldSettings\(certificate\), got Certificate$"),
     (partial(LoopConfig, env=CRUISE.env, shield=ShieldSettings(CERTIFICATE), filter=print),
      "give either a shield or a filter"),
-    *((partial(ShieldSettings, CERTIFICATE, **{name: 4}), f"{name} is for mode \"lookahead\"")
-      for name in ("horizon", "least_safe_steps")),
+    (partial(ShieldSettings, CERTIFICATE, horizon=4), 'horizon is for mode "lookahead"'),
     (partial(ShieldSettings, CERTIFICATE, mode="x"), r"^mode must be one of \["),
     *((partial(LagrangianSettings, **{name: value}), f"{name} must be >= 0")
       for name in ("cost_limit", "learning_rate", "multiplier") for value in (-0.1, NAN, INF)),

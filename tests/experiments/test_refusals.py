@@ -22,7 +22,7 @@ from experiments.settings import (
 )
 from experiments.settings.certificates import AttackSettings
 from ncs_gym import Channel, ChannelContract
-from tests.certificates import feasible_bounds_not_sought
+from tests.certificates import feasible_age_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
@@ -43,7 +43,6 @@ SETTINGS = [
     (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
     *((ChannelSettings, {"file": "f"} | given, "give --certificate and --plant, or --env")
       for given in ({"plant": "p", "env": "e"}, {"certificate": "c"}, {"certificate": "c", "plant": "p", "env": "e"})),
-    (ChannelSettings, {"file": "f", "least_safe_steps": 5}, "--least-safe-steps are those of a shield of --env"),
     (CompareSettings, {"horizon": 6}, "--horizon 6 is for mode lookahead, which is not asked for"),
     *((AttackSettings, {name: value}, f"--{name} must be at least")
       for name, value in [("steps", 0), ("steps", NAN), ("seed", -1)]),
@@ -92,16 +91,15 @@ USAGE = [
     ("evaluate nowhere --episodes 0", "--episodes must be at least 1"),
     ("evaluate nowhere --shield lookahead --horizon 51", "--horizon must be at least 1 and at most"),
     ("evaluate nowhere --shield project --horizon 6", "--horizon 6 is for mode lookahead"),
-    ("evaluate nowhere --shield project --least-safe-steps 6", "--least-safe-steps 6 is for mode lookahead"),
+    ("evaluate nowhere --shield project --horizon 6", "--horizon 6 is for mode lookahead"),
     ("render --horizon 6", "--horizon 6 is for mode lookahead"),
     ("train --horizon 6", "--horizon 6 is for mode lookahead"),
     ("train --violation-penalty 7", "--violation-penalty 7 is for an arm penalized, which is not asked for"),
     ("train --arm unshielded --intervention-penalty 5", "--intervention-penalty 5 is for an arm with +penalty"),
     ("render --side-by-side --shield none", "--side-by-side compares with a shield"),
     ("requirements --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),
-    ("requirements --losses -1", "max_consecutive_losses"),
-    ("requirements --keep 0", "--keep"),
-    ("requirements --delays 1 1", "different values"),
+    ("requirements --ages -1", "an age must be a whole number >= 0"),
+    ("requirements --ages 1 1", "ages must be different values"),
     ("reproduce --starts 0", "--starts must be"),
     ("reproduce --steps -1", "--steps must be"),
     ("reproduce --seed -1", "--seed must be"),
@@ -191,7 +189,7 @@ def test_calls_are_refused(call, words):
 
 @pytest.mark.parametrize(("line", "words"), USAGE)
 def test_usage_errors_are_the_parsers(line, words):
-    with feasible_bounds_not_sought():
+    with feasible_age_not_sought():
         run = ncs(*line.split(), COLUMNS="200")
     assert run.returncode == 2
     assert "Traceback" not in run.stderr

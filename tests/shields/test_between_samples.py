@@ -19,9 +19,8 @@ from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
-from shields.synthesis.requirement_search import with_radii
-from tests.certificates import certificate_of, feasible_bounds_not_sought
-from tests.plants import servo, swinging
+from tests.certificates import certificate_of, feasible_age_not_sought
+from tests.plants import servo, swinging, with_radii
 from tests.second_verifier.verify import verify_again
 from tests.shields.runtime.batches import decided_alike
 from tests.verdicts import verified
@@ -129,23 +128,22 @@ def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_cert
     env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
     plant = replace(env.plant, gamma=0.43)
     synthesize(plant, safe_set="ellipsoid")
-    with feasible_bounds_not_sought(), pytest.raises(Infeasible, match="between"):
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match="between"):
         synthesize(replace(plant, between_samples=2))
 
 
 @pytest.mark.slow
-def test_quick_search_for_feasible_bounds_knows_the_times_between_samples():
+def test_quick_search_for_radii_knows_the_times_between_samples():
     contract = ChannelContract(2)
     plain, plant = (servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.48], between_samples=points) for points in (None, 4))
     synthesize(plain, contract=contract)
-    with pytest.raises(Infeasible, match="single changes that a search finds enough") as caught:
+    with pytest.raises(Infeasible, match="radii shrink to") as caught:
         synthesize(plant, contract=contract)
-    share, wider = caught.value.details["share_of_radii"], caught.value.details["box_factor"]
-    assert 0.8 < share < 1.0 < wider
-    synthesize(with_radii(plant, disturbance=0.97 * share, noise=0.97 * share), contract=contract)
-    synthesize(replace(plant, box=plant.box_rows / (1.03 * wider)), contract=contract)
+    share = caught.value.details["share_of_radii"]
+    assert 0.8 < share < 1.0
+    synthesize(with_radii(plant, 0.97 * share), contract=contract)
     with pytest.raises(Infeasible):
-        synthesize(with_radii(plant, disturbance=1.05 * share, noise=1.05 * share), contract=contract)
+        synthesize(with_radii(plant, 1.05 * share), contract=contract)
 
 
 @pytest.mark.parametrize("horizon", [1, 4])

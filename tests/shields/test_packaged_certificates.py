@@ -75,8 +75,8 @@ def test_every_id_has_a_verified_certificate(env_id):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", IDS)
-def test_synthesis_gives_what_comes_with_the_package(env_id):
-    # Other processors round otherwise on the way, so that not all digits are the same.
+def test_synthesis_gives_sets_as_large_as_those_that_come_with_the_package(env_id):
+    # As large an ellipsoid. Many gains keep nearly the same one, which differ in their polytopes by a hundredth.
     plant, contract = plant_and_contract(env_id)
     kept, made = certificate_of_package(plant, contract), synthesize(plant, contract=contract)
     alone = synthesize(plant, contract=contract, safe_set="ellipsoid")
@@ -84,12 +84,9 @@ def test_synthesis_gives_what_comes_with_the_package(env_id):
         assert verified(found, plant).valid
         assert (found.contract, found.fingerprint) == (packed.contract, packed.fingerprint)
         assert (found.polytope is None) == (packed.polytope is None)
-        np.testing.assert_allclose(found.K, packed.K, rtol=0.01, atol=0.001 * np.abs(packed.K).max())
-        np.testing.assert_allclose(found.L, packed.L, rtol=0.01, atol=0.001 * np.abs(packed.L).max())
+        assert np.linalg.slogdet(found.L)[1] >= np.linalg.slogdet(packed.L)[1] - 1e-3
     if kept.polytope is not None:
-        assert share_in_polytope(made.polytope, plant) == pytest.approx(
-            share_in_polytope(kept.polytope, plant), abs=0.002
-        )
+        assert share_in_polytope(made.polytope, plant) >= 0.98 * share_in_polytope(kept.polytope, plant)
 
 
 def test_certificate_of_the_package_is_taken_and_nothing_synthesized(calls, unasked):

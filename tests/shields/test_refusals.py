@@ -76,7 +76,6 @@ REFUSED = [
     (lambda: synthesize(plant(), safe_set="Polytope"), ValueError, "safe_set must be"),
     (lambda: synthesize(plant(), safe_set=0), ValueError, "safe_set must be"),
     (lambda: synthesize(plant(), safe_set=["polytope"]), ValueError, "safe_set must be"),
-    (lambda: synthesize(plant(), safe_set="ellipsoid", search_gain=True), ValueError, "search_gain is for polytopes"),
     *(
         (
             lambda name=name: paper_synthesis(replace(plant(), **{name: 1e-4})),
@@ -101,11 +100,11 @@ REFUSED = [
         Infeasible,
         "too ill-conditioned for .* give states units in which the half-widths of the box are of similar size",
     ),
-    (lambda: requirements(servo(), losses=[]), ValueError, "different values"),
-    (lambda: requirements(servo(), delays=[1, 1]), ValueError, "different values"),
-    (lambda: requirements(servo(), losses=[-1]), ValueError, "losses"),
-    (lambda: requirements(servo(), disturbances=[0.0]), ValueError, "disturbance"),
-    (lambda: requirements(FIXED, sampling_periods=[0.5]), ValueError, "from_statespace"),
+    (lambda: requirements(servo(), ages=[]), ValueError, "ages must be different values, at least one"),
+    (lambda: requirements(servo(), resolutions=[0.1, 0.1]), ValueError, "resolutions must be different values"),
+    (lambda: requirements(servo(), ages=[-1]), ValueError, "an age must be a whole number >= 0"),
+    (lambda: requirements(servo(), resolutions=[np.nan]), ValueError, "a resolution must be"),
+    (lambda: requirements("servo"), ValueError, "plant must be a LinearPlant, got str"),
     (lambda: verify(plant(), kept()), ValueError, "verify takes a Certificate and a LinearPlant"),
     # Fields of certificates.
     (lambda: replace(kept(), proofs=()), CertificateError, "proofs"),

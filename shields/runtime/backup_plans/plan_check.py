@@ -81,96 +81,81 @@ class PlanTest:
 
         Both are NaN if unknown.
         """
-        every = slice(None)
-        return self._row_limits(estimates, tightening, every, every), self._radius(estimates, tightening, every)
+        return self._row_limits(estimates, tightening, slice(None)), self._radius(estimates, tightening)
 
     @own_error_state  # what is not finite is not certified
-    def _row_limits(self, estimates: np.ndarray, tightening: Tightening, steps: slice, rows: slice) -> np.ndarray:
-        """Returns what `limits_at` says of some steps and rows."""
-        limits, rounding = tightening.row_limits[:, steps, rows], self._row_rounding[steps, rows]
+    def _row_limits(self, estimates: np.ndarray, tightening: Tightening, rows: slice) -> np.ndarray:
+        """Returns what `limits_at` says of some rows."""
+        limits, rounding = tightening.row_limits[:, :, rows], self._row_rounding[:, rows]
         size = np.abs(estimates) @ rounding.reshape(-1, estimates.shape[1]).T
         return limits - size.reshape(limits.shape) - self._margin
 
     @own_error_state
-    def _radius(self, estimates: np.ndarray, tightening: Tightening, steps: slice) -> np.ndarray:
-        """Returns the same of the cone at some steps."""
-        radius = tightening.radius[:, steps] - np.abs(estimates) @ self._end_rounding[:, steps]  # may be far below zero
+    def _radius(self, estimates: np.ndarray, tightening: Tightening) -> np.ndarray:
+        """Returns the same of the cone."""
+        radius = tightening.radius - np.abs(estimates) @ self._end_rounding  # may be far below zero
         return np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
     @own_error_state  # with what is not finite no plan begins
-    def may_begin(self, estimates: np.ndarray, tightening: Tightening, firsts: np.ndarray, shortest: int) -> np.ndarray:
-        """Returns where a plan of at least `shortest` inputs may begin with an input, (E, m); shape (E,).
+    def may_begin(self, estimates: np.ndarray, tightening: Tightening, firsts: np.ndarray) -> np.ndarray:
+        """Returns where a plan may begin with an input, (E, m); shape (E,).
 
         Elsewhere none is certified: some row, on the way or at every end, is beyond its limit whatever inputs follow.
         """
         both, k = np.concatenate([estimates, firsts], axis=1), len(self.prediction.plant.box)
-        late = slice(shortest - 1, None)
-        in_box = self._may_keep(both, estimates, tightening, slice(None), slice(k))
-        on_the_way = np.ones_like(in_box)
-        np.logical_and.accumulate(in_box[:, :-1], axis=1, out=on_the_way[:, 1:])
-        ends = on_the_way[:, late]
+        in_box = self._may_keep(both, estimates, tightening, slice(k))
+        ends = np.ones_like(in_box)
+        np.logical_and.accumulate(in_box[:, :-1], axis=1, out=ends[:, 1:])
         if not self.prediction.ends:
-            ends &= in_box[:, late] & self._may_keep(both, estimates, tightening, late, slice(k, None))
+            ends &= in_box & self._may_keep(both, estimates, tightening, slice(k, None))
         return np.any(ends, axis=1)
 
-    def _may_keep(
-        self, both: np.ndarray, estimates: np.ndarray, tightening: Tightening, steps: slice, rows: slice
-    ) -> np.ndarray:
-        """Returns whether each of some rows is within its limits at some steps for some later inputs, (E, steps)."""
-        others, matrix = self._by_others[steps, rows], self._by_first[:, steps, rows]
+    def _may_keep(self, both: np.ndarray, estimates: np.ndarray, tightening: Tightening, rows: slice) -> np.ndarray:
+        """Returns whether each of some rows is within its limits at every step for some later inputs, (E, N)."""
+        others, matrix = self._by_others[:, rows], self._by_first[:, :, rows]
         values = (both @ matrix.reshape(len(matrix), -1)).reshape(len(both), *others.shape)
-        limits = self._row_limits(estimates, tightening, steps, rows) + self._reach_of_others[steps, rows]
+        limits = self._row_limits(estimates, tightening, rows) + self._reach_of_others[:, rows]
         return np.all(np.abs(values + others) <= limits, axis=2)
 
     @own_error_state
-    def certified(
-        self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, shortest: int = 1
-    ) -> np.ndarray:
-        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N).
-
-        Parts of less than `shortest` inputs are not looked at, and count as not certified.
-        """
+    def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
+        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N)."""
         block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
         if len(plans) > block:
             parts = [slice(start, start + block) for start in range(0, len(plans), block)]
-            found = [self.certified(estimates[e], tightening.some(e), plans[e], shortest) for e in parts]
+            found = [self.certified(estimates[e], tightening.some(e), plans[e]) for e in parts]
             return np.concatenate(found)
         prediction, plant = self.prediction, self.prediction.plant
-        centers, late, k = prediction.centers(estimates, plans), slice(shortest - 1, None), len(plant.box)
-        in_box = self._between(estimates, tightening, centers, slice(None), slice(k))
+        centers, k = prediction.centers(estimates, plans), len(plant.box)
+        in_box = self._between(estimates, tightening, centers, slice(k))
         if prediction.ends:
-            kept = self._in_cone(estimates, tightening, centers, late)
+            kept = self._in_cone(estimates, tightening, centers)
         else:
-            kept = in_box[late] & self._between(estimates, tightening, centers, late, slice(k, None))
+            kept = in_box & self._between(estimates, tightening, centers, slice(k, None))
         on_the_way = np.ones_like(in_box)
         np.logical_and.accumulate(in_box[:-1], axis=0, out=on_the_way[1:])
-        kept &= on_the_way[late]
+        kept &= on_the_way
         if tightening.between.size:
-            kept &= prediction.grid.keeps(estimates, tightening.between, plans, self._margin)[late]
+            kept &= prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
         within = np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1)
-        allowed = np.logical_and.accumulate(within, axis=-1)
-        allowed[..., : shortest - 1] = False
-        allowed[..., late] &= kept.transpose(1, 2, 0)
-        return allowed
+        return np.logical_and.accumulate(within, axis=-1) & kept.transpose(1, 2, 0)
 
-    def _between(
-        self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray, steps: slice, rows: slice
-    ) -> np.ndarray:
-        """Returns whether some rows keep their limits at some of the centers, shape (steps, E, P)."""
-        some, of_rows = centers[steps], self.prediction.rows[rows]
+    def _between(self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray, rows: slice) -> np.ndarray:
+        """Returns whether some rows keep their limits at the centers, shape (N, E, P)."""
+        of_rows = self.prediction.rows[rows]
         # Sums over long last axes are fast.
-        values = (of_rows @ some.reshape(*some.shape[:2], -1)).reshape(len(some), -1, *some.shape[2:])
+        values = (of_rows @ centers.reshape(*centers.shape[:2], -1)).reshape(len(centers), -1, *centers.shape[2:])
         values -= self.prediction.middle[rows, None, None]
-        limits = self._row_limits(estimates, tightening, steps, rows)
+        limits = self._row_limits(estimates, tightening, rows)
         return np.all(np.abs(values, out=values) <= limits.transpose(1, 2, 0)[..., None], axis=1)
 
-    def _in_cone(self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray, steps: slice) -> np.ndarray:
-        """Returns whether |T G c_j| keeps its limit at some of the centers, shape (steps, E, P)."""
-        some, weighting = centers[steps], tightening.weighting[:, steps].transpose(1, 2, 3, 0)[..., None]
-        weighted = weighting[:, :, 0] * some[:, 0, None]
-        for i in range(1, some.shape[1]):
-            weighted += weighting[:, :, i] * some[:, i, None]
-        radius = self._radius(estimates, tightening, steps)
+    def _in_cone(self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray) -> np.ndarray:
+        """Returns whether |T G c_j| keeps its limit at the centers, shape (N, E, P)."""
+        weighting = tightening.weighting.transpose(1, 2, 3, 0)[..., None]
+        weighted = weighting[:, :, 0] * centers[:, 0, None]
+        for i in range(1, centers.shape[1]):
+            weighted += weighting[:, :, i] * centers[:, i, None]
+        radius = self._radius(estimates, tightening)
         return np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
 
     @own_error_state

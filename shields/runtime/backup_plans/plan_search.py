@@ -1,4 +1,4 @@
-"""The search for a certified plan that is long enough and whose first input is close to the proposed one.
+"""The search for a certified plan whose first input is close to the proposed one.
 
 Candidates come first: a given beginning, and then a gain at the predicted centers, limited or saturated. The solution
 of a convex program is tried last; whatever a solver says about it is not believed.
@@ -61,17 +61,15 @@ class Planner:
         first: The one-step test.
         fallback: The certificate's: the regulators have gains of their own around the same resting point.
         horizon: Largest length N of a plan.
-        enough: Length of a plan that is long enough, at most N. A shorter one is taken only where none is: the longest.
         margin: By which plans must pass the test.
 
     Attributes:
         test: The plan test.
         horizon: N.
-        enough: The same.
     """
 
-    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, enough: int, margin: float) -> None:
-        self.test, self.horizon, self.enough = PlanTest(Prediction(first, horizon), margin), horizon, enough
+    def __init__(self, first: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
+        self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant, self._fallback, gain = first.plant, fallback, fallback.gain
         self._rest = read_only(np.concatenate(fallback[1:]))
         braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
@@ -80,20 +78,16 @@ class Planner:
         self._loops = np.concatenate(loops, axis=1)
         self._program = PlanProgram(self.test.prediction)
 
-    def ranks(self, lengths: np.ndarray) -> np.ndarray:
-        """Returns how much plans of these lengths count: a longer one for more, until it is long enough."""
-        return np.minimum(lengths, self.enough)
-
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns a plan, (j, m), of a single environment, if the first candidates of `beginning_with` are enough."""
         tightening = self.test.tightenings_of(shape[None])
-        if not self.test.may_begin(estimate[None], tightening, proposed[None], self.enough)[0]:
+        if not self.test.may_begin(estimate[None], tightening, proposed[None])[0]:
             return None
         plans = self._continued(estimate, proposed)
-        certified = self.test.certified(estimate[None], tightening, plans[None], self.enough)[0, :, self.enough - 1 :]
+        certified = self.test.certified(estimate[None], tightening, plans[None])[0]
         which = int(certified.any(axis=1).argmax())
         more = int(certified[which].argmax())
-        return plans[which, : self.enough + more] if certified[which, more] else None
+        return plans[which, : 1 + more] if certified[which, more] else None
 
     def may_do_better(
         self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray, projected: np.ndarray
@@ -104,40 +98,40 @@ class Planner:
         beginnings[0, 0, 0] = projected
         if self._begins_closer(x_hat, u, beginnings)[0]:
             return True
-        return bool(self.test.may_begin(x_hat, self.test.tightenings_of(shape[None]), u, self.enough)[0])
+        return bool(self.test.may_begin(x_hat, self.test.tightenings_of(shape[None]), u)[0])
 
     def _begins_closer(self, estimates: np.ndarray, proposed: np.ndarray, beginnings: np.ndarray) -> np.ndarray:
         """Returns where a candidate of `find` begins closer than the projected input, or need not, shape (E,).
 
         The projected inputs are the first of the first beginnings, NaN where there are none; shape (E, 4, any, m).
         """
-        if self.enough > 1 or self.test.prediction.ends:
+        if self.test.prediction.ends:
             return np.ones(len(estimates), np.bool_)
         projected_at, *others_at = _distances(self._completed(estimates, beginnings[:, :, :1]), proposed).T
         return np.isnan(beginnings[:, 0, 0, 0]) | np.any(others_at < projected_at, axis=0)
 
     def beginning_with(
-        self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray, shortest: int
+        self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
     ) -> Plans:
-        """Returns certified plans of at least `shortest` inputs whose first inputs are the proposed ones.
+        """Returns certified plans whose first inputs are the proposed ones.
 
         After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
-        then K, or the saturated regulator. The first candidate that is certified and long enough counts, and is all
-        that is looked at; the solver is not asked.
+        then K, or the saturated regulator. The first candidate that is certified counts, and is all that is looked at;
+        the solver is not asked.
         """
         tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
-        plans = self._best(estimates, tightening, continued[:, :1], proposed, shortest)
-        left = np.flatnonzero(plans.lengths < self.enough)
-        left = left[self.test.may_begin(estimates[left], tightening.some(left), proposed[left], shortest)]
+        plans = self._best(estimates, tightening, continued[:, :1], proposed)
+        left = np.flatnonzero(plans.lengths == 0)
+        left = left[self.test.may_begin(estimates[left], tightening.some(left), proposed[left])]
         for next_of in (
             lambda some: continued[some, 1:],
             lambda some: self._limited(estimates[some], proposed[some], stored[some]),
         ):
             if not left.size:
                 break
-            found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left], shortest)
+            found = self._best(estimates[left], tightening.some(left), next_of(left), proposed[left])
             self.improve(plans, left, found)
-            left = left[plans.lengths[left] < self.enough]
+            left = left[plans.lengths[left] == 0]
         return plans
 
     def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
@@ -169,10 +163,9 @@ class Planner:
     ) -> Plans:
         """Returns certified plans whose first inputs are close to the proposed ones.
 
-        Candidates are the projected input and then the regulator, what is stored, and either gain from the start; where
-        states and inputs have limits together also the projected input and then K. The solver is asked where none of
-        them is certified; where plans end in S also if nothing is stored. Plans that end in P would begin closer by it
-        in a single step, but not in a loop (docs/lookahead.md), for three times the time.
+        Candidates are the projected input and then the regulator, what is stored, and either gain from the start. The
+        solver is asked where none of them is certified; where plans end in S also if nothing is stored. Plans that end
+        in P would begin closer by it in a single step, but not in a loop (docs/lookahead.md), for three times the time.
         `projected` are the closest inputs that pass the one-step test, shape (E, m), NaN where there are none. Where
         there is one and plans end in P, a plan of any length is looked for only if a candidate begins closer.
         """
@@ -182,7 +175,7 @@ class Planner:
         plans = Plans(nothing, np.zeros(len(estimates), np.int64), np.full(len(estimates), np.inf))
         some = np.flatnonzero(self._begins_closer(estimates, proposed, beginnings))
         if some.size:
-            known = (each[some] for each in (estimates, shapes, proposed, projected, stored, beginnings))
+            known = (each[some] for each in (estimates, shapes, proposed, stored, beginnings))
             self.improve(plans, some, self._found(*known))
         return plans
 
@@ -191,16 +184,11 @@ class Planner:
         estimates: np.ndarray,
         shapes: np.ndarray,
         proposed: np.ndarray,
-        projected: np.ndarray,
         stored: np.ndarray,
         beginnings: np.ndarray,
     ) -> Plans:
         """Returns the plans of `find`, of candidates with these beginnings, shape (E, 4, N, m), or of the solver."""
         tightening, candidates = self.test.tightenings_of(shapes), self._completed(estimates, beginnings)
-        # A regulator knows nothing of limits of states and inputs together, K keeps them. Elsewhere plans with K only
-        # bring the state closer to the edge, where less can be promised later.
-        if self.enough > 1 and len(self._plant.mixed_rows):
-            candidates = np.concatenate([candidates, self._continued(estimates, projected)], axis=1)
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
             needed = plans.lengths == 0
@@ -216,9 +204,8 @@ class Planner:
         return completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
 
     def improve(self, plans: Plans, chosen: np.ndarray, others: Plans) -> None:
-        """Puts other plans of the environments chosen in place where they have a higher rank, or begin closer."""
-        own, other = self.ranks(plans.lengths[chosen]), self.ranks(others.lengths)
-        better = (other > own) | ((other == own) & (others.distances < plans.distances[chosen]))
+        """Puts other plans of the environments chosen in place where they begin closer."""
+        better = others.distances < plans.distances[chosen]
         for part, improved in zip(plans, others, strict=True):
             part[chosen[better]] = improved[better]
 
@@ -228,24 +215,16 @@ class Planner:
         tightening: Tightening,
         plans: np.ndarray,
         proposed: np.ndarray,
-        shortest: int = 1,
     ) -> Plans:
-        """Returns one certified plan of P for each environment, shape (E, P, N, m), of at least `shortest` inputs.
+        """Returns one certified plan of P for each environment, shape (E, P, N, m).
 
-        Of each that is long enough, the shortest such beginning counts, of others the longest. The plan of the highest
-        rank is returned; of several the one that begins closest, and of equal ones the first.
+        Of each the shortest certified beginning counts. The plan that begins closest is returned, of equal ones the
+        first.
         """
-        enough = self.test.certified(estimates, tightening, plans, self.enough)[..., self.enough - 1 :]
-        lengths = np.where(enough.any(axis=-1), self.enough + enough.argmax(axis=-1), 0)
-        short = np.flatnonzero((lengths == 0).all(axis=1)) if shortest < self.enough else ()
-        if len(short):
-            certified = self.test.certified(estimates[short], tightening.some(short), plans[short], shortest)
-            longest = self.horizon - certified[..., ::-1].argmax(axis=-1)
-            lengths[short] = np.where(certified.any(axis=-1), longest, 0)
-        ranks = self.ranks(lengths)
+        certified = self.test.certified(estimates, tightening, plans)
+        lengths = np.where(certified.any(axis=-1), 1 + certified.argmax(axis=-1), 0)
         distances = np.where(lengths > 0, _distances(plans, proposed), np.inf)
-        highest = ranks == ranks.max(axis=1, keepdims=True)
-        best, rows = np.where(highest, distances, np.inf).argmin(axis=1), np.arange(len(plans))
+        best, rows = distances.argmin(axis=1), np.arange(len(plans))
         return Plans(*(part[rows, best] for part in (plans, lengths, distances)))
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:

@@ -22,11 +22,6 @@ class Lookahead:
     proposed one is applied and what follows it in its plan is stored. Without any, the next stored input is applied;
     where nothing is stored, K x_hat.
 
-    A plan that leaves at least g inputs stored is long enough. For g > 0 an input that passes the one-step test is only
-    a plan of one input, and is applied as it is only if it begins one that is long enough. Where none is found, the
-    longest of the plans found and the stored one is applied. So the smaller of g and the number of inputs stored never
-    falls by more than one per step.
-
     Its methods change decisions about N proposals in place, given the numbers of `some` of them, estimates x_hat (n,
     N), what is known of the Sigma_k of each, proposals (m, N) [physical units], and plans still stored (horizon, m, N),
     NaN beyond their ends.
@@ -35,21 +30,19 @@ class Lookahead:
         test: The one-step test.
         fallback: The certificate's.
         horizon: Longest plan, in steps.
-        least: g, smaller than the horizon.
         margin: By which plans must pass their test.
 
     Attributes:
         horizon: Longest plan, in steps.
-        least: g.
         needs_shapes: Whether plans need the error shapes themselves.
         planner: Finds the plans.
     """
 
     needs_shapes = True
 
-    def __init__(self, test: SetTest, fallback: Fallback, horizon: int, least: int, margin: float) -> None:
-        self._test, self.horizon, self.least, self._margin = test, horizon, least, margin
-        self.planner = Planner(test, fallback, horizon, least + 1, margin)
+    def __init__(self, test: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
+        self._test, self.horizon, self._margin = test, horizon, margin
+        self.planner = Planner(test, fallback, horizon, margin)
 
     def beginning_alone(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> np.ndarray | None:
         """Returns a plan, (j, m), of a single environment that begins with what is proposed, if one is soon found."""
@@ -74,14 +67,14 @@ class Lookahead:
     def keep(
         self, decided: Decision, valid: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
     ) -> None:
-        """Lets inputs within the limits (`valid`, shape (N,)) pass where a plan that is long enough begins with them.
+        """Lets inputs within the limits (`valid`, shape (N,)) pass where a plan begins with them.
 
         Of these decisions `input` is the proposed one, and `plan` is all NaN.
         """
-        some = np.flatnonzero(valid if self.least else valid & ~decided.proved)
+        some = np.flatnonzero(valid & ~decided.proved)
         if some.size:
             known = self._rows(some, estimates, errors, decided.input, stored)
-            found = self.planner.beginning_with(*known, self.planner.enough)
+            found = self.planner.beginning_with(*known)
             begun = self._begin(decided, some, found)
             decided.intervened[some[begun]] = False
 
@@ -95,15 +88,14 @@ class Lookahead:
         stored: np.ndarray,
     ) -> None:
         """Changes decisions of mode "project" about proposals that were not let pass."""
-        some = np.flatnonzero((decided.reason != PLANNED) & ((decided.reason != SAFE) | (self.least > 0)))
+        some = np.flatnonzero((decided.reason != PLANNED) & (decided.reason != SAFE))
         if not some.size:
             return
         changed = np.zeros(some.shape, np.bool_)
         searched = np.flatnonzero(decided.reason[some] != INVALID)
         if searched.size:
             changed[searched] = self._plan(decided, some[searched], estimates, errors, proposed, stored)
-        passes = (decided.reason[some] == SAFE) | (decided.reason[some] == PROJECTED)
-        left = ~changed & (self._ranks(stored[..., some]) > passes)
+        left = ~changed & (decided.reason[some] != PROJECTED) & ~np.isnan(stored[0, 0, some])
         resumed = some[left]
         decided.input[:, resumed], decided.plan[:-1, :, resumed] = stored[0][:, resumed], stored[1:, :, resumed]
         decided.fallback[resumed], decided.stored[resumed], decided.reason[resumed] = False, True, STORED
@@ -122,26 +114,13 @@ class Lookahead:
         proposed: np.ndarray,
         stored: np.ndarray,
     ) -> np.ndarray:
-        """Begins new plans where one is found that is closer than the input that passes, or longer; returns where.
-
-        Nowhere is it shorter, as far as lengths count, than what is stored.
-        """
-        passes = (decided.reason[some] == SAFE) | (decided.reason[some] == PROJECTED)
+        """Begins new plans where one is found that is closer than the input that passes; returns where."""
+        passes = decided.reason[some] == PROJECTED
         closest = np.where(passes, decided.input[:, some], np.nan)
         x_hat, shapes, wanted, plans = self._rows(some, estimates, errors, proposed, stored)
         found = self.planner.find(x_hat, shapes, wanted, closest.T, plans)
-        short = np.flatnonzero(found.lengths < self.planner.enough)
-        if self.least and short.size:  # what begins with the proposal may be the longest, though it is too short
-            begun = self.planner.beginning_with(x_hat[short], shapes[short], wanted[short], plans[short], 1)
-            self.planner.improve(found, short, begun)
-        ranks = self.planner.ranks(found.lengths)
-        farther = passes & (ranks <= 1) & (found.distances >= norms(closest - proposed[:, some]))
-        found.lengths[farther | (ranks < self._ranks(stored[..., some]))] = 0
+        found.lengths[passes & (found.distances >= norms(closest - proposed[:, some]))] = 0
         return self._begin(decided, some, found)
-
-    def _ranks(self, stored: np.ndarray) -> np.ndarray:
-        """Returns the ranks of stored plans, shape (horizon, m, N)."""
-        return self.planner.ranks(np.count_nonzero(~np.isnan(stored[:, 0]), axis=0))
 
     def _rows(
         self, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, inputs: np.ndarray, stored: np.ndarray

@@ -18,7 +18,7 @@ from agents.agent import Agent
 from experiments.runs.policies import certificate_file
 from ncs_gym import truck_trailer
 from shields import Certificate, certify
-from tests.certificates import feasible_bounds_not_sought
+from tests.certificates import feasible_age_not_sought
 from tests.command import SMOKE, assert_one_sentence, killed, ncs, ncs_process, succeeded, without_pictures
 from tests.verdicts import verified
 from tests.workers import no_worker_processes
@@ -275,8 +275,6 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
         assert (document["arms"][f"shield: {mode}"]["plan_rate"] > 0.0) is (mode == "lookahead")
         assert ("from a" in evaluated.stdout) is (mode == "lookahead")
         assert "The guarantee held after 600 of 600 steps." in evaluated.prose
-    asked = ncs("evaluate", out, "--episodes", "3", "--least-safe-steps", "2").prose
-    assert "held after 600 of 600 steps; after 600 the box was promised for one step more at least" in asked
 
 
 @pytest.mark.slow
@@ -410,7 +408,7 @@ def test_errors_of_the_disk_say_what_to_do(number, remedy, certificate, monkeypa
 
 def test_infeasible_problem_is_one_sentence(tmp_path):
     truck_trailer(disturbance_bound=3.0).save(tmp_path / "plant.json")
-    with feasible_bounds_not_sought():
+    with feasible_age_not_sought():
         run = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
     assert run.returncode == 2
     assert run.stderr.splitlines()[-1].startswith("ncs: (I) no invariant ellipsoid or polytope in the box was found")

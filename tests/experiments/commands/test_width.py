@@ -83,8 +83,8 @@ class Shown:
         return printed("channel", record(0.02 * np.arange(500), delay=0.01, loss=0.2), "--env", "ncs_gym/CartPole-v0")
 
     def requirements(self):
-        asked = ("--send-periods", 1, 2, "--losses", *range(12), "--input-delays", 0, 1, "--jobs", 1)
-        return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r")
+        asked = ("--ages", *range(12), "--resolutions", *(1e-4 * k for k in range(12)))
+        return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r.json")
 
     def attack(self):
         names = ("steps", "episodes", "outside S", "outside box", "no claim", "overridden")

@@ -174,7 +174,6 @@ class LoopBeside:
             behind = {"downlink": env.downlink, "downlink_contract": env.downlink_contract, "on_unproved": "ignore"}
             made = self.shield.filter
             given = self.shield.certificate, env.plant, channel, made.mode, made.horizon
-            behind["least_safe_steps"] = made.least_safe_steps
             self.loops[channel] = SafeLoop(*given, **behind)
         self.loop, estimator = self.loops[channel], env.estimator
         vars(estimator).pop("advance", None)
@@ -222,7 +221,6 @@ class LoopBeside:
             return
         assert (self.loop.guaranteed, self.loop.reason) == (info["shield_guaranteed"], info["shield_reason"])
         assert self.loop.plan_length == info.get("shield_plan_length", 0)
-        assert self.loop.safe_steps == info.get("shield_safe_steps", 0)
 
 
 @dataclass
@@ -253,7 +251,6 @@ def compare(
     certificate: Certificate | None = None,
     mode: str = "project",
     anew: tuple[int, ...] = (),
-    least_safe_steps: int = 0,
 ) -> Seen:
     """Steps a vector and, with the same draws, scalar environments; compares everything that both say.
 
@@ -266,10 +263,9 @@ def compare(
         certificate: That of the shields; None compares bare environments.
         mode: Of the shields.
         anew: Before which steps every third environment is reset alone.
-        least_safe_steps: Of the shields in mode "lookahead".
     """
     shielded = certificate is not None
-    settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore", "least_safe_steps": least_safe_steps}
+    settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore"}
     outer = VectorSafetyShield(many, certificate, **settings) if shielded else many
     _, infos = outer.reset(seed=3, options=options)
     singles = scalar_versions(many)

@@ -23,11 +23,9 @@ from tests.shields.attacks.worlds import (
     ALL_TIMES,
     BOX,
     ERROR,
-    FALL,
     KEPT,
     LASTS,
     SAFE_SET,
-    SILENCE,
     through_estimators,
     through_loop,
     through_shield,
@@ -35,7 +33,7 @@ from tests.shields.attacks.worlds import (
 
 pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning")
 
-MODES = ("project", "switch", "boundary", "lookahead", SILENCE)
+MODES = ("project", "switch", "boundary", "lookahead")
 # Environments and steps behind one network in the part, and behind each of them in the whole.
 SIZES = {
     "SafetyShield": ((None, 120), (None, 400)),
@@ -44,7 +42,7 @@ SIZES = {
 }
 # How close the part comes to every claim at least, a single environment to a share of that; the box may be far larger
 # than the safe set.
-CLOSE = {SAFE_SET: 0.9, BOX: 0.4, KEPT: 0.0, FALL: 0.0, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0, LASTS: 0.0}
+CLOSE = {SAFE_SET: 0.9, BOX: 0.4, ALL_TIMES: 0.9, ERROR: 0.75, AGE: 1.0, LASTS: 0.0}
 SHARE = {"SafetyShield": 0.7, "VectorSafetyShield": 1.0, "SafeLoop": 0.8}
 WITH_REMAINDER = [name for name in CASES if name.endswith("with remainder")]
 
@@ -91,13 +89,12 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
             assert not far
     counts = sum((outcome.counts for outcome in outcomes), Counter())
     assert counts["overridden"] < counts["steps"] or counts["guaranteed"] == 0  # a single start that is not proved
-    if "lookahead" not in mode:  # there a plan may save every proposal
+    if mode != "lookahead":  # there a plan may save every proposal
         assert counts["overridden"] > 0 or through == "SafetyShield"  # which has few steps
         assert counts["guaranteed"] == counts["steps"]
     elif through == "VectorSafetyShield":
         assert min(counts["planned"], counts["stored"]) > 0
-        if is_whole or mode != SILENCE:  # plans for silence rarely leave it so soon
-            assert counts["outside S"] > 0
+        assert counts["outside S"] > 0
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
@@ -135,17 +132,15 @@ def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract
     ("name", "seed"),
     [
         pytest.param(name, seed, marks=[pytest.mark.slow] if seed or c % 2 else [])
-        for c, name in enumerate(name for name in CASES if name not in WITH_REMAINDER)
-        for seed in (0, 1)
+        for c, name in enumerate(name for name in CASES if name not in WITH_REMAINDER and case(name).contract)
+        for seed in (0, 1, 2, 3)
     ],
 )
-def test_the_box_is_kept_for_the_promised_steps_whatever_the_network_does(name, seed):
-    outcome = attacked(name, SILENCE, LOOP, seed, seed, has_outages=True)
+def test_the_box_is_kept_in_silence_for_as_long_as_the_certificate_says(name, seed):
+    outcome = attacked(name, MODES[seed], LOOP, seed, seed, has_outages=True, more=0)
     assert not {claim: gauge for claim, gauge in outcome.largest.items() if gauge > 1.0 and claim != AGE}
-    assert outcome.counts["kept"] > 0.1 * outcome.counts["steps"]
-    assert case(name).contract is None or outcome.counts["kept though not guaranteed"] > 0
+    assert outcome.counts["kept in silence"] > 0
     assert outcome.largest[KEPT] > 0.3
-    assert outcome.largest[FALL] == 1.0
 
 
 @contextmanager
@@ -221,6 +216,7 @@ def tried(patch, defect, name, mode, through):
         "downlink not known": {"aware": False},
         "disturbances three times as large": {"rough": 3.0},
         "samples later than promised": {"late": 2},
+        "silence for longer than is said": {"is_silent": True, "more": 60},
         "times between samples not counted": {"of": without_the_grid(name)} if "at all times" in name else {},
     }
     mode = "monitor" if defect == "no filter" else mode
@@ -260,6 +256,7 @@ TWINS = {
     "disturbances three times as large": (STATE, turns(LINEAR, MODES, LOOP), True, 3),
     "downlink not known": ((SAFE_SET,), each(BOTH_WAYS, ONE_STEP, LOOP), True, 1),
     "samples later than promised": ((AGE,), turns(PROMISED, MODES, LOOP), True, 3),
+    "silence for longer than is said": ((KEPT,), turns(PROMISED[:4], MODES, LOOP), False, 2),
     "times between samples not counted": ((ALL_TIMES,), each(AT_ALL_TIMES[:2], MODES, VECTOR), False, 1),
     "plans checked with nothing": ((BOX,), each(PLANNED, ["lookahead"], VECTOR), False, 1),
     "plans checked with two disturbances less": ((BOX,), each(PLANNED, ["lookahead"], LOOP), False, 1),

@@ -11,16 +11,15 @@ from ncs_gym import Actuator, Channel, Disturbance, Ellipsoid, NCSEnv, NCSVector
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import contract_of
-from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields import SafeLoop, SafetyShield, VectorSafetyShield, silence_of
 from tests.ncs_gym.envs.same_draws import holding_gain
 from tests.shields.attacks.adversary import Adversary, Between, Traffic, boundary, box_of, farthest, gauges, region_of
 from tests.shields.attacks.cases import Case, box_ellipsoid
 
-SAFE_SET, BOX, KEPT, FALL, ALL_TIMES, ERROR, AGE, LASTS = (
+SAFE_SET, BOX, KEPT, ALL_TIMES, ERROR, AGE, LASTS = (
     "in the safe set",
     "in the box",
-    "in the box for so many steps",
-    "safe steps fall by at most one",
+    "in the box in silence",
     "in the box at all times",
     "error in its ellipsoid",
     "age within the contract",
@@ -28,8 +27,6 @@ SAFE_SET, BOX, KEPT, FALL, ALL_TIMES, ERROR, AGE, LASTS = (
 )
 # Episodes are begun anew after so many steps, in the middle of plans; in vectors after so many.
 EPISODE, VECTOR_EPISODE = 60, 20
-# Mode "lookahead", asked for as many safe steps as its plans can have.
-SILENCE = "lookahead for silence"
 # What is no input; a loop puts its own in the place of it.
 NO_INPUTS = (None, np.nan, "left", np.zeros(9), 10**400)
 
@@ -56,11 +53,18 @@ class Outcome:
 
 
 class Watch:
-    """Compares what is claimed of steps with what is true of them."""
+    """Compares what is claimed of steps with what is true of them.
 
-    def __init__(self, case: Case, mode: str, delay: int) -> None:
+    Args:
+        case: What is attacked.
+        mode: Of the shield or loop.
+        delay: Steps from a decision to its effect.
+        kept_until: Until which age of the newest sample the box is said to be kept in silence, 0 for nothing.
+    """
+
+    def __init__(self, case: Case, mode: str, delay: int, kept_until: int = 0) -> None:
         self.case, self.outcome, self.delay = case, Outcome(), delay
-        self.claims_safe_set = mode not in ("lookahead", SILENCE)
+        self.claims_safe_set = mode != "lookahead"
         self.safe, self.box = region_of(case.certificate.safe_set), box_of(case.plant)
         counts = case.plant.between_samples is not None if case.at_all_times is None else case.at_all_times
         self.between = Between(case.plant) if counts else None
@@ -68,13 +72,22 @@ class Watch:
         self.oldest = np.inf if promised is None else promised.max_age - delay
         self.states: np.ndarray | None = None
         self.ages = np.zeros(1, np.int64)
-        self.held, self.left = np.zeros(1, np.bool_), np.zeros(1, np.int64)
+        self.held, self.trusted, self.kept_until = np.zeros(1, np.bool_), np.zeros(1, np.bool_), kept_until
         # Estimates, shapes and where an episode goes on, of the steps until they belong to the present.
         self.expected: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
-    def begin(self, states: np.ndarray, held: np.ndarray, left: np.ndarray, begun: Any = True) -> None:
-        """States (n, N); where they are guaranteed, how long the box is kept, and where episodes start, (N,) each."""
-        self.states, self.held, self.left = states, held, left
+    @property
+    def kept(self) -> np.ndarray:
+        """Where the box is said to be kept in the next step, shape (N,): as long as the newest sample is young enough.
+
+        That counts from states that were guaranteed while the contract was kept.
+        """
+        return self.trusted & (self.ages < self.kept_until)
+
+    def begin(self, states: np.ndarray, held: np.ndarray, begun: Any = True) -> None:
+        """States (n, N); where they are guaranteed, and where episodes start, (N,) each."""
+        self.states, self.held = states, held
+        self.trusted = np.where(begun | (self.ages <= self.oldest), held, self.trusted)
         for _, _, valid in self.expected:
             valid[:] &= ~np.broadcast_to(begun, valid.shape)
 
@@ -83,7 +96,6 @@ class Watch:
         states: np.ndarray,
         inputs: np.ndarray,
         held: np.ndarray,
-        left: np.ndarray,
         ages: np.ndarray,
         reasons: Any,
         goes_on: Any = True,
@@ -94,25 +106,25 @@ class Watch:
         if lost.any():
             outcome.lost |= set(np.atleast_1d(reasons)[lost])
         outcome.see(LASTS, 1.0 + (np.maximum(ages, self.ages) <= self.oldest), lost)
+        kept = goes_on & self.kept
         self.ages = ages
         out = self.box.gauges(states)
         outcome.see(BOX, out, held)
-        outcome.see(KEPT, out, goes_on & (self.left > 0))
-        outcome.see(FALL, (self.left - left).astype(float), np.broadcast_to(goes_on, held.shape))
+        if self.kept_until:
+            outcome.see(KEPT, out, kept)
         levels = self.safe.gauges(states)
         if self.claims_safe_set:
             outcome.see(SAFE_SET, levels, held)
         if self.between is not None:
-            claimed = goes_on & (self.held & held | (self.left > 0))
+            claimed = goes_on & (self.held & held | kept)
             outcome.see(ALL_TIMES, self.between.gauges(self.states, inputs), claimed)
         if self.case.contract is not None:
             outcome.see(AGE, ages / self.case.contract.max_age, np.ones_like(held))
         outcome.counts["steps"] += held.size
         outcome.counts["guaranteed"] += np.count_nonzero(held)
-        outcome.counts["kept"] += np.count_nonzero(left)
-        outcome.counts["kept though not guaranteed"] += np.count_nonzero(~held & (left > 0))
+        outcome.counts["kept in silence"] += np.count_nonzero(kept & (ages > self.oldest))
         outcome.counts["outside S"] += np.count_nonzero(held & (levels > 1.0))
-        self.begin(states, held, left, ~goes_on)
+        self.begin(states, held, ~goes_on)
 
     def compare(self, estimates: np.ndarray, shapes: np.ndarray, states: np.ndarray, alarmed: Any, first: bool) -> None:
         """Compares the estimates (n, N) that belong to these states now with what they claim, shapes (N, n, n).
@@ -158,7 +170,7 @@ def starts_of(case: Case, mode: str, rng: np.random.Generator, count: int) -> np
     plant, safe = case.plant, region_of(case.certificate.safe_set)
     scale = plant.half_widths if hasattr(safe, "rows") else np.sqrt(np.diag(case.certificate.L))
     starts = case.start * boundary(safe, scale, rng, count)
-    if mode not in ("lookahead", SILENCE):
+    if mode != "lookahead":
         return starts
     spread = rng.uniform(0.2, 0.95, count) * boundary(box_of(plant), plant.half_widths, rng, count)
     return np.where(rng.random(count) < 0.3, starts, spread)
@@ -175,8 +187,6 @@ def corners_of(plant: Any, rng: np.random.Generator, count: int | None) -> dict[
 
 def planning(case: Case, mode: str) -> dict[str, Any]:
     """Settings of a shield or loop in this mode."""
-    if mode == SILENCE:
-        return {"mode": "lookahead", "horizon": case.horizon, "least_safe_steps": case.horizon - 1}
     return {"mode": mode, "horizon": case.horizon if mode == "lookahead" else None}
 
 
@@ -184,7 +194,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
     """Attacks `SafetyShield`, or with a count `VectorSafetyShield`, around environments."""
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
     plant, certificate, nature, many = case.plant, case.certificate, Nature(), count is not None
-    first = box_ellipsoid(plant, 0.6) if "lookahead" in mode else Ellipsoid((0.999 * case.start) ** 2 * certificate.L)
+    first = box_ellipsoid(plant, 0.6) if mode == "lookahead" else Ellipsoid((0.999 * case.start) ** 2 * certificate.L)
     settings: dict[str, Any] = {
         "plant": plant,
         "channel": uplink,
@@ -209,10 +219,6 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         """A value of the infos with the environment as the last axis."""
         return np.moveaxis(np.asarray(value), 0, -1) if many else np.asarray(value)[..., None]
 
-    def kept(info: dict[str, Any]) -> np.ndarray:
-        """For how many steps the box is said to be kept."""
-        return column(info.get("shield_safe_steps", np.zeros(count or (), np.int64)))
-
     watch, size = Watch(case, mode, env.downlink_protocol.input_delay), count or 1
     nature.adversary = adversary = Adversary(plant, certificate, rng, size)
     outcome, counts = watch.outcome, watch.outcome.counts
@@ -223,7 +229,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
             states = starts_of(case, mode, rng, size)
             options = {"state": states.T if many else states[:, 0], **corners_of(plant, rng, count)}
         _, info = shield.reset(seed=seed if watch.states is None else None, options=options)
-        watch.begin(column(info["state"]), column(info["shield_guaranteed"]), kept(info), begun)
+        watch.begin(column(info["state"]), column(info["shield_guaranteed"]), begun)
         counts["starts outside S"] += np.count_nonzero(watch.held & (watch.safe.gauges(watch.states) > 1.0))
         return info
 
@@ -243,7 +249,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         *_, info = shield.step(actions.T if many else actions[:, 0])
         held, ages = column(info["shield_guaranteed"]), column(info["measurement_age"])
         goes_on = env.episodes == episodes
-        watch.step(column(info["state"]), column(info["input"]), held, kept(info), ages, info["shield_reason"], goes_on)
+        watch.step(column(info["state"]), column(info["input"]), held, ages, info["shield_reason"], goes_on)
         broken = ["contract_broken", "downlink_broken", *([] if case.process else ["assumption_violated"])]
         outcome.lost |= {key for key in broken if np.any(info[key])}
         planned = np.asarray(info.get("shield_plan_length", 0))
@@ -280,6 +286,7 @@ def through_loop(
     late: int = 0,
     is_silent: bool = False,
     has_outages: bool = False,
+    more: int | None = None,
     rough: float = 1.0,
 ) -> Outcome:
     """Attacks `SafeLoop` beside a plant that is written out here, with worst noise and traffic of any pattern.
@@ -294,6 +301,7 @@ def through_loop(
         late: How many steps older than promised samples may be.
         is_silent: Whether no sample arrives at all.
         has_outages: Whether now and then none arrives for up to three times as long as plans are.
+        more: For how many steps more than `silence_of` says the box is said to be kept in silence.
         rough: By how much disturbances are larger than assumed.
     """
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
@@ -305,7 +313,9 @@ def through_loop(
     behind = {"downlink": downlink} if aware else {}
     loop = SafeLoop(certificate, plant, channel, on_unproved="ignore", **planning(case, mode), **behind)
     outage = 0
-    adversary, watch = Adversary(plant, certificate, rng, 1), Watch(case, mode, loop.input_delay)
+    silence = None if more is None else silence_of(certificate, plant)
+    kept_until = 0 if silence is None or more is None else silence.max_age + silence.anywhere + more
+    adversary, watch = Adversary(plant, certificate, rng, 1), Watch(case, mode, loop.input_delay, kept_until)
     counts, D = watch.outcome.counts, rough**2 * plant.disturbance.shape_matrix
     N = plant.sensor_error_with(uplink.quantization_step).shape_matrix
     for step in range(steps):
@@ -313,7 +323,7 @@ def through_loop(
             x = starts_of(case, mode, rng, 1)
             present = x + farthest(plant.initial_error.shape_matrix, adversary.axes)
             loop.start(present[:, 0], initial_set=x[:, 0])
-            watch.begin(x, np.array([loop.guaranteed]), np.array([loop.safe_steps]))
+            watch.begin(x, np.array([loop.guaranteed]))
             uplinks, downlinks = Traffic(oldest, max_age, 1), Traffic(delay, delay, 1)
             actuator, commands, samples = Actuator(delay, plant.m, limits), deque(maxlen=delay + 1), []
             actuator.start(loop.episode)
@@ -336,8 +346,7 @@ def through_loop(
         if has_outages:
             outage = max(outage - 1, 0) or (rng.random() < 0.1) * int(rng.integers(1, 3 * case.horizon))
         loop.receive([] if is_silent or outage else hostile_packets(rng, arrived, k + 1))
-        held, left = np.array([loop.guaranteed]), np.array([loop.safe_steps])
-        watch.step(x, u[:, None], held, left, np.array([loop.measurement_age]), loop.reason)
+        watch.step(x, u[:, None], np.array([loop.guaranteed]), np.array([loop.measurement_age]), loop.reason)
         counts["overridden"] += decision.intervened
         counts["planned"] += len(decision.plan) > 0
         counts["stored"] += bool(decision.stored)

@@ -69,20 +69,19 @@ def farthest_out_of_box(plant, x_hat, shape, plan, step):
     return np.abs(extreme_ends(plant, x_hat, shape, plan, both, step) @ plant.box_rows.T).max()
 
 
-@pytest.mark.parametrize("shortest", [1, 2, STEPS])
-def test_what_may_not_begin_a_plan_begins_none_of_many(case, shortest):
+def test_what_may_not_begin_a_plan_begins_none_of_many(case):
     plant, certificate, test = case
     rng = np.random.default_rng(5)
     estimates, shapes, plans = situations(plant, certificate, rng, 300)
     others = plant.u_max * rng.choice([-1.0, 0.0, 1.0], (300, 40, STEPS, plant.m))
     others[:, :, 0] = plans[:, :, 0]
     tightening = test.tightenings_of(shapes)
-    certified = test.certified(estimates, tightening, np.concatenate([plans, others], axis=1), shortest)
-    may = test.may_begin(estimates, tightening, plans[:, 0, 0], shortest)
+    certified = test.certified(estimates, tightening, np.concatenate([plans, others], axis=1))
+    may = test.may_begin(estimates, tightening, plans[:, 0, 0])
     assert certified[may].any()
     assert not certified[~may].any()
-    assert may.all() == (shortest == 1 and certificate.polytope is None)  # there the end, S, is not looked at
-    assert not test.may_begin(np.full_like(estimates, np.nan), tightening, plans[:, 0, 0], shortest).any() or may.all()
+    assert may.all() == (certificate.polytope is None)  # there the end, S, is not looked at
+    assert not test.may_begin(np.full_like(estimates, np.nan), tightening, plans[:, 0, 0]).any() or may.all()
 
 
 def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):

@@ -10,7 +10,7 @@ from shields.runtime.backup_plans.plan_search import Plans
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
-from tests.shields.attacks.cases import box_ellipsoid, plan_case
+from tests.shields.attacks.cases import box_ellipsoid, case, plan_case
 
 COUNT = 6
 
@@ -186,3 +186,30 @@ def test_final_info_says_what_the_last_decision_stored():
             assert (info["shield_plan_length"] == 0).all()  # starts are in S
             assert info["final_info"]["_shield_plan_length"].all()
     assert max(lengths) > 0
+
+
+@pytest.mark.parametrize("wrong", [np.nan, 1e3], ids=["a gap", "beyond the limits"])
+def test_what_is_no_plan_counts_as_none_of_many_loops_too(wrong):
+    cart, horizon = case("cart-pole"), 12
+    made, plant, error = (
+        SafetyFilter(cart.certificate, cart.plant, "lookahead", horizon),
+        cart.plant,
+        cart.certificate.Sigma,
+    )
+    lost = np.full((2, plant.n), 10.0) * plant.half_widths  # no plan is found
+    proposals, stored = np.array([[np.nan], [0.0]]), np.full((2, horizon, plant.m), np.nan)
+    stored[:, :4] = 0.1 * plant.u_max
+    decided = made.decide_many(lost, error, proposals, stored)
+    np.testing.assert_array_equal(decided.reason, "stored")
+    stored[:, 0] = wrong
+    decided = made.decide_many(lost, error, proposals, stored)
+    alone = [made.decide(x, error, u, plan) for x, u, plan in zip(lost, proposals, stored, strict=True)]
+    assert [*decided.reason] == [each.reason for each in alone] == ["invalid", "fallback"]
+    np.testing.assert_array_equal(decided.input, [each.input for each in alone])
+    assert np.isnan(decided.plan).all()
+
+
+def test_horizon_of_numpy_is_that_of_a_spec():
+    env = SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), mode="lookahead", horizon=np.int64(6))
+    made = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert made.get_wrapper_attr("horizon") == 6

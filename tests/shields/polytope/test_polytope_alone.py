@@ -12,9 +12,8 @@ from shields.synthesis.design_problem import design_problem
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.polytope_certificates import certify_polytope
 from shields.synthesis.polytope_gain import most_tolerant_gain, polytope_margin
-from shields.synthesis.requirement_search import with_radii
-from tests.certificates import certificate_of, feasible_bounds_not_sought
-from tests.plants import named, servo
+from tests.certificates import certificate_of, feasible_age_not_sought
+from tests.plants import named, servo, with_radii
 from tests.verdicts import verified
 
 AGE = ChannelContract(3)
@@ -40,7 +39,7 @@ def test_where_no_ellipsoid_is_found_a_polytope_is_and_both_verifiers_prove_it()
 @pytest.mark.parametrize("name", ["servo", pytest.param("servo, at all times", marks=pytest.mark.slow)])
 def test_ellipsoid_that_is_asked_for_is_infeasible_where_only_a_polytope_is_found(name):
     with (
-        feasible_bounds_not_sought(),
+        feasible_age_not_sought(),
         pytest.raises(Infeasible, match=r"\(I\) no invariant ellipsoid in the box|between two samples"),
     ):
         synthesize(found(name)[1], contract=AGE, safe_set="ellipsoid")
@@ -94,10 +93,7 @@ def test_margin_of_a_gain_is_what_errors_and_disturbances_reach_together(seed):
         reached.append(used)
     assert 1.0 / max(reached) == pytest.approx(margin, rel=1e-6)
     _, physical = problem.to_physical(np.eye(2), K)
-    certified = [
-        certify_polytope(with_radii(plant, disturbance=f * margin, noise=f * margin), physical, AGE)
-        for f in (0.99, 1.02)
-    ]
+    certified = [certify_polytope(with_radii(plant, f * margin), physical, AGE) for f in (0.99, 1.02)]
     assert certified[0] is not None
     assert certified[1] is None
 
@@ -108,7 +104,7 @@ def test_more_tolerant_gain_is_found_and_carried_over_to_easier_problems():
     start = max_margin_gain(problem, problem.covering_error_shape)
     margin = most_tolerant_gain(problem, start).margin
     assert margin >= polytope_margin(problem, start.K) > 1.15 * start.margin
-    hardest = with_radii(plant, disturbance=0.98 * margin, noise=0.98 * margin)
+    hardest = with_radii(plant, 0.98 * margin)
     certificate = nearby_certificate(hardest, AGE)
     assert not certificate.keeps_ellipsoid
     assert nearby_certificate(hardest, AGE, polytope=False) is None

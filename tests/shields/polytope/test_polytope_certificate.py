@@ -21,8 +21,8 @@ from shields import synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
-from shields.synthesis import polytope_certificates
-from shields.synthesis.polytope_certificates import certify_polytope, with_largest_polytope, with_polytope
+from shields.synthesis.polytope_certificates import certify_polytope, polytope_share, with_polytope
+from shields.synthesis.polytope_gain import regulators
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -52,20 +52,6 @@ def test_polytopes_fill_much_more_of_the_box_and_both_verifiers_prove_them(name)
     assert wide.polytope.gauge(points).max() <= 1.0 + 1e-5
 
 
-@pytest.mark.parametrize(
-    ("name", "before", "after"),
-    [("TruckTrailerCruise", 0.95, 0.98), pytest.param("BatchReactor", 0.76, 0.81, marks=pytest.mark.slow)],
-)
-def test_gain_with_the_largest_polytope_is_kept_proved_and_says_what_it_gained(name, before, after):
-    wide, certificate, plant = found(name)
-    wider = with_largest_polytope(certificate, plant)
-    shares = [each.provenance["polytope_share_of_box"] for each in (wide, wider)]
-    assert shares[0] == wider.provenance["share_with_gain_of_ellipsoid"] < before < after < shares[1]
-    assert f"{100.0 * shares[1]:.4g} % of the safe box's volume ({100.0 * shares[0]:.3g} % with the gain" in str(wider)
-    assert verified(wider, plant).valid
-    assert (wider.K != wide.K).any()
-
-
 @pytest.mark.parametrize("name", IDS)
 def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
     wide, certificate, plant = found(name)
@@ -78,55 +64,13 @@ def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
 
 
 @pytest.mark.slow
-def test_gain_of_the_ellipsoid_stays_where_no_other_has_a_larger_polytope():
-    all_of_the_box = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, **QUIET)
-    assert_gain_stays(all_of_the_box)
-    tilted = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0], [0.9]], u_max=1.0, **QUIET)
-    assert search.points_of_box(tilted, 4) is None
-    assert_gain_stays(tilted)
-
-
-QUIET = {"dt": 1.0, "disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
-
-
-def assert_gain_stays(plant):
-    certificate = synthesize(plant)
-    assert certificate.polytope is not None
-    assert synthesize(plant, search_gain=True) == certificate
-
-
-@pytest.mark.slow
 def test_polytope_of_a_candidate_is_kept_where_it_is_larger():
-    wide, certificate, plant = found("TruckTrailerCruise")
-    wider = with_largest_polytope(certificate, plant)
+    wide, _, plant = found("TruckTrailerCruise")
+    others = [certify_polytope(plant, K) for K in regulators(plant)]
+    wider = max(filter(None, others), key=polytope_share)
     again = synthesize(plant, candidates=[wider])
-    shares = [each.provenance["polytope_share_of_box"] for each in (wide, wider, again)]
-    assert shares[0] < shares[1] <= shares[2]
+    assert polytope_share(wide) < polytope_share(wider) <= polytope_share(again)
     assert verified(again, plant).valid
-
-
-def test_search_for_a_gain_that_fails_keeps_the_polytope_of_the_first_gain(monkeypatch):
-    wide, certificate, plant = found("TruckTrailerCruise")
-
-    def failing(*_, **__):
-        raise np.linalg.LinAlgError("singular")
-
-    monkeypatch.setattr(polytope_certificates, "certify_polytope", failing)
-    assert with_largest_polytope(certificate, plant) == wide
-    with pytest.raises(ValueError, match="search_gain"):
-        synthesize(plant, search_gain="no")
-
-
-def test_interrupted_search_for_a_gain_keeps_the_polytope_of_the_first_gain():
-    wide, certificate, plant = found("TruckTrailerCruise")
-
-    def interrupt(line):
-        if line.startswith("gain of the polytope"):
-            raise KeyboardInterrupt
-
-    with pytest.raises(SynthesisInterrupted, match="the first gain's") as interrupted:
-        with_largest_polytope(certificate, plant, interrupt)
-    assert interrupted.value.certificate == wide
 
 
 def test_default_has_a_polytope_around_the_same_ellipsoid_bit_for_bit():

@@ -152,8 +152,6 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
             ("penalty", -1.0, "penalty must be"),
             ("penalty", np.nan, "penalty must be"),
             *(("on_unproved", wrong, UNPROVED) for wrong in ("log", None, ["warn"])),
-            ("least_safe_steps", 3, "least_safe_steps is for mode \"lookahead\", mode 'project' takes none"),
-            *(("least_safe_steps", wrong, "must be a whole number") for wrong in (50, -1, 2.5, False, None)),
         )
     ],
     *[
@@ -198,11 +196,6 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         (partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", wrong), ValueError, "horizon")
         for wrong in (0, -1, 51, 2.5, "3", True, np.nan)
     ],
-    (
-        partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", 6, 6),
-        ValueError,
-        "takes plans of 7 steps, got horizon = 6",
-    ),
     (lambda: SafetyFilter(CERTIFICATE, THIRTEEN, "boundary"), ValueError, "at most 12 inputs, got 13"),
     (lambda: safety_filter().fallback_input(np.zeros(3)), ValueError, r"shape \(2,\)"),
     (lambda: safety_filter().fallback_input([np.nan, 0.0]), ValueError, r"shape \(2,\)"),

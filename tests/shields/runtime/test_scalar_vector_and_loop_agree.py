@@ -64,7 +64,6 @@ class Feature:
     safe_set: str = "ellipsoid"
     options: dict[str, Any] | None = None
     count: int = 2
-    least_safe_steps: int = 0
 
 
 OUTSIDE = {"state": np.array([[1.99, 1.98], [0.0, 0.0], [-2.05, 1.0]])}
@@ -77,18 +76,7 @@ GOES_ON, NEVER = ("", guarantee.NOT_KNOWN_INSIDE), (guarantee.NO_DOWNLINK_CONTRA
 FEATURES = {
     "one input, in every mode": Feature(TRUCK, {"channel": SPARSE, "disturbance": "adversarial"}, MODES),
     "an unstable plant with a contract": Feature(CART, LATE_CART, ("project", "lookahead", "monitor")),
-    "steps for which the box is kept": Feature(
-        CART, LATE_CART, ("lookahead",), GOES_ON, options=CART_ANYWHERE, count=3, least_safe_steps=6
-    ),
-    "steps for which the box is kept behind a downlink": Feature(
-        TRUCK,
-        {"channel": SPARSE, "downlink": KEPT},
-        ("lookahead",),
-        GOES_ON,
-        options=OUTSIDE,
-        count=3,
-        least_safe_steps=3,
-    ),
+    "starts all over the box": Feature(CART, LATE_CART, ("lookahead",), GOES_ON, options=CART_ANYWHERE, count=3),
     "limits of rates and of both together": Feature(
         RATES, {"channel": SPARSE, "disturbance": "adversarial"}, MODES, safe_set="polytope"
     ),
@@ -191,7 +179,7 @@ def test_scalar_shields_vector_shields_and_loops_agree(name, mode, reset):
     settings = {"max_episode_steps": 11, "autoreset_mode": reset} | feature.settings
     many = NCSVectorEnv(feature.count, plant=feature.plant, **settings)
     certificate = certificate_of(feature.plant, many.certificate_contract, feature.safe_set)
-    seen = compare(many, 34, feature.options, certificate, mode, (1, 7, 25), feature.least_safe_steps)
+    seen = compare(many, 34, feature.options, certificate, mode, (1, 7, 25))
     # Nothing keeps the state in S, and after an outage the error is too large for a while.
     doubts = {guarantee.NOT_KNOWN_INSIDE, guarantee.LARGE_ERROR} if mode == "monitor" else set()
     assert set(feature.reasons) <= seen.reasons <= set(feature.reasons) | doubts

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
-from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible, synthesize
 from shields.errors import SynthesisInterrupted
 from shields.synthesis.design_problem import design_problem
-from shields.synthesis.diagnosis import Clock, with_feasible_bounds
+from shields.synthesis.diagnosis import Clock, with_age_that_helps
 from shields.synthesis.max_margin_gain import max_margin_gain
-from tests.certificates import feasible_bounds_not_sought
+from tests.certificates import feasible_age_not_sought
 from tests.plants import random_plant
 from tests.verdicts import verified
 
@@ -39,7 +39,7 @@ def test_its_margin_is_what_exact_verification_accepts(make):
     margin = max_margin_gain(problem, problem.covering_error_shape).margin
     tolerated = radii_scaled(plant, 0.99 * margin)
     assert verified(synthesize(tolerated, contract=contract, safe_set="ellipsoid"), tolerated).valid
-    with feasible_bounds_not_sought(), pytest.raises(Infeasible, match="radii shrink to") as caught:
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match="radii shrink to") as caught:
         synthesize(radii_scaled(plant, 2.0 * margin), contract=contract, safe_set="ellipsoid")
     assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
 
@@ -106,21 +106,10 @@ SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound
 
 
 @pytest.mark.slow
-def test_largest_gamma_and_age_are_what_synthesis_accepts():
-    bounds = {"gamma": 1e-2, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
+def test_age_that_is_named_is_nearly_the_largest_that_synthesis_accepts():
+    bounds = {"gamma": 1e-7, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
     plant = LinearPlant(**PENDULUM | bounds)
-    with pytest.raises(Infeasible, match=r"gamma = .* or less") as caught:
-        synthesize(plant, contract=ChannelContract(4, 1e-4), safe_set="ellipsoid")
-    gamma = caught.value.details["largest_gamma"]
-    assert 0.0 < gamma < 1e-2
-    smaller = replace(plant, gamma=0.98 * gamma)
-    assert synthesize(smaller, contract=ChannelContract(4, 1e-4), safe_set="ellipsoid").keeps_ellipsoid
-    larger = replace(plant, gamma=1.05 * gamma)
-    with feasible_bounds_not_sought(), pytest.raises(Infeasible):
-        synthesize(larger, contract=ChannelContract(4, 1e-4), safe_set="ellipsoid")
-    assert not synthesize(larger, contract=ChannelContract(4, 1e-4)).keeps_ellipsoid
-    plant = replace(plant, gamma=1e-7)
-    with pytest.raises(Infeasible, match=r"max_age = .* or less") as caught:
+    with pytest.raises(Infeasible, match="there is a certificate for max_age = ") as caught:
         synthesize(plant, contract=ChannelContract(40, 1e-3), safe_set="ellipsoid")
     age = caught.value.details["max_age"]
     problem, _ = design_problem(plant, ChannelContract(age, 1e-3))
@@ -129,49 +118,10 @@ def test_largest_gamma_and_age_are_what_synthesis_accepts():
     assert max_margin_gain(problem, problem.covering_error_shape).margin < 1.0 + 1e-4
 
 
-TOO_LARGE = {
-    "disturbance_bound": [0.05, 0.3],
-    "sensor_bound": 0.2,
-    "initial_bound": (np.eye(2), [0.2, 0.2]),
-    "process_noise_cov": 1e-3 * np.eye(2),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "value", "safe_set"),
-    [
-        ("disturbance_bound", TOO_LARGE["disturbance_bound"], "polytope"),
-        *(slow(name, value, "ellipsoid") for name, value in TOO_LARGE.items()),
-        *(slow(name, value, "polytope") for name, value in TOO_LARGE.items()),
-    ],
-)
-def test_message_names_what_was_declared_and_the_largest_factor_that_works(name, value, safe_set):
-    plant = LinearPlant(**PENDULUM | SMALL | {name: value})
-    with pytest.raises(Infeasible, match=rf"{name} or less") as caught:
-        synthesize(plant, contract=ChannelContract(0), safe_set=safe_set)
-    assert "gamma" not in str(caught.value)
-    assert all(declared in str(caught.value) for declared in SMALL)
-    factor = caught.value.details[f"{name}_factor"]
-    assert f"{factor:.3g} times the given {name}" in str(caught.value)
-
-    def scaled(by):
-        size = value if name == "process_noise_cov" else getattr(plant, name)
-        return replace(
-            plant, **{name: Ellipsoid(by**2 * size.shape_matrix) if isinstance(size, Ellipsoid) else by * size}
-        )
-
-    assert synthesize(scaled(0.98 * factor), contract=ChannelContract(0), safe_set=safe_set) is not None
-    with feasible_bounds_not_sought(), pytest.raises(Infeasible):
-        synthesize(scaled(1.05 * factor), contract=ChannelContract(0), safe_set=safe_set)
-
-
-@pytest.mark.slow
-def test_bounds_of_a_stable_plant_are_named_without_a_contract_too():
+def test_disturbance_that_exceeds_a_limit_alone_is_named():
     plant = truck_trailer(gamma=0.0, disturbance_bound=2.0, process_noise_cov=np.zeros((2, 2)), sensor_bound=0.01)
-    largest = r"times the given disturbance_bound or less.*finds none with a smaller sensor_bound "
     exceeded = r"the disturbance of one step alone reaches [\d.]+ times the limit \|coupling stretch\| <= 2 m"
-    with pytest.raises(Infeasible, match=f"{exceeded}.*{largest}"):
+    with pytest.raises(Infeasible, match=exceeded):
         synthesize(plant)
 
 
@@ -188,8 +138,9 @@ def test_sensor_that_is_louder_than_the_box_is_wide_is_named():
 
 
 def test_first_error_that_is_larger_than_the_box_is_named():
-    plant, clock = drone(initial_bound=[5.0, 1.0]), Clock(0.0)  # no change is sought
-    told = with_feasible_bounds(Infeasible("none", "I", 0.5), plant, ChannelContract(3), clock=clock)
+    plant, over = drone(initial_bound=[5.0, 1.0]), Clock(0.0)  # no age is sought
+    told = with_age_that_helps(Infeasible("none", "I", 0.5), plant, ChannelContract(3), lambda promised: True, over)
+    assert told.details == {}
     assert "the error of the first estimate alone reaches 7.07 times the limit |x1| <= 1" in str(told)
     assert "|x2|" not in str(told)
 
@@ -202,12 +153,12 @@ def test_plant_that_no_gain_stabilizes_is_not_blamed_on_its_bounds():
     assert caught.value.details == {"share_of_radii": 0.0}
 
 
-def test_interrupted_search_for_feasible_bounds_says_why_there_is_no_certificate():
+def test_interrupted_search_for_feasible_ages_says_why_there_is_no_certificate():
     def progress(line):
         if line.startswith("no certificate"):
             raise KeyboardInterrupt
 
-    with pytest.raises(SynthesisInterrupted, match=r"interrupted while feasible bounds were sought: \(I\)") as caught:
+    with pytest.raises(SynthesisInterrupted, match=r"interrupted while feasible ages were sought: \(I\)") as caught:
         synthesize(truck_trailer(gamma=0.5), progress=progress)
     assert caught.value.certificate is None
 
