@@ -16,6 +16,7 @@ from ncs_gym.network.channel import in_time
 from shields import CertificateError, VectorSafetyShield, certificate_for
 from shields.silence import MOST_STEPS, way_back
 from shields.synthesis.faces import Extremes, Faces
+from shields.synthesis.polytope_certificates import certify_polytope
 from tests.certificates import certificate_of
 from tests.plants import named, small
 
@@ -163,7 +164,7 @@ def test_a_resting_point_that_is_no_equilibrium_moves_the_estimate():
     bounds = {"sensor_bound": 0.003, "initial_bound": 0.003}
     given = {"A": [[1.02, 0.05], [0.0, 0.9]], "B": [[0.1], [0.2]], "box": np.eye(2), "dt": 0.1, "u_max": 2.0}
     plant, wide = (LinearPlant(**given, **bounds, disturbance_bound=each) for each in (0.001, 0.005))
-    found, x_c = certificate_of(wide, ChannelContract(3), "polytope"), np.array([0.1, 0.0])
+    found, x_c = certify_polytope(wide, np.array([[-0.87, -0.75]]), ChannelContract(3)), np.array([0.1, 0.0])
     moved = replace(
         found,
         fingerprint=plant.fingerprint,

@@ -123,12 +123,12 @@ def test_remainder_that_the_box_cannot_bear_is_named():
         synthesize(plant, contract=ChannelContract(0))
 
 
-def test_family_that_the_box_cannot_bear_is_named_by_the_ranges_of_its_parameters():
+def test_family_that_the_box_cannot_bear_is_told_what_share_of_its_radii_would_do():
     def furnace(loss):
         bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.02, "initial_bound": 0.02}
         return LinearPlant(A=[[1.0 - 0.1 * loss]], B=[[0.05]], dt=0.1, box=[1.0], u_max=2.0, **bounds)
 
-    with pytest.raises(Infeasible, match=r"remainder or less \(shrink the ranges of the parameters\)"):
+    with pytest.raises(Infeasible, match=r"radii shrink to 13\.\d% of those given"):
         synthesize(LinearPlant.family(furnace, {"loss": (-6.0, 8.0)}, monotone=True))
 
 
