@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
-from functools import partial, reduce
+from dataclasses import dataclass, fields, replace
+from functools import reduce
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -42,7 +42,7 @@ _OWN = ("A", "B", "continuous_model", "step_offset")
 _ROUNDED = ("box", "box_ends", "input_ends", "mixed_rows", "mixed_ends")
 SAME = 1e-9
 # Bounds of disturbances that hold this rounding agree to this, in limits of the states.
-SAME_BOUND = 1e-10
+SAME_BOUND = 1e-8
 
 
 def plant_of_middle(
@@ -227,7 +227,7 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
         function=function,
         interval=interval,
         center=_center_of(plants),
-        check=partial(_require_shared, kind, first, cover, "another one"),
+        check=_Shared(first, cover, "another one"),
     )
     checked = _check_monotone(family, room)
     shown_ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(names, ends, strict=True))
@@ -266,7 +266,7 @@ def _require_alike(kind: type[P], plants: list[P]) -> None:
         _require_member(kind, plants[0], each)
     first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
     for number, each in enumerate(plants):
-        _require_shared(kind, first, cover, f"member {number}", each)
+        _Shared(first, cover, f"member {number}")(each)
 
 
 def _require_member(kind: type[P], first: P, plant: Any) -> None:
@@ -280,26 +280,32 @@ def _require_member(kind: type[P], first: P, plant: Any) -> None:
     matrices_of(plant, (first.n, first.n + first.m + 1), np.zeros(plant.n + plant.m))
 
 
-def _require_shared(kind: type[P], first: P, cover: Ellipsoid | None, name: str, plant: Any) -> None:
-    """Raises ValueError unless a plant, counted from where the first one is, has all that members share.
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """What all members share: that of the first one, counted from where the family rests.
 
-    Args:
-        kind: Class of the plants.
+    Attributes:
         first: The first member.
         cover: The family's bound of disturbances.
-        name: What the message calls the plant.
-        plant: The plant.
+        name: What messages call another member.
     """
-    _require_member(kind, first, plant)
-    moved = _around_center(plant, _resting_points([first])[0])
-    for entry in fields(moved):
-        one, other = getattr(first, entry.name), getattr(moved, entry.name)
-        tolerance = SAME if entry.name in _ROUNDED else 0.0
-        if entry.name not in (*_OWN, "disturbance_bound") and not _is_same(one, other, tolerance):
-            raise ValueError(
-                f"the members of a family may differ in A and B alone, and {name} has another {entry.name}"
-            )
-    _require_covered(first, cover, plant, name)
+
+    first: LinearPlant
+    cover: Ellipsoid | None
+    name: str
+
+    def __call__(self, plant: Any) -> None:
+        """Raises ValueError unless a plant, counted from where the first one is, has all that members share."""
+        _require_member(type(self.first), self.first, plant)
+        moved = _around_center(plant, _resting_points([self.first])[0])
+        for entry in fields(moved):
+            one, other = getattr(self.first, entry.name), getattr(moved, entry.name)
+            tolerance = SAME if entry.name in _ROUNDED else 0.0
+            if entry.name not in (*_OWN, "disturbance_bound") and not _is_same(one, other, tolerance):
+                raise ValueError(
+                    f"the members of a family may differ in A and B alone, and {self.name} has another {entry.name}"
+                )
+        _require_covered(self.first, self.cover, plant, self.name)
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:

@@ -243,6 +243,7 @@ def reordered(certificate, plant, order):
         initial_cov=plant.initial_cov[square],
         error_gain=None if plant.error_gain is None else plant.error_gain[:, order],
         operating_state=plant.operating_state[order],
+        continuous_model=None,
         **bounds,
         **names,
     )
