@@ -10,7 +10,6 @@ from scipy.linalg import null_space
 from torch import nn
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.safety_filter import SafetyFilter
 
@@ -43,7 +42,6 @@ class SafeLayer(nn.Module):
         ValueError: If the error shape is no positive semidefinite matrix.
     """
 
-    @own_error_state
     def __init__(self, certificate: Certificate, plant: LinearPlant, error_shape: Any = None) -> None:
         super().__init__()
         self.filter = SafetyFilter(certificate, plant)
@@ -54,7 +52,6 @@ class SafeLayer(nn.Module):
     def __deepcopy__(self, memo: dict[int, Any]) -> SafeLayer:
         return self  # nothing in it is learned
 
-    @own_error_state
     def forward(
         self, actions: torch.Tensor, estimates: torch.Tensor, error_shapes: torch.Tensor | None = None
     ) -> torch.Tensor:
@@ -120,7 +117,6 @@ class _Projected(torch.autograd.Function):
         return (gradients[0][:, :, None] * jacobians).sum(dim=1), None, None, None
 
 
-@own_error_state
 def projection_jacobians(
     shield: SafetyFilter, estimates: np.ndarray, error_shapes: np.ndarray, proposals: np.ndarray
 ) -> np.ndarray:

@@ -13,7 +13,6 @@ from scipy.optimize import linprog
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
 from ncs_gym.network.contract import MAX_AGE
-from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.diagnosis import margin_of
@@ -164,7 +163,6 @@ def contract_of_age(age: float, quantization_step: float) -> ChannelContract | N
 Executor = Callable[[Sequence[Search]], Iterable[Mapping[float, Answer]]]
 
 
-@own_error_state
 def requirements(
     plant: LinearPlant | Callable[[float], LinearPlant],
     *,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
-from ncs_gym.validation import own_error_state, read_only
+from ncs_gym.validation import read_only
 from shields.runtime.rows_within_step import RowsWithinStep, closed, rows_within_step, supports
 from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, judged_shapes
 
@@ -84,20 +84,17 @@ class PlanTest:
         every = slice(None)
         return self._row_limits(estimates, tightening, every, every), self._radius(estimates, tightening, every)
 
-    @own_error_state  # what is not finite is not certified
     def _row_limits(self, estimates: np.ndarray, tightening: Tightening, steps: slice, rows: slice) -> np.ndarray:
         """Returns what `limits_at` says of some steps and rows."""
         limits, rounding = tightening.row_limits[:, steps, rows], self._row_rounding[steps, rows]
         size = np.abs(estimates) @ rounding.reshape(-1, estimates.shape[1]).T
         return limits - size.reshape(limits.shape) - self._margin
 
-    @own_error_state
     def _radius(self, estimates: np.ndarray, tightening: Tightening, steps: slice) -> np.ndarray:
         """Returns the same of the cone at some steps."""
         radius = tightening.radius[:, steps] - np.abs(estimates) @ self._end_rounding[:, steps]  # may be far below zero
         return np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
-    @own_error_state  # with what is not finite no plan begins
     def may_begin(self, estimates: np.ndarray, tightening: Tightening, firsts: np.ndarray, shortest: int) -> np.ndarray:
         """Returns where a plan of at least `shortest` inputs may begin with an input, (E, m); shape (E,).
 
@@ -122,7 +119,6 @@ class PlanTest:
         limits = self._row_limits(estimates, tightening, steps, rows) + self._reach_of_others[steps, rows]
         return np.all(np.abs(values + others) <= limits, axis=2)
 
-    @own_error_state
     def certified(
         self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, shortest: int = 1
     ) -> np.ndarray:
@@ -173,7 +169,6 @@ class PlanTest:
         radius = self._radius(estimates, tightening, steps)
         return np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
 
-    @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between all ends: x is in the box then."""
         count, extents = len(self.prediction.plant.box), np.sqrt(np.diag(error_shape))
@@ -377,7 +372,6 @@ class Tightening(NamedTuple):
         return Tightening(*(part[chosen] for part in self))
 
 
-@own_error_state  # what overflows passes no test
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 
