@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ncs_gym import NCSVectorEnv
-from ncs_gym.validation import AroundEnvironment, require_batched_infos, require_not_inside
+from ncs_gym.validation import require_batched_infos
 
 # Networks of control loops are small: more threads wait for each other, pay off at batches of 16384 only, and make
 # results depend on their number. Set once, at the import, so that torch.set_num_threads afterwards has the last word.
@@ -33,7 +33,7 @@ INFO_KEYWORDS = ("cost", "shield_intervened", "shield_correction", "shield_guara
 _EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
 
 
-class SB3VecEnv(AroundEnvironment, VecEnv):
+class SB3VecEnv(VecEnv):
     """A gymnasium `VectorEnv` as a stable-baselines3 `VecEnv`.
 
     stable-baselines3 expects the step that ends an episode to return the first observation of the next episode, and
@@ -63,8 +63,6 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         ValueError: If episodes cannot be restarted in the step that ends them and that is not allowed, or if
             observations are not arrays.
     """
-
-    _inside = "_made_around"
 
     def __init__(
         self,
@@ -100,7 +98,6 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         self.batch_info: dict[str, Any] = {}
         self._started = time.time()
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
-        self._made_around = vector_env
 
     def reset(self) -> np.ndarray:
         """Starts all episodes, with the seeds and options given by `seed` and `set_options`, which are for these only.
@@ -208,14 +205,11 @@ class SB3VecEnv(AroundEnvironment, VecEnv):
         """Sets an attribute of environments of gymnasium's sync and async vector environments, all at once.
 
         Raises:
-            AttributeError: For any other vector environment, whose environments are not objects of their own, and for
-                what a wrapper of vector environments around them has.
+            AttributeError: For any other vector environment, whose environments are not objects of their own.
         """
         inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
         if not isinstance(inner, _WITH_RESET_MASK[1:]):
-            require_not_inside(attr_name, self.vector_env, "SB3VecEnv")
             raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
-        require_not_inside(attr_name, self.vector_env, "SB3VecEnv", until=inner)
         values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
         for e in chosen:
             values[e] = value

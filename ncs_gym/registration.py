@@ -129,9 +129,6 @@ class Factory:
         own |= {"plant": read, "disturbance": self._disturbance(read)}
         if self.start is not None and getattr(read, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
-        if misplaced := sorted(given.keys() & Channel.__dataclass_fields__.keys()):
-            name = misplaced[0]
-            raise ValueError(f"{name} is a setting of the channel: give channel=Channel({name}=...), or its dictionary")
         for name, value in given.items():
             if name in kinds or name == "terminate_on_violation":
                 if value is not None:

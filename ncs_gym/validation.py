@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import copy
 import math
-import re
 import sys
 import warnings
-from collections.abc import Callable
-from functools import cached_property, wraps
 from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, ParamSpec, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 
@@ -27,33 +24,8 @@ MAX_QUOTED_LENGTH, LONGEST_TEXT = 200, 1000
 FILLED_IN_LATER: Any = None
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-# The packages, what makes their dataclasses, and what `own_error_state` puts between.
+# The packages, what makes their dataclasses, and what `np.errstate` puts between.
 _OURS = "ncs_gym.", "shields.", "dataclasses", "numpy._core."
-
-# Decorates every public door that computes with numbers from outside, for all threads at once. What numpy does about
-# overflow, underflow and NaN is the caller's to say, and "raise" would interrupt a step of a loop; here what is not
-# finite is looked for where it counts.
-own_error_state = np.errstate(all="ignore")
-
-
-def again_if_interrupted(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes a pure function compute again in its own error state where the caller's interrupts it.
-
-    For what every step of a loop calls: the usual way is three times as fast as with `own_error_state`.
-    """
-    again = own_error_state(function)
-
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        try:
-            return function(*args, **kwargs)
-        except FloatingPointError:
-            return again(*args, **kwargs)
-
-    return call
 
 
 def warn_caller(text: str, category: type[Warning]) -> None:
@@ -67,20 +39,10 @@ def warn_caller(text: str, category: type[Warning]) -> None:
 class ReadOnlyArrays:
     """Mixin that keeps the array fields of a frozen dataclass read-only.
 
-    It is checked, and computes its cached properties, in an error state of its own (`own_error_state`).
-
     `dataclass(frozen=True)` stops assignment to a field but not writing into an array. `gym.make`
     deep-copies keyword arguments, and both copies and pickles of a read-only array are writable
     again; so a copy is the object itself, and unpickling freezes anew.
     """
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        for name, value in list(vars(cls).items()):
-            if isinstance(value, cached_property):
-                value.func = own_error_state(value.func)
-            elif name == "__post_init__":
-                cls.__post_init__ = own_error_state(value)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _make_arrays_read_only(self) -> None:
         for name, value in vars(self).items():
@@ -105,55 +67,18 @@ class CopiedWhole:
         return copy.deepcopy(self)
 
 
-class Setting(property):
-    """A property that is read, and never set; see `setting`."""
-
-    def __init__(self, name: str, kept_as: str, instead: str) -> None:
-        super().__init__(attrgetter(kept_as), self._refuse)
-        self._name, self._instead = name, instead
-
-    def refusal(self, owner: Any) -> str:
-        """Returns why it cannot be set, and how to make another object."""
-        kind = type(owner).__name__
-        way = f", as in {owner.made_by}" if hasattr(owner, "made_by") else ""
-        why = f"{self._name} is a setting of {kind} and cannot be changed: make another {kind} with it{way}"
-        return why + self._instead
-
-    def _refuse(self, owner: Any, value: Any) -> None:
-        raise AttributeError(self.refusal(owner))
-
-
-def setting(name: str, kept_as: str | None = None, instead: str = "") -> Any:
-    """Returns a property for what an object is made with, and other parts of it rest on: it is read, and never set.
-
-    Assigning raises an error that says how to make another object; a class may say so by its attribute `made_by`.
+def setting(name: str, kept_as: str | None = None) -> Any:
+    """Returns a read-only property.
 
     Args:
         name: Of the property.
         kept_as: Attribute that holds the value, also of a part ("part.attribute"); the name after an underscore by
             default.
-        instead: End of the error's sentence, which says what else can be done.
     """
-    return Setting(name, kept_as or f"_{name}", instead)
+    return property(attrgetter(kept_as or f"_{name}"))
 
 
-class AroundEnvironment:
-    """Mixin of wrappers: setting what only something inside has raises an error, since it would have no effect.
-
-    Names that nothing inside has are the wrapper's own, and may be set. Of those, `__init__` sets before `env` what
-    something inside may have too.
-    """
-
-    # Attribute that holds what is inside.
-    _inside = "env"
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name[0] != "_" and name not in self.__dict__ and not hasattr(type(self), name):
-            require_not_inside(name, self.__dict__.get(self._inside), type(self).__name__)
-        object.__setattr__(self, name, value)
-
-
-class AroundEnvironments(AroundEnvironment):
+class AroundEnvironments:
     """Mixin of wrappers of vector environments: their specification says that they are there, as single ones' does.
 
     Gymnasium's vector wrappers leave themselves out, so that `gym.make_vec` would make environments without a shield or
@@ -174,27 +99,6 @@ class AroundEnvironments(AroundEnvironment):
         spec = copy.deepcopy(inside)
         spec.additional_wrappers += (own,)
         return spec
-
-
-def require_not_inside(name: str, inside: Any, outside: str, until: Any = None) -> None:
-    """Raises AttributeError if setting an attribute outside would have no effect, because something inside has it.
-
-    Args:
-        name: Of the attribute.
-        inside: The outermost of the layers inside; None for none.
-        outside: What it would be set on, for the message.
-        until: A layer that is not asked, nor what is inside it.
-    """
-    layer = inside
-    while layer is not None and layer is not until:
-        own = getattr(layer, "__dict__", {})
-        if name in own or hasattr(type(layer), name):
-            kept = getattr(type(layer), name, None)
-            if isinstance(kept, Setting):
-                raise AttributeError(kept.refusal(layer))
-            kind = type(layer).__name__
-            raise AttributeError(f"{name} belongs to the {kind} inside: set on {outside} it would have no effect")
-        layer = own.get("env")
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
@@ -256,33 +160,17 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as messages quote it: on one line, and not without end; a path as it is.
-
-    Of a tensor with gradient, which is no array, and of a number of a kind that numpy does not have it says what to do.
-    """
+    """Returns a value as messages quote it: on one line, and not without end; a path as it is."""
     try:
         text = " ".join((str(value) if isinstance(value, PurePath) else repr(value)).split())
     except Exception:
         text = f"a {type(value).__name__}"
-    text = text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
-    if "bfloat16" in str(getattr(value, "dtype", "")):
-        return f"{text}, which numpy has no such numbers for: convert it (.float())"
-    return f"{text}, which has a gradient: detach it (.detach())" if _has_gradient(value) else text
-
-
-def _has_gradient(value: Any) -> bool:
-    """Returns whether a value is a tensor of torch with gradient, or a list with one, which numpy makes no array of."""
-    try:
-        entries = value if isinstance(value, (list, tuple)) else (value,)
-        return any(getattr(entry, "requires_grad", False) is True for entry in entries)
-    except Exception:  # attributes of other people's objects may raise anything
-        return False
+    return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
 
 
 def reason_of(error: BaseException) -> str:
     """Returns what an error says, as messages quote it: on one line, not without end; its type if it says nothing."""
     text = " ".join(str(error)[: 2 * MAX_QUOTED_LENGTH].split()).rstrip(".") or type(error).__name__
-    text = re.sub(r"\. Did you mean (.*)\?$", r" (did you mean \1?)", text)  # as Python asks from 3.13 on
     return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
 
 
@@ -330,20 +218,10 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
         have > 0 and (want is None or have == want) for have, want in zip(matrix.shape, shape, strict=True)
     )
     if not fits:
-        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}{_advice(matrix, shape)}")
+        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
     if not (np.abs(matrix) < LARGEST_NUMBER).all():
         raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(matrix.tolist())}")
     return matrix
-
-
-def _advice(array: np.ndarray, shape: tuple[int | None, int | None]) -> str:
-    """Returns how to write a vector that fits the expected (rows, columns) as a single one of either; else nothing."""
-    rows, columns = shape
-    if array.ndim == 1 and rows == array.size and columns in (None, 1):
-        return f"; a single column is written {shown(array[:, None].tolist())}"
-    if array.ndim == 1 and columns == array.size and rows in (None, 1):
-        return f"; a single row is written {shown(array[None].tolist())}"
-    return ""
 
 
 def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:

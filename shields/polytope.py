@@ -15,7 +15,6 @@ from ncs_gym.validation import (
     ReadOnlyArrays,
     as_matrix,
     as_vector,
-    own_error_state,
     read_only,
     shown,
 )
@@ -108,7 +107,6 @@ class Polytope(ReadOnlyArrays):
         """The dimension n."""
         return self.rows.shape[1]
 
-    @own_error_state
     def gauge(self, points: Any) -> Any:
         """Returns max f (x - c) over the faces f: 0 at the center, 1 on the boundary.
 
@@ -118,7 +116,6 @@ class Polytope(ReadOnlyArrays):
         gauges = ((np.asarray(points, dtype=np.float64) - self.center) @ self.F.T).max(axis=-1)
         return float(gauges) if gauges.ndim == 0 else gauges
 
-    @own_error_state
     def support(self, directions: Any) -> Any:
         """Returns max of a'x over the polytope for a direction a (n,), or for each of shape (count, n), by a solver.
 
@@ -141,7 +138,6 @@ class Polytope(ReadOnlyArrays):
         reached = np.array(found) + given @ self.center
         return float(reached[0]) if np.ndim(directions) == 1 else reached
 
-    @own_error_state
     def outline(self, pair: tuple[int, int]) -> np.ndarray:
         """Returns corners of a polygon around the projection onto two coordinates, shape (k, 2); for pictures.
 
@@ -157,12 +153,10 @@ class Polytope(ReadOnlyArrays):
         heights = np.stack([heights, np.roll(heights, -1)], axis=1)
         return np.linalg.solve(normals, heights[..., None])[..., 0]
 
-    @own_error_state
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
 
-    @own_error_state
     def sample_boundary(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns points of the boundary in random directions, shape (count, n)."""
         scale = 1.0 / np.maximum(np.abs(self.rows).max(axis=0), np.finfo(float).tiny)

@@ -13,7 +13,7 @@ import numpy as np
 from ncs_gym import LinearPlant, certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import in_time
-from ncs_gym.validation import as_count, counted, own_error_state
+from ncs_gym.validation import as_count, counted
 from shields.certificate import Certificate
 from shields.certificate_text import labeled
 from shields.polytope import Polytope
@@ -133,7 +133,6 @@ class _Fallbacks:
         plant: Gives A, B, D and the limits.
     """
 
-    @own_error_state  # what overflows keeps no limit
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
         within, rest = rows_within_step(plant), certificate.fallback
         (k, n), m = within.at_samples.shape, plant.m
@@ -184,7 +183,6 @@ class _Fallbacks:
                 return steps
         return most
 
-    @own_error_state
     def _keeps(self, age: int, j: int, share: float | None) -> np.ndarray:
         """Returns which limits are kept after j fallback inputs, shape (q,)."""
         least, largest, reach = self._after(j)

@@ -12,7 +12,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from ncs_gym import LinearPlant, NCSVectorEnv
 from ncs_gym.plants.past_inputs import inputs_under_way
-from ncs_gym.validation import AroundEnvironment
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
@@ -251,7 +250,7 @@ FILTERS: dict[str, Callable[..., Rule]] = {
 }
 
 
-class EstimateFilter(AroundEnvironment, VectorWrapper):
+class EstimateFilter(VectorWrapper):
     """Applies what a filter makes of the proposed inputs, given the estimates; it proves nothing.
 
     The infos gain `shield_intervened`, `input_proposed` and `shield_correction` as behind a `VectorSafetyShield`, but

@@ -14,7 +14,6 @@ from gymnasium.vector.utils import batch_space
 
 from agents.evaluation import Policy
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, VectorRequestActions
-from ncs_gym.validation import AroundEnvironment
 from shields import VectorSafetyShield
 
 # Margins are shown to agents within these limits.
@@ -126,7 +125,7 @@ def with_rule(asking: Asking, rule: RequestRule) -> Policy:
     return act
 
 
-class RequestsOnly(AroundEnvironment, VectorWrapper):
+class RequestsOnly(VectorWrapper):
     """An environment whose actions, (N, 1), only ask for samples, while a controller proposes the inputs.
 
     Observations have one entry more, the margin of what is proposed.

@@ -14,7 +14,6 @@ from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop_settings import (
     CHANNELS,
-    channel_setting,
     expect,
     loop_contracts,
     require_suitable,
@@ -39,7 +38,7 @@ from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, as_flag, own_error_state, setting, shown, warn_caller
+from ncs_gym.validation import as_count, as_flag, setting, shown, warn_caller
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
@@ -162,11 +161,10 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
-    made_by: ClassVar[str] = "gym.make(id, channel=...)"
     observation_space: Box
     action_space: Box
     plant: LinearPlant = setting("plant")
-    channel: Channel = channel_setting("channel")
+    channel: Channel = setting("channel")
     task: Task = setting("task")
     disturbance: Disturbance = setting("disturbance")
     initial_set: Ellipsoid = setting("initial_set")
@@ -180,11 +178,10 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     noise: str = setting("noise")
     observe: tuple[str, ...] = setting("observe")
     process: Process = setting("process", "_process_given")
-    downlink: Channel | None = channel_setting("downlink")
+    downlink: Channel | None = setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract")
     downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_protocol")
 
-    @own_error_state
     def __init__(
         self,
         plant: LinearPlant,
@@ -260,7 +257,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self.start: Ellipsoid | np.ndarray = self._initial_set
         self._consistent = False
 
-    @own_error_state
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -313,7 +309,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             self.renderer.begin(info, self._task_state)
         return self._observation(), info
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Applies the input of an action for one step.
 
@@ -371,10 +367,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         """The true state, shape (n,), a copy; only `reset(options={"state": x})` sets it."""
         return self._state.copy()
 
-    @state.setter
-    def state(self, value: Any) -> None:
-        raise AttributeError('the state is set at the start of an episode: env.reset(options={"state": x})')
-
     @property
     def outstanding(self) -> int:
         """Number of samples requested that are newer than the newest one used (docs/requests.md, "The rule").
@@ -401,7 +393,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             most = self._contract.max_age, self._contract.max_age + input_delay
         return np.array(most, dtype=np.float64).clip(min=1.0)
 
-    @own_error_state
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
 
@@ -436,7 +427,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         """What a shield decides on, read-only: no wrapper stands between."""
         return self._known
 
-    @own_error_state
     def estimates_ahead(self) -> list[tuple[np.ndarray, int]]:
         """Returns estimate and number of the error shape of now and of every step until the next decision's effect."""
         pending = self._committed.pending

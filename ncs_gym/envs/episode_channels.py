@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import VectorWrapper
 
 from ncs_gym.envs.json_settings import from_json, to_json
 from ncs_gym.network.channel import Channel, require_duration
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
-from ncs_gym.validation import AroundEnvironment, AroundEnvironments, shown
+from ncs_gym.validation import AroundEnvironments, shown
 
 # Draws a channel; and which one: the option of `reset`, and of several channels the key.
 _Draw = Callable[[np.random.Generator], Any]
@@ -184,7 +184,7 @@ def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
     return Channel(quantization_step=declared.quantization_step, delay=shortest, jitter=longest - shortest)
 
 
-class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
+class RandomChannel(gym.Wrapper, RecordConstructorArgs):
     """Draws a channel at the start of every episode (domain randomization over networks).
 
     The draws come from the environment's own `np_random`, so that a seed determines them. A shield may stand inside or
@@ -204,8 +204,7 @@ class RandomChannel(AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self)
         if not isinstance(env, gym.Env):
-            hint = ": VectorRandomChannel is for vector environments" if isinstance(env, VectorEnv) else ""
-            raise ValueError(f"RandomChannel takes an environment, as gym.make returns it, got {shown(env)}{hint}")
+            raise ValueError(f"RandomChannel takes an environment, as gym.make returns it, got {shown(env)}")
         gym.Wrapper.__init__(self, env)
         if not env.has_wrapper_attr("episode_channel"):
             raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")
@@ -249,10 +248,7 @@ class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorAr
         RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
         if not hasattr(env, "channel"):
-            raise ValueError(
-                "VectorRandomChannel is for an NCSVectorEnv, or another one in VectorNetworked, got "
-                f"{env.unwrapped}: gymnasium's sync and async ones take RandomChannel around each environment"
-            )
+            raise ValueError(f"VectorRandomChannel is for an NCSVectorEnv or VectorNetworked, got {env.unwrapped}")
         self._drawn: dict[_Which, _Draw] = {}
         self.draw_from(channel, downlink)
 
@@ -311,24 +307,14 @@ def _drawn(keys: list[Any], channel: Any, downlink: Any) -> dict[_Which, _Draw]:
 
 def _draw(source: Any, name: str, keys: list[Any]) -> _Draw:
     """Returns what draws a channel, given a function or a list; `keys` are those of the channels in this direction."""
-    several = keys != [None]
     if callable(source):
         return source
-    try:
-        choices = [from_json(each, (Channel,), name) for each in source] if isinstance(source, (list, tuple)) else []
-    except ValueError:
-        if not several:
-            raise
-        choices = []
+    choices = [from_json(each, (Channel,), name) for each in source] if isinstance(source, (list, tuple)) else []
     if not choices or not all(isinstance(each, Channel) for each in choices):
-        by_key = f", or a dictionary of these by the channels' keys {keys}" if several else ""
-        wanted = f"a function (rng) -> Channel or a list of channels{by_key}"
-        alone = (
-            "; here is one channel for all, several are given to Networked by key"
-            if isinstance(source, Mapping)
-            else ""
+        by_key = "" if keys == [None] else f", or a dictionary of these by the keys {keys}"
+        raise ValueError(
+            f"{name} must be a function (rng) -> Channel or a list of channels{by_key}, got {shown(source)}"
         )
-        raise ValueError(f"{name} must be {wanted}, got {shown(source)}{'' if several else alone}")
     return partial(_chosen, tuple(choices))
 
 

@@ -16,7 +16,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_numbers, as_vector, setting, shown, warn_caller
+from ncs_gym.validation import as_numbers, as_vector, shown
 
 T = TypeVar("T")
 
@@ -24,12 +24,6 @@ T = TypeVar("T")
 CHANNELS = "channel", "downlink"
 # The default start covers this fraction of the half-width of the safe box in every direction.
 START_FRACTION = 0.1
-
-
-def channel_setting(name: str, kept_as: str | None = None) -> Any:
-    """Returns a `setting` whose error also says how episodes get other channels."""
-    option = f'reset(options={{"{name}": ...}})'
-    return setting(name, kept_as, f"; episodes get other ones by RandomChannel, a single one by {option}")
 
 
 def loop_contracts(
@@ -105,42 +99,19 @@ def expect(value: Any, kind: type[T], name: str) -> T:
 def start_option(options: dict[str, Any] | None, plant: LinearPlant) -> np.ndarray | None:
     """Returns options["state"] as a finite array of shape (n,), or None without one.
 
-    Warns:
-        UserWarning: If it seems to be an absolute state.
-
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
     options = _known_options(options, {"state", "parameters", *CHANNELS})
     if "state" not in options:
         return None
-    start = as_vector(options["state"], plant.n, "options['state']")
-    _warn_of_absolute_states(start[None], plant)
-    return start
-
-
-def _warn_of_absolute_states(states: np.ndarray, plant: LinearPlant) -> None:
-    """Warns the caller if a state, of shape (k, n), is outside of the safe box and were inside if it was absolute."""
-    if not plant.operating_state.any():
-        return
-    farthest, if_absolute = (
-        plant.constraint_values(each.T).max(axis=0) for each in (states, states - plant.operating_state)
-    )
-    if ((farthest > 0.0) & (if_absolute <= 0.0)).any():
-        warn_caller(
-            "options['state'] is outside of the safe box, and inside if it is absolute: states are deviations from the "
-            "operating point, which plant.to_deviation(state) gives",
-            UserWarning,
-        )
+    return as_vector(options["state"], plant.n, "options['state']")
 
 
 def vector_reset_options(
     options: dict[str, Any] | None, count: int, plant: LinearPlant
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns which environments to reset, shape (count,), and where they start, (count, n) or None.
-
-    Warns:
-        UserWarning: If a start seems to be an absolute state.
 
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
@@ -156,9 +127,7 @@ def vector_reset_options(
     starts = None if starts is None else starts.copy()
     if starts is None or starts.shape not in {(n,), (count, n)} or not np.isfinite(starts).all():
         raise ValueError(f"options['state'] must be finite with shape ({n},) or ({count}, {n}), got {shown(starts)}")
-    starts = np.broadcast_to(starts, (count, n))
-    _warn_of_absolute_states(starts, plant)
-    return mask, starts
+    return mask, np.broadcast_to(starts, (count, n))
 
 
 def _known_options(options: Any, known: set[str]) -> dict[str, Any]:

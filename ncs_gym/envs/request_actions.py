@@ -13,7 +13,6 @@ from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.validation import (
-    AroundEnvironment,
     AroundEnvironments,
     as_number,
     as_numbers,
@@ -38,7 +37,7 @@ class _WithCost:
         self._saved_kwargs, self._cached_spec = {"cost": self._cost}, None
 
 
-class RequestActions(_WithCost, AroundEnvironment, gym.Wrapper, RecordConstructorArgs):
+class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
     """Lets an agent decide when samples are taken, at a price (docs/requests.md).
 
     The action has one entry more, in [-1, 1]: a sample is asked for where it is positive. The observation has two

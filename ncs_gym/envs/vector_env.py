@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, 
 from ncs_gym.envs.episode_channels import channel_infos, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop_settings import CHANNELS, channel_setting, vector_reset_options
+from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, actions_of, read_actions
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
@@ -31,7 +31,7 @@ from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, frozen, own_error_state, setting, shown
+from ncs_gym.validation import as_count, frozen, setting, shown
 
 
 def _with_columns(values: np.ndarray, mask: np.ndarray, new: Any) -> np.ndarray:
@@ -74,10 +74,9 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         ValueError: If a setting is wrong; see `NCSEnv`.
     """
 
-    made_by: ClassVar[str] = "gym.make_vec(id, num_envs, channel=...)"
     single: NCSEnv = setting("single")
     plant: LinearPlant = setting("plant")
-    channel: Channel = channel_setting("channel")
+    channel: Channel = setting("channel")
     task: Task = setting("task")
     disturbance: Disturbance = setting("disturbance", "_single.disturbance")
     initial_set: Ellipsoid = setting("initial_set", "_single.initial_set")
@@ -90,13 +89,12 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     contract: ChannelContract | None = setting("contract")
     certificate_contract: ChannelContract | None = setting("certificate_contract")
     error_set: ErrorSet = setting("error_set")
-    downlink: Channel | None = channel_setting("downlink")
+    downlink: Channel | None = setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract", "_single.downlink_contract")
     downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
 
-    @own_error_state
     def __init__(
         self,
         num_envs: int = 1,
@@ -159,10 +157,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         """The true states, shape (N, n), a copy; only `reset(options={"state": x})` sets them."""
         return self._state.T.copy()
 
-    @state.setter
-    def state(self, value: Any) -> None:
-        raise AttributeError('the state is set at the start of an episode: env.reset(options={"state": x})')
-
     @property
     def episode_channels(self) -> tuple[Channel, ...]:
         """The channels of the present episodes."""
@@ -183,13 +177,11 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         """With SAME_STEP, where an episode ended in the last step, shape (N,), and what was known at its end."""
         return self._ended
 
-    @own_error_state
     def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), numbers (k,)."""
         pending = self._downlink_state.committed.pending
         return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
 
-    @own_error_state
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
@@ -232,7 +224,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._draw(info, begins=mask, moved=False)
         return self._observation(), info
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies the inputs of actions of shape (N, m), for one step of every environment.
 
@@ -286,7 +278,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         """
         return require_on_request(self._requests).outstanding(self._estimator.age)
 
-    @own_error_state
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
 

@@ -237,7 +237,7 @@ class ArrivalHistories:
             number = self._count
             if number == len(self.next):
                 for name in _BY_HISTORY:  # the last one tells how much
-                    setattr(self, name, with_room(getattr(self, name), number))
+                    setattr(self, name, with_room(getattr(self, name)))
             self.present[number], self.replay_from[number] = present, replay_from
             self._priors[:, number], self._held[:, number] = priors, held
             self.next[number] = self.arrival[:, number] = self.new_age[number] = UNKNOWN

@@ -16,7 +16,6 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.description import outputs_of
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import own_error_state
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (docs/shield_proof.md).
 GROWTH = 1.1
@@ -41,7 +40,6 @@ class ErrorSetError(ValueError):
     """No error set could be computed accurately enough."""
 
 
-@own_error_state
 def certified_error_set(plant: LinearPlant, contract: ChannelContract | None = None) -> ErrorSet:
     """Returns the error set of a plant: of a stable one without a contract, of any under one.
 

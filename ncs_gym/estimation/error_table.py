@@ -189,9 +189,9 @@ class ErrorTable:
         number = self._count
         if number == len(self._ages):
             for name in _BY_NUMBER_LAST:
-                setattr(self, name, with_room(getattr(self, name), number))
+                setattr(self, name, with_room(getattr(self, name)))
             for name in _BY_NUMBER:  # the last one tells how much
-                setattr(self, name, with_room(getattr(self, name), number, axis=0))
+                setattr(self, name, with_room(getattr(self, name), axis=0))
         self._covariances[number], self._shapes[number], self._ages[number], self._certified[number] = statistics
         self._after_step[number] = self._after_update[number] = UNKNOWN
         self._gains[number], self._by_columns[number], self._recurs[number] = 0.0, False, False
@@ -200,8 +200,6 @@ class ErrorTable:
         return number
 
 
-def with_room(array: np.ndarray, count: int, axis: int = -1) -> np.ndarray:
-    """Returns an array with room for twice as many numbers along an axis; the same if it has it already."""
-    if array.shape[axis] > count:  # growing was interrupted before
-        return array
+def with_room(array: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Returns an array with room for twice as many numbers along an axis."""
     return np.concatenate([array, np.zeros_like(array)], axis=axis)

@@ -17,7 +17,7 @@ from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import CopiedWhole, again_if_interrupted, frozen, own_error_state, setting
+from ncs_gym.validation import CopiedWhole, frozen, setting
 
 
 class Estimate(NamedTuple):
@@ -69,7 +69,6 @@ class Estimator(CopiedWhole):
     buffer: int = setting("buffer")
     error_set: ErrorSet = setting("error_set")
 
-    @own_error_state
     def __init__(
         self,
         plant: LinearPlant,
@@ -104,7 +103,6 @@ class Estimator(CopiedWhole):
         self._histories = self._usual
         self._begin(mean)
 
-    @own_error_state
     def restart(self, mean: np.ndarray, inputs: Sequence[np.ndarray]) -> None:
         """Begins anew with an estimate of an earlier step of the episode: that of the newest sample it was made of.
 
@@ -229,7 +227,6 @@ class Estimator(CopiedWhole):
         self._samples[age] = packet.measurement
         return after
 
-    @own_error_state  # an infinite weight of a residual of zero, a huge residual
     def _replayed(self, history: int) -> int:
         """Replays from the oldest new sample on, keeps whichever history is better, and returns the history then."""
         histories, H = self._histories, self._plant.H
@@ -255,7 +252,6 @@ class Estimator(CopiedWhole):
             self.age = new_age
         return target
 
-    @again_if_interrupted
     def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x_hat + B u, shape (n,); an unstable plant's within the limit of its states."""
         mean = self._plant.A.dot(mean) + self._plant.B.dot(u)

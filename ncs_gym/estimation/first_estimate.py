@@ -122,8 +122,7 @@ def _least_squares(
     gains = {age: part * weights for age, part in zip(samples, parts, strict=True)}
     estimate, shape = moved[w], np.zeros((n, n))
     for age, T in gains.items():
-        with np.errstate(invalid="ignore"):  # of a sample that is not finite comes no estimate
-            estimate = estimate + T @ (samples[age] - H @ moved[w - age])
+        estimate = estimate + T @ (samples[age] - H @ moved[w - age])
         shape = outer_sum(shape, T @ N @ T.T, plant.weight)
     for left in range(w):  # steps that are left after the one in which a disturbance acted
         M = sum((T @ H @ powers[left - age] for age, T in gains.items() if age <= left), -powers[left])

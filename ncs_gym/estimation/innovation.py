@@ -51,9 +51,7 @@ def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, toler
     axes, values = common_axes(first, second)
     if not np.isfinite(axes).all():
         return np.array([sum_gauge(point, first, second) > 1.0 + tolerance for point in points], np.bool_)
-    with np.errstate(invalid="ignore", over="ignore"):
-        squares = np.square(axes @ points.T)
-    return outside_sum_in_axes(squares, values[:, None], tolerance)
+    return outside_sum_in_axes(np.square(axes @ points.T), values[:, None], tolerance)
 
 
 def outside_sum_in_axes(squares: np.ndarray, values: np.ndarray, tolerance: float) -> np.ndarray:

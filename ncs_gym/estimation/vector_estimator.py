@@ -13,7 +13,7 @@ from ncs_gym.estimation.arrival_histories import NO_REPLAY, ArrivalHistories
 from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum_in_axes
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import CopiedWhole, frozen, own_error_state
+from ncs_gym.validation import CopiedWhole, frozen
 
 
 class VectorEstimator(CopiedWhole):
@@ -164,7 +164,6 @@ class VectorEstimator(CopiedWhole):
         mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
         return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
-    @own_error_state  # an infinite weight of a residual of zero, a huge residual
     def _monitor(self, residual: np.ndarray, statistics: np.ndarray) -> None:
         """Latches the alarm of environments whose residual no error and no noise within their bounds explain.
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import again_if_interrupted, as_count, as_flag, as_number, counted, read_only, shown
+from ncs_gym.validation import as_count, as_flag, as_number, counted, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -102,11 +102,6 @@ class Channel:
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
         object.__setattr__(self, "send_period", as_count(self.send_period, "send_period", low=1))
-        if isinstance(self.delay, (tuple, list)):
-            raise ValueError(
-                f"delay is one number of steps, got {shown(self.delay)}: jitter is the largest random delay beyond it, "
-                "so that delay=1, jitter=1 stands for 1 to 2 steps"
-            )
         for name in ("delay", "jitter"):
             object.__setattr__(self, name, as_count(getattr(self, name), name, low=0, high=LONGEST_DELAY))
         if self.max_consecutive_losses is not None:
@@ -169,7 +164,6 @@ class Channel:
         arrives = f"What is not lost arrives {late} late" if self.longest_delay else "What is not lost arrives at once"
         return f"A sample is taken and sent {every}, {rounded}. {lost}. {arrives}."
 
-    @again_if_interrupted
     def quantize(self, measurement: np.ndarray) -> np.ndarray:
         """Returns the measurement, of any shape, rounded to multiples of the quantization step."""
         q = self.quantization_step

@@ -100,7 +100,7 @@ def warn_of_broken_contract(
         warn_caller(
             "the channel may lose any number of packets in a row, but the certificate's contract allows the newest "
             f"sample to be {counted(contract.max_age, 'step')} old in all, so that the guarantee is likely to be "
-            "lost: say what the network promises by max_consecutive_losses",
+            "lost",
             BrokenContractWarning,
         )
         return
@@ -116,16 +116,6 @@ def warn_of_broken_contract(
         broken.append(f"rounds measurements to {channel.quantization_step:g}, {allowed}")
     if not broken:
         return
-    oldest = max((age if kept is None else kept.max_age) + input_delay, contract.max_age)
-    if oldest > MAX_AGE:
-        advice = f"no certificate is for samples older than {MAX_AGE} steps"
-    else:
-        enough = ChannelContract(oldest, max(channel.quantization_step, contract.quantization_step))
-        losses = "or of a larger max_age where packets are lost"
-        advice = (
-            f"give a certificate of {enough}, {losses if kept is None else 'which the channel keeps with its losses'}"
-        )
     warn_caller(
-        f"the channel {', and it '.join(broken)}, so that the guarantee is likely to be lost: {advice}",
-        BrokenContractWarning,
+        f"the channel {', and it '.join(broken)}, so that the guarantee is likely to be lost", BrokenContractWarning
     )

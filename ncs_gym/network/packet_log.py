@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym.network.channel import LONGEST_DELAY, TraceChannel, replayed_ages
 from ncs_gym.network.log_files import read_record
 from ncs_gym.reading import MOST_STEPS, require_packets
-from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting, own_error_state
+from ncs_gym.validation import ReadOnlyArrays, as_number, as_setting
 
 # Times that differ by less than this fraction of a step are the same; where the resolution of the times themselves is
 # coarser than the second fraction they cannot be placed.
@@ -67,7 +67,6 @@ class PacketLog(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     @classmethod
-    @own_error_state
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Returns the packets in a file (docs/requirements.md has recipes that make one of other records).
 
@@ -83,14 +82,12 @@ class PacketLog(ReadOnlyArrays):
         return cls(*read_record(path))
 
     @property
-    @own_error_state
     def period(self) -> float:
         """Median time between packets that are not sent at once [s]."""
         gaps = np.diff(self.sent)
         return float(np.median(gaps[gaps > 0.0]))
 
     @property
-    @own_error_state
     def disagreement(self) -> str:
         """A sentence where the span of the record and its number of packets disagree; empty where they do not."""
         gaps, period = np.diff(self.sent), self.period
@@ -111,7 +108,6 @@ class PacketLog(ReadOnlyArrays):
             "samples were lost there."
         )
 
-    @own_error_state
     def trace(self, dt: float) -> tuple[int, ...]:
         """Returns after how many control steps of duration dt the sample of each `send_period` arrived.
 
@@ -122,7 +118,6 @@ class PacketLog(ReadOnlyArrays):
         """
         return tuple(self._trace(dt).tolist())
 
-    @own_error_state
     def send_period(self, dt: float) -> int:
         """Returns the largest number of control steps of which all samples are taken at multiples.
 
@@ -131,7 +126,6 @@ class PacketLog(ReadOnlyArrays):
         """
         return max(int(np.gcd.reduce(self._samples(dt)[0])), 1)
 
-    @own_error_state
     def channel(self, dt: float, *, quantization_step: float = 0.0) -> TraceChannel:
         """Returns the channel that replays the record in control steps of duration dt [s], with the ages of `ages`.
 
@@ -142,7 +136,6 @@ class PacketLog(ReadOnlyArrays):
             trace=self.trace(dt), send_period=self.send_period(dt), quantization_step=quantization_step, dt=dt
         )
 
-    @own_error_state
     def ages(self, dt: float) -> np.ndarray:
         """Returns the age of the newest sample that has arrived at every control step, shape (steps,) [steps].
 
@@ -155,7 +148,6 @@ class PacketLog(ReadOnlyArrays):
         stamps, _ = self._samples(dt)
         return replayed_ages(self._trace(dt), self.send_period(dt), int(stamps[-1]) + 1)
 
-    @own_error_state
     def left_out(self, dt: float) -> int:
         """Returns how many packets are sent within a step that has one already, so that they are no samples."""
         return len(self.sent) - len(self._samples(dt)[0])

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
-from ncs_gym.validation import again_if_interrupted, frozen
+from ncs_gym.validation import frozen
 
 # More losses in a row than any episode has steps.
 UNLIMITED = 2**31 - 1
@@ -74,7 +74,6 @@ class StackedChannels:
             self.loss = StackedBursts(*(np.array([getattr(each, name) for each in chains]) for name in names))
         self.shortest_delay, self.longest_delay = int(self.delay.min()), int((self.delay + jitter).max())
 
-    @again_if_interrupted
     def quantize(self, measurements: np.ndarray) -> np.ndarray:
         """Returns measurements, shape (p, N), each rounded to multiples of its channel's quantization step."""
         q = self.quantization_step

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from functools import partial
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -14,12 +12,11 @@ from gymnasium.wrappers import Autoreset
 
 from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.json_settings import from_json, to_json
-from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of, largest_age
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, snapshot, zero_of
-from ncs_gym.validation import AroundEnvironment, as_count, as_flag, as_numbers, counted, setting, shown, warn_caller
+from ncs_gym.validation import as_count, as_flag, as_numbers, counted, setting, shown, warn_caller
 
 # Keys of infos that are the network's own.
 INFOS = (
@@ -113,10 +110,6 @@ class NetworkSettings:
         Raises:
             ValueError: If it is no channel, or of keys that observations do not have.
         """
-        for name in options.keys() - {"channel", "downlink"}:
-            if meant := get_close_matches(str(name), ("channel", "downlink"), cutoff=0.75):
-                said = f"the reset option {shown(name)} is the environment's; the network's is {meant[0]!r}"
-                warn_caller(said, UserWarning)
         given, keys = options.pop("channel", None), [part.key for part in self.parts]
         each = [given] * len(keys)
         if isinstance(given, Mapping) and keys != [None]:
@@ -146,11 +139,11 @@ class NetworkSettings:
         return max(max(ages) + downlink_protocol(self.downlink, None).input_delay + waits, 1)
 
 
-class ReadNetwork(AroundEnvironment):
+class ReadNetwork:
     """Mixin of the wrappers: what they are made with is read, and never set."""
 
-    channel: Any = channel_setting("channel", "_settings.channel")
-    downlink: Channel | None = channel_setting("downlink", "_settings.downlink")
+    channel: Any = setting("channel", "_settings.channel")
+    downlink: Channel | None = setting("downlink", "_settings.downlink")
     observe: tuple[str, ...] = setting("observe", "_settings.entries.names")
     fill: Any = setting("fill", "_settings.fill")
     late: str = setting("late", "_settings.late")
@@ -171,8 +164,7 @@ def as_channel(value: Any, name: str) -> Channel | None:
     channel = from_json(value, (Channel,), name)
     if channel is None or isinstance(channel, Channel):
         return channel
-    hint = f": PacketLog.load({shown(value)}).channel(dt) replays a record" if isinstance(value, str | PathLike) else ""
-    raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}{hint}")
+    raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}")
 
 
 def _one_of(value: Any, known: tuple[str, ...], name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium import Space
@@ -59,8 +59,6 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
     Raises:
         ValueError: If a setting is wrong, or does not fit the environments' spaces.
     """
-
-    made_by: ClassVar[str] = "VectorNetworked(envs, channel=...)"
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -98,8 +98,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
     Raises:
         ValueError: If a setting is wrong, or does not fit the environment's spaces.
     """
-
-    made_by: ClassVar[str] = "Networked(env, channel=...)"
 
     def __init__(
         self,

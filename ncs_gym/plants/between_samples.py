@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.plants.statespace import zero_order_hold
-from ncs_gym.validation import again_if_interrupted, read_only
+from ncs_gym.validation import read_only
 
 MOST_POINTS = 64
 # A and B of a plant are those of its model in continuous time up to this, relative to their largest entries.
@@ -144,7 +144,6 @@ class GridValues:
         joint = np.concatenate([moved, pushed, shares * box_rows], axis=2)
         self._shape, self._joint = (points - 1, k), np.ascontiguousarray(joint.reshape((points - 1) * k, -1))
 
-    @again_if_interrupted
     def worst(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Returns the largest values since the last sample, shape (k,) or (k, N); never below those at the end.
 

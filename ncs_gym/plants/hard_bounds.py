@@ -13,7 +13,7 @@ from ncs_gym import exact
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
-from ncs_gym.validation import ReadOnlyArrays, own_error_state, read_only
+from ncs_gym.validation import ReadOnlyArrays, read_only
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
 INFLATION = 1.0 + 1e-9
@@ -125,7 +125,6 @@ class HardBounds(ReadOnlyArrays):
         """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
         return Ellipsoid(inflated(self.nominal_sensor_error.shape_matrix))
 
-    @own_error_state
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
@@ -172,14 +171,12 @@ class HardBounds(ReadOnlyArrays):
             P0 = P0 + self.initial_bound.shape_matrix / (self.n + 2)
         return read_only(Q), read_only(R), read_only(P0)
 
-    @own_error_state
     def sample_sensor_noise(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
         """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
         return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
 
-    @own_error_state
     def sample_initial_error(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ncs_gym.plants import between_samples
 from ncs_gym.plants.past_inputs import inputs_under_way
-from ncs_gym.validation import ReadOnlyArrays, again_if_interrupted, read_only
+from ncs_gym.validation import ReadOnlyArrays, read_only
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -119,7 +119,6 @@ class LimitValues(ReadOnlyArrays):
             self.continuous_model, (self.box, self.box_ends), self.largest_input, self.dt, self.between_samples
         )
 
-    @again_if_interrupted
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns how far c_j x is beyond the nearer end, in units of half the range, for each row of the safe box.
 
@@ -135,7 +134,6 @@ class LimitValues(ReadOnlyArrays):
         low, high = read_only(self.box_low), read_only(self.box_high)
         return (low, high), (low[:, None], high[:, None])
 
-    @again_if_interrupted
     def mixed_values(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns how far the rows of `mixed_rows` are beyond the nearer end, in units of half their range.
 

@@ -42,7 +42,6 @@ from ncs_gym.validation import (
     as_setting,
     as_units,
     counted,
-    own_error_state,
     read_only,
     reason_of,
     shown,
@@ -76,7 +75,6 @@ def with_limits_as_published(kind: Kind) -> Kind:
     construct: Callable[..., None] = constructor.__init__
 
     @functools.wraps(construct)
-    @own_error_state
     def __init__(self: Any, **arguments: Any) -> None:
         if "C" in arguments:
             raise ValueError(
@@ -350,7 +348,6 @@ class LinearPlant(LimitValues, HardBounds):
             raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
 
     @classmethod
-    @own_error_state
     def from_statespace(
         cls,
         sys: Any,
@@ -371,7 +368,6 @@ class LinearPlant(LimitValues, HardBounds):
         return cls(**statespace.sampled_arguments(sys, dt, settings))
 
     @classmethod
-    @own_error_state
     def family(
         cls,
         members: Sequence[Self] | Callable[..., Self],
@@ -404,7 +400,6 @@ class LinearPlant(LimitValues, HardBounds):
         """
         return plant_of_middle(cls, members, ranges, monotone=monotone, at_rest=at_rest)
 
-    @own_error_state
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
 
@@ -449,7 +444,6 @@ class LinearPlant(LimitValues, HardBounds):
             step_offset=exact.product(G, self.step_offset),
         )
 
-    @own_error_state
     def with_rate_limits(self, du_max: ArrayLike, *, per: str = "step") -> Self:
         """Returns the plant with limits |u_k - u_{k-1}| <= du_max of how fast inputs change.
 

@@ -21,7 +21,6 @@ from ncs_gym.validation import (
     as_setting,
     as_vector,
     counted,
-    own_error_state,
     shown,
     warn_caller,
 )
@@ -43,8 +42,6 @@ THINNEST = 1e-4
 SMALLEST_WEIGHT = 1e-9
 # The operating point is no equilibrium if a step moves it by more, in half-widths of the box.
 NO_EQUILIBRIUM = 1e-6
-# A function is nearly at rest where a step moves it by no more than this part of the longest one in the box.
-NEARLY_AT_REST = 0.01
 # Results keep this many digits, so that other machines find the same numbers.
 DIGITS = 9
 
@@ -90,7 +87,6 @@ class _Steps(NamedTuple):
     moved: np.ndarray
 
 
-@own_error_state
 def linear_model(
     process: Process | Callable[[np.ndarray, np.ndarray], np.ndarray],
     box: Any = None,
@@ -125,8 +121,7 @@ def linear_model(
             are taken in place of fitted ones; a disturbance is declared beside the remainder.
 
     Warns:
-        NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far and the nearest point that stays; or a
-            function is at rest at `operating_state`, as if it were one of absolute values.
+        NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far.
 
     Raises:
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, a state lacks
@@ -163,7 +158,11 @@ def linear_model(
     largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
     basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
     if (off := float((np.abs(origin) / widths).max())) > max(NO_EQUILIBRIUM, spread):
-        warn_caller(_moving_origin(off, origin, (A, B), region), NoEquilibriumWarning)
+        warn_caller(
+            f"the operating point is no equilibrium: a step from (0, 0) moves it by {off:.3g} half-widths of the box, "
+            "which the remainder has to hold",
+            NoEquilibriumWarning,
+        )
     reached = np.sqrt(np.diag(bound.shape_matrix)) / widths
     if reached.max() >= 1.0:
         raise ValueError(
@@ -177,18 +176,11 @@ def linear_model(
             "the remainder was bounded around the operating point that was given, from which the middle of "
             "disturbance_bound moves: give symmetric ends, and let the process hold the middle"
         )
-    if isinstance(moving, FunctionProcess) and _rests_at_operating_point(moving, frame, region, drawn):
-        warn_caller(
-            "the function seems to take absolute values: it is nearly at rest at operating_state with operating_input, "
-            "and does something else there than near zero. It has to take deviations: if it takes absolute values, "
-            "give lambda x, u: f(x0 + x, u0 + u) - x0",
-            NoEquilibriumWarning,
-        )
     return plant
 
 
 class NoEquilibriumWarning(UserWarning):
-    """The point that deviations are counted from does not stay where it is, or is not where they seem to be counted."""
+    """The point that deviations are counted from does not stay where it is."""
 
 
 def _frame(limits: dict[str, Any]) -> LinearPlant:
@@ -208,46 +200,6 @@ def _size_of(vector: Any, point: Any, pair: Any) -> int:
     ends = list(pair) if isinstance(pair, (tuple, list, np.ndarray)) else []
     numbers = [as_setting(each) for each in (vector, point, *ends) if each is not None]
     return max((each.size for each in numbers if each is not None), default=1)
-
-
-def _rests_at_operating_point(process: FunctionProcess, plant: LinearPlant, region: _Region, steps: _Steps) -> bool:
-    """Returns whether a function that should be one of deviations is at rest where an absolute one is.
-
-    That says nothing of one which does the same there, as a linear one.
-    """
-    x0, u0 = plant.operating_state, plant.operating_input
-    if not x0.any() and not u0.any():
-        return False
-    try:
-        moved = process.step(plant, x0, u0) - x0
-        near = [
-            process.step(plant, x0 + x, u0 + u) - x0
-            for x, u in zip(steps.states.T[:REPEATED], steps.inputs.T[:REPEATED], strict=True)
-        ]
-    except Exception:  # whatever a function of deviations does so far away
-        return False
-    widths = region.half[: plant.n]
-    off = np.abs(np.array([moved, *(np.array(near) - steps.moved.T[:REPEATED])])) / widths
-    little = NEARLY_AT_REST * float((np.abs(steps.moved - steps.states).T / widths).max())
-    return bool(off[0].max() <= little < off[1:].max())
-
-
-def _moving_origin(off: float, origin: np.ndarray, model: tuple[np.ndarray, np.ndarray], region: _Region) -> str:
-    """Returns the sentence about f(0, 0), shape (n,), that is `off` half-widths long at its largest entry."""
-    (A, B), (widths, limits) = model, np.split(region.half, [len(origin)])
-    balance = np.hstack([(np.eye(len(A)) - A) * widths, -B * limits]) / widths[:, None]
-    point = np.linalg.lstsq(balance, origin / widths)[0]
-    state, applied = widths * point[: len(A)], limits * point[len(A) :]
-    sentence = (
-        f"the operating point is no equilibrium: a step from (0, 0) moves it by {off:.3g} half-widths of the box, "
-        "which the remainder has to hold"
-    )
-    if np.abs(balance @ point - origin / widths).max() > 0.1 * off:
-        return f"{sentence}, and by the linear model no point nearby stays where it is"
-    return (
-        f"{sentence}; by the linear model the state {shown(exact.rounded(state, 4).tolist())} stays where it is with "
-        f"the input {shown(exact.rounded(applied, 4).tolist())}: count deviations from there"
-    )
 
 
 def _steps_of(

@@ -198,8 +198,7 @@ def as_process(value: Any) -> Process:
     """
     if isinstance(value, Process):
         return value
-    hint = ": give ncs_gym.FunctionProcess of a function (x, u) -> x+" if callable(value) else ""
-    raise ValueError(f"process must be of type Process, got {type(value).__name__}{hint}")
+    raise ValueError(f"process must be of type Process, such as FunctionProcess(f), got {type(value).__name__}")
 
 
 @dataclass(frozen=True)

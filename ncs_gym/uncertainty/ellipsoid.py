@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, outer_sum
-from ncs_gym.validation import ReadOnlyArrays, as_covariance, own_error_state, read_only
+from ncs_gym.validation import ReadOnlyArrays, as_covariance, read_only
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -77,21 +77,18 @@ class Ellipsoid(ReadOnlyArrays):
         _, values, _ = self._principal_axes
         return (values > THIN * values[-1]) | (not values.any())
 
-    @own_error_state
     def support(self, direction: np.ndarray) -> np.ndarray | float:
         """Returns max of a'z over the ellipsoid for a direction a (n,), or for each of shape (..., n)."""
         direction = np.asarray(direction, dtype=np.float64)
         value = np.sqrt(np.maximum(((direction @ self.shape_matrix) * direction).sum(axis=-1), 0.0))
         return float(value) if value.ndim == 0 else value
 
-    @own_error_state
     def extreme_point(self, direction: np.ndarray) -> np.ndarray:
         """Returns a point of the ellipsoid, shape (n,), that attains the support in `direction`."""
         image = self.shape_matrix @ direction
         height = np.sqrt(max(float(direction @ image), 0.0))
         return image / height if height > 0.0 else np.zeros(self.dim)
 
-    @own_error_state
     def gauge(self, points: ArrayLike) -> Any:
         """Returns sqrt(z' P^-1 z): 0 at the center, 1 on the boundary, infinite off a flat ellipsoid.
 
@@ -111,13 +108,11 @@ class Ellipsoid(ReadOnlyArrays):
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
 
-    @own_error_state
     def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
         """Returns a uniformly distributed point, shape (n,), or `count` of them, shape (count, n)."""
         radius = rng.random(None if count is None else (count, 1)) ** (1.0 / np.count_nonzero(self.drawn_axes))
         return self.sample_boundary(rng, count) * radius
 
-    @own_error_state
     def sample_boundary(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
         """Returns boundary points, shape (n,) or (count, n): images of uniform directions of the unit sphere.
 
@@ -126,12 +121,10 @@ class Ellipsoid(ReadOnlyArrays):
         directions = rng.standard_normal(self.dim if count is None else (count, self.dim)) * self.drawn_axes
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)) @ self.factor.T
 
-    @own_error_state
     def outer_sum(self, other: Ellipsoid) -> Ellipsoid:
         """Returns the trace-smallest ellipsoid of the family P1/nu + P2/(1-nu) around the Minkowski sum."""
         return Ellipsoid(outer_sum(self.shape_matrix, other.shape_matrix, np.eye(self.dim)))
 
-    @own_error_state
     def farthest_point(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).
 
@@ -153,7 +146,6 @@ class Ellipsoid(ReadOnlyArrays):
         return points[0] if np.ndim(centers) == 1 else points
 
 
-@own_error_state  # a slope of zero on the longest axis ends in 0/0, centers far away in infinity
 def farthest_coordinates(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns the s, |s| <= 1, that maximize s' diag(values) s + 2 slope's, in columns, shape (n, count).
 

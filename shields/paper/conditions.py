@@ -8,7 +8,6 @@ from fractions import Fraction
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import own_error_state
 from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
 from shields.paper.certificate import PaperCertificate
 from shields.verification import Report
@@ -20,7 +19,6 @@ from shields.verification.rational_matrix import Matrix, add, multiply, quadrati
 _ROUNDING = Fraction(1, 10**12)
 
 
-@own_error_state
 def verify(certificate: PaperCertificate, plant: LinearPlant) -> Report:
     """Returns whether the constraints (C1)-(C7) of OP hold for a certificate and a plant, in exact arithmetic.
 

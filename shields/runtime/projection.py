@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.validation import own_error_state
-
 # A gain below this fraction of the largest counts as a direction that does not move the state.
 FLAT = 1e-13
 # Rows whose directions differ by less than this are parallel; what is found is tested again, with a larger margin.
@@ -183,7 +181,6 @@ def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return images, np.array([[cosine, sine], [-sine, cosine]])
 
 
-@own_error_state  # what is not finite is not admissible
 def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """Returns argmin |u - wanted| over |offset + effect u| <= limits, row by row; NaN where there is none.
 

@@ -24,7 +24,6 @@ from ncs_gym.validation import (
     as_numbers,
     as_vector,
     counted,
-    own_error_state,
     setting,
     shown,
     warn_caller,
@@ -129,7 +128,6 @@ class SafeLoop(CopiedWhole):
     input_delay: int = setting("input_delay")
     channel: Channel = setting("channel", "_estimator.channel")
 
-    @own_error_state
     def __init__(
         self,
         certificate: Certificate,
@@ -190,7 +188,6 @@ class SafeLoop(CopiedWhole):
         ]
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
-    @own_error_state
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None, *, known: bool = True) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
@@ -234,7 +231,7 @@ class SafeLoop(CopiedWhole):
         self._lost.begin()
         self._lost.tell_of(self.reason)
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()) -> np.ndarray:
         """Returns the estimate at this control step, shape (n,): predicted from the last one, then corrected.
 
@@ -297,14 +294,13 @@ class SafeLoop(CopiedWhole):
         self._lost.tell_of(self.reason)
         return estimate
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def decide(self, proposed: Any, *, ask: bool = False) -> Decision:
         """Returns what to apply from now until the next step, and why.
 
         Args:
             proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; clipped to the limits.
-                What is no finite input (None, say, if the controller failed) is replaced by u = K x_hat.
-                What is neither None nor numbers of that shape (a batch, a tensor with gradient) is told of.
+                What is no finite input is replaced by u = K x_hat, with a warning unless it is None.
             ask: Whether your controller asks for a sample, where samples are on request: that of the next step, behind
                 a downlink that of c steps later. See `request`.
 
@@ -318,8 +314,10 @@ class SafeLoop(CopiedWhole):
         if as_flag(ask, "ask"):
             requests = require_on_request(requests)
         u = _as_input(proposed, low.shape)  # what is none is decided as such
-        if u is None and proposed is not None:
-            self._tell_of_proposal(proposed, low.shape)
+        if u is None and proposed is not None and "proposal" not in self._told_of:
+            self._told_of = self._told_of | {"proposal"}
+            wanted = f"decide takes one input, finite numbers of shape {low.shape}, got {shown(proposed)}"
+            warn_caller(f"{wanted}; u = K x_hat is applied instead", UserWarning)
         self._phase = _Phase.STOPPED
         u = np.full_like(low, np.nan) if u is None else np.minimum(np.maximum(u, low), high)
         decision = self._monitored.decide(u)
@@ -434,12 +432,9 @@ class SafeLoop(CopiedWhole):
         """Warns once of every reason for which packets were discarded in this call."""
         oldest = self._estimator.channel.longest_delay
         texts = {
-            "too_late": f"it came later than {counted(oldest, 'step')}, the longest delay of the channel of this "
-            "loop; give SafeLoop the channel with its longest delay",
-            "ahead": f"its stamp is ahead of the loop, which is at step {self.steps}; stamp samples with the number of "
-            "their control step, counted from 0 at start (loop.steps), by one clock for both",
-            "other_episode": f"its episode is not that of the loop, {self.episode}; send "
-            "Packet(stamp, measurement, loop.episode)",
+            "too_late": f"it is older than {counted(oldest, 'step')}, the longest delay of the channel of this loop",
+            "ahead": f"its stamp is ahead of the loop, which is at step {self.steps}",
+            "other_episode": f"its episode is not that of the loop, {self.episode}",
         }
         is_new = {name for name in texts if getattr(self._discarded, name) > getattr(before, name)}
         if self.steps <= oldest:  # they may be stragglers
@@ -449,18 +444,6 @@ class SafeLoop(CopiedWhole):
             warn_caller(
                 f"a packet was discarded: {texts[name]} (`discarded` counts such packets)", UnusedPacketsWarning
             )
-
-    def _tell_of_proposal(self, proposed: Any, shape: tuple[int, ...]) -> None:
-        """Warns once of proposals that are no numbers of the shape of an input, as mistakes in programs make them."""
-        numbers = as_numbers(proposed)
-        is_input = numbers is not None and (numbers.shape == shape or (numbers.ndim == 0 and shape == (1,)))
-        if is_input or "proposal" in self._told_of:  # NaN comes from a controller that failed
-            return
-        self._told_of = self._told_of | {"proposal"}
-        warn_caller(
-            f"decide takes one input, numbers of shape {shape}, got {shown(proposed)}; u = K x_hat is applied instead",
-            UserWarning,
-        )
 
     def _require_started(self) -> _Phase:
         if self._phase is _Phase.STOPPED:
@@ -509,7 +492,6 @@ class SafeLoop(CopiedWhole):
         alarm = estimator.alarm or self._contradicted
         return LoopObservation(estimate, errors, alarm, estimator.age, estimator.damaged, stays)
 
-    @own_error_state
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
         return self._estimator.predicted(self._inputs.pending[: self._input_delay])

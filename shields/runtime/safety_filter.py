@@ -11,7 +11,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
-from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, own_error_state, read_only, shown, warn_caller
+from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.no_plans import NoPlans
@@ -115,6 +115,7 @@ class SafetyFilter(ReadOnlyArrays):
         """The test margin a projected input needs: MARGIN, and what rounding the action to float32 can move x+."""
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
 
+    @np.errstate(all="ignore")
     def decide(
         self,
         estimate: np.ndarray,
@@ -139,12 +140,8 @@ class SafetyFilter(ReadOnlyArrays):
                 pairs = (estimate, x_hat), (input_proposed, proposed)
                 one, other = (given if array.ndim else array[None] for given, array in pairs)
                 return self.decide(one, errors, other, stored)
-            self._tell_of_shapes(estimate, input_proposed)
         elif self.mode != "boundary":
-            try:
-                decision = self._decide_alone(x_hat, errors, proposed, stored)
-            except FloatingPointError:  # underflow, where numpy is told to raise
-                decision = None
+            decision = self._decide_alone(x_hat, errors, proposed, stored)
             if decision is not None:
                 return decision
         n, m = self.plant.n, self.plant.m
@@ -179,7 +176,6 @@ class SafetyFilter(ReadOnlyArrays):
             return None  # also for NaN
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
-    @own_error_state  # what is not finite passes no test
     def decide_columns(
         self, estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: np.ndarray | None = None
     ) -> Decision:
@@ -208,7 +204,7 @@ class SafetyFilter(ReadOnlyArrays):
         self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def decide_many(
         self, estimates: Any, error_shapes: Any, proposals: Any, stored: np.ndarray | None = None
     ) -> Decision:
@@ -254,20 +250,6 @@ class SafetyFilter(ReadOnlyArrays):
             plan=decided.plan.transpose(2, 0, 1),
         )
 
-    def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
-        """Warns the caller of `decide` that estimate or input is not a single one, and what it decides then."""
-        answers = {"estimate": "it returns the operating input", "input": "it falls back to K x_hat"}
-        for (name, answer), value, (size,) in zip(answers.items(), (estimate, proposed), self._single, strict=True):
-            if (array := _as_array(value)).shape != (size,):
-                got = f"shape {array.shape}" if array.size else shown(value)
-                warn_caller(
-                    f"decide takes one {name}, numbers of shape ({size},), got {got}: {answer} "
-                    "(decide_many takes batches)",
-                    UserWarning,
-                )
-                return
-
-    @own_error_state
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
         if not self.lookahead.horizon:
@@ -294,25 +276,22 @@ class SafetyFilter(ReadOnlyArrays):
             self._remembered[key] = known
         return known
 
-    @own_error_state
+    @np.errstate(all="ignore")  # what is not finite is unusable
     def errors_of_many(self, error_shapes: np.ndarray) -> PredictedErrors:
         """Returns what is known of error shapes, (k, n, n); only mode "lookahead" needs the shapes themselves."""
         known = self.test.predicted(error_shapes, self.certificate.error_shapes)
         return known if self.lookahead.needs_shapes else known._replace(shape=known.shape[:0])
 
-    @own_error_state
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray | PredictedErrors, u: np.ndarray) -> float:
         """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""
         x_hat, u = _as_column(_as_array(estimate), self.plant.n), _as_column(_as_array(u), self.plant.m)
         return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).margins(u)[1].item()
 
-    @own_error_state
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray | PredictedErrors) -> bool:
         """Returns whether estimate and error shape prove that x is in the certificate's safe set."""
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
 
-    @own_error_state
     def fallback_input(self, estimate: np.ndarray) -> np.ndarray:
         """Returns K x_hat, shape (m,), clipped to the limits and rounded to what a float32 action can express.
 
@@ -353,7 +332,6 @@ class SafetyFilter(ReadOnlyArrays):
             reason = np.where(unsafe, UNSAFE, FALLBACK)
             decided.reason[some] = np.where(valid & ~np.isnan(sets.radius), reason, INVALID)
 
-    @own_error_state
     def _gained(self, estimates: np.ndarray) -> np.ndarray:
         """Returns K x_hat as actions can express it, shape (m, N); NaN where it cannot be computed."""
         gained = self.certificate.K @ estimates + self._constant

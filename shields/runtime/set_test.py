@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 
 from ncs_gym import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
-from ncs_gym.validation import frozen, own_error_state, read_only
+from ncs_gym.validation import frozen, read_only
 from shields.certificate import Certificate, CertificateError
 from shields.runtime.projection import closest_admissible, closest_between, closest_in_interval, closest_on_line
 from shields.runtime.rows_within_step import closed, rows_within_step, supports
@@ -86,7 +86,6 @@ class SetTest:
         limits: The low and the high end of each input.
     """
 
-    @own_error_state  # what is not finite passes no test
     def __init__(
         self, plant: LinearPlant, cone: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray
     ) -> None:
@@ -123,7 +122,6 @@ class SetTest:
         limits = self.plant.largest_input
         return max(float(np.linalg.norm(cone, axis=0) @ limits), float((rows @ limits).max(initial=0.0)))
 
-    @own_error_state  # what overflows passes no test, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
         """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
 
@@ -217,7 +215,6 @@ class SetTest:
         bounds = np.concatenate([row_limits, np.repeat(half, count, axis=1)])
         return closest_between(inputs, offset, self._limited_rows, bounds)
 
-    @own_error_state
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether estimates of shape (n, N), or a single one, (n,), prove that x is in the set.
 
@@ -233,7 +230,6 @@ class SetTest:
             left = (half - (np.abs(values - middle) + errors.own)).min(axis=0)
         return left >= margin + self.rounding * self.own_columns.dot(np.abs(estimates))
 
-    @own_error_state
     def keeps_within_step(
         self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
     ) -> bool:

@@ -14,7 +14,6 @@ import numpy as np
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
@@ -89,7 +88,6 @@ def _between(rows: np.ndarray, low: np.ndarray, high: np.ndarray, initial: Ellip
     return all(lo <= product <= hi for (product,), (lo, hi) in zip(products, ends, strict=True))
 
 
-@own_error_state  # what is not finite is no verdict
 def _surely_between(rows: np.ndarray, low: np.ndarray, high: np.ndarray, state: np.ndarray) -> bool | None:
     """Returns whether low <= g x <= high for all rows and one state; None where rounding could decide it."""
     products, sizes = rows @ state, np.abs(rows) @ np.abs(state)

@@ -15,7 +15,7 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.validation import AroundEnvironments, own_error_state, require_batched_infos
+from ncs_gym.validation import AroundEnvironments, require_batched_infos
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
@@ -69,7 +69,6 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
 
     _wanted, _wrappers, _refused = NCSVectorEnv, VectorWrapper, (VectorActionWrapper,)
 
-    @own_error_state
     def __init__(
         self,
         env: VectorEnv,
@@ -98,11 +97,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         self._errors = NumberedErrors(self._filter)
         self._no_reason = np.full(count, "", dtype=object)
         self._no_reason.flags.writeable = False
-        # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
-        self._interrupted = Clock(np.full(count, -1), np.full(count, -1), -2)
         self._clock: Clock | None = None
 
-    @own_error_state
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -112,16 +108,11 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
             ValueError: If what is wrapped is not any more what the shield was made for.
             GuaranteeLostError: If x in S is not proved and that is to be raised; the episodes have begun then.
         """
-        before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
+        before = self._clock or Clock(np.full(self.num_envs, -1), np.full(self.num_envs, -1), -1)
         if self._inner.render_mode is not None:
             self._annotate(None, 0, NO_PLAN, intervened=False)
-        try:
-            # gymnasium's annotation leaves out the lists that its own vector environments take.
-            observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
-        except ValueError:
-            if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
-                self._clock = before  # refused before anything moved
-            raise
+        # gymnasium's annotation leaves out the lists that its own vector environments take.
+        observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorSafetyShield")
         self._require_same()
         self._look_at({*self._inner.episode_channels})
@@ -144,7 +135,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         self._lost.tell()
         return observation, info
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies the actions, or what the shield puts in the place of some.
 
@@ -156,6 +147,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         actions, proposed = read_actions(self._filter.plant, actions, self.num_envs)
+        before, self._clock = self._clock, self._clock._replace(ticks=-2)  # after an exception nothing is proved
         decided = self._filter.decide_columns(self._report.estimate, self._report.errors, proposed, self._stored)
         if self._filter.mode != "monitor" and np.count_nonzero(decided.intervened):
             actions = overridden(actions, decided, self._filter.plant)
@@ -164,7 +156,6 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
             plan, acted = decided.plan[..., e], bool(decided.intervened[e])
             plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
             self._annotate(proposed[:, e].copy(), int(self._interventions[e]) + acted, plan, intervened=acted)
-        before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
@@ -274,9 +265,8 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
 
     def _idle_margins(self, chosen: np.ndarray) -> np.ndarray:
         """Returns the margins of no input in some environments, shape (len(chosen),)."""
-        with np.errstate(all="ignore"):
-            sets = self._filter.test.reachable(self._report.estimate[:, chosen], self._report.errors.of(chosen))
-            return sets.margins(np.zeros((self._filter.plant.m, len(chosen))))[1]
+        sets = self._filter.test.reachable(self._report.estimate[:, chosen], self._report.errors.of(chosen))
+        return sets.margins(np.zeros((self._filter.plant.m, len(chosen))))[1]
 
     def _read_clock(self) -> Clock:
         inner = self._inner

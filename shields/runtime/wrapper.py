@@ -11,15 +11,13 @@ from typing import Any, Generic, TypeVar
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
-from ncs_gym.envs.loop_settings import channel_setting
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import AroundEnvironment, as_number, own_error_state, setting, shown, warn_caller
+from ncs_gym.validation import as_number, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.packaged_certificates import certificate_for
 from shields.runtime.decisions import NO_PLAN
@@ -33,14 +31,14 @@ E = TypeVar("E", NCSEnv, NCSVectorEnv)
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
 
-# What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
+# What the clock reads while a step is under way: after an exception nothing is proved until the next reset.
 INTERRUPTED = (-1, -1)
 
 # What of an environment a shield's proof rests on.
 PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
 
-class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
+class BaseShield(RecordConstructorArgs, Generic[E]):
     """What the shields have in common: their settings, and that what they wrap stays what they were made for."""
 
     certificate: Certificate = setting("certificate")
@@ -48,7 +46,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
     mode: str = setting("mode", "_filter.mode")
     horizon: int | None = setting("horizon", "_filter.horizon")
     on_unproved: str = setting("on_unproved", "_lost.on_unproved")
-    channel: Channel = channel_setting("channel", "_inner.channel")
+    channel: Channel = setting("channel", "_inner.channel")
 
     @property
     def penalty(self) -> float:
@@ -118,7 +116,7 @@ class BaseShield(AroundEnvironment, RecordConstructorArgs, Generic[E]):
             layer = layer.env
         if not isinstance(layer, self._wanted):
             wanted = self._wanted.__name__
-            raise ValueError(f"the shield needs an {wanted} inside, got {type(layer).__name__}{_hint_for(env)}")
+            raise ValueError(f"the shield needs an {wanted} inside, got {type(layer).__name__}")
         return layer
 
     @staticmethod
@@ -223,7 +221,6 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
 
     _wanted, _wrappers, _refused = NCSEnv, gym.Wrapper, REFUSED
 
-    @own_error_state
     def __init__(
         self,
         env: gym.Env,
@@ -241,7 +238,6 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
 
-    @own_error_state
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`.
 
@@ -249,19 +245,12 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
             ValueError: If what is wrapped is not any more what the shield was made for.
             GuaranteeLostError: If x in S is not proved and that is to be raised; the episode has begun then.
         """
-        now = self._episode
-        before, now.clock = now.clock, now.clock and INTERRUPTED
         if self._is_drawn:
             self._annotate(None, 0, NO_PLAN, intervened=False)
-        try:
-            observation, info = self.env.reset(seed=seed, options=options)
-        except ValueError:
-            if self._read_clock() == before:  # refused before anything moved
-                now.clock = before
-            raise
+        observation, info = self.env.reset(seed=seed, options=options)
         self._require_same()
         self._look_at({self._inner.episode_channel})
-        clock, known, start = self._read_clock(), self._inner.known, self._inner.start
+        now, clock, known, start = self._episode, self._read_clock(), self._inner.known, self._inner.start
         report, errors = self._observed(known), self._monitored.errors
         ahead = self._inner.estimates_ahead()[:-1]
         earlier = [LoopObservation(mean, errors.one(known.table, number), False) for mean, number in ahead]
@@ -277,7 +266,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         self._lost.tell_of(info["shield_reason"])
         return observation, info
 
-    @own_error_state
+    @np.errstate(all="ignore")
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Applies the action, or what the shield puts in its place.
 
@@ -332,16 +321,3 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
             "episode_interventions": now.interventions,
             "episode_guaranteed": now.proved / (self._inner.steps + 1),
         }
-
-
-def _hint_for(env: Any) -> str:
-    """Returns which shield an environment takes that the other one refuses, or what to read if neither takes it."""
-    inner = getattr(env, "unwrapped", None)
-    if isinstance(inner, NCSEnv):
-        return ": use SafetyShield for a single environment"
-    if isinstance(inner, NCSVectorEnv):
-        return ": use VectorSafetyShield for a vectorized environment"
-    if isinstance(inner, VectorEnv):
-        each = "make_vec(..., vectorization_mode='sync', wrappers=[SafetyShield])"
-        return f": for gymnasium's sync and async vector environments give {each}"
-    return ", which has no linear model with bounds: docs/own_plant.md says how one is given to it"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.validation import as_vector, own_error_state, shown
+from ncs_gym.validation import as_vector, shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.design_problem import Rest, design_problem
@@ -38,7 +38,7 @@ _FEW_ALTERNATIONS = 4
 _LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
 
 
-@own_error_state
+@np.errstate(all="ignore")
 def synthesize(
     plant: LinearPlant,
     method: str = "certified",

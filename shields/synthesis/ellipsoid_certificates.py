@@ -10,7 +10,6 @@ import numpy as np
 
 from ncs_gym import LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
@@ -44,7 +43,6 @@ _WIDEST_SPREAD = 1e6
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
 
-@own_error_state
 def certify(
     plant: LinearPlant, L: np.ndarray, K: np.ndarray, contract: ChannelContract | None = None
 ) -> Certificate | None:

@@ -59,9 +59,8 @@ def max_margin_gain(
         searches: Number of regulators, those of largest margin, that the search begins at.
     """
     search = _GainSearch(problem, Sigma, input_limits)
-    with np.errstate(all="ignore"):
-        initial = sorted(_initial_points(problem), key=search.largest_use)[:searches]
-        improved = [search.improved(point) for point in initial]
+    initial = sorted(_initial_points(problem), key=search.largest_use)[:searches]
+    improved = [search.improved(point) for point in initial]
     best = min(improved, key=search.largest_use, default=None)
     return None if best is None else search.gain_at(best)
 

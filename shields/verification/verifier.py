@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import own_error_state
 from shields.certificate import Certificate
 from shields.certificate_text import labeled
 from shields.errors import CertificateError
@@ -52,7 +51,6 @@ def _line(alike: list[Condition]) -> str:
     return labeled(f"{'holds ' if least.holds else 'BROKEN'}  {least.margin:+.3e}  ", f"{least.name}{count}")
 
 
-@own_error_state
 def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
@@ -78,7 +76,6 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
 _valid: set[tuple[str, str, bytes]] = set()
 
 
-@own_error_state
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
     """Raises unless a certificate verifies for a plant; what has verified in this process is not verified again.
 

@@ -7,7 +7,6 @@ polynomials and chi-square quantiles in ball arithmetic; with the first it share
 from collections.abc import Iterator
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import own_error_state
 from shields import Certificate, Report
 from shields.paper import PaperCertificate
 from shields.verification.condition import Condition
@@ -16,7 +15,6 @@ from tests.second_verifier.exact import is_so
 from tests.second_verifier.paper import paper_conditions
 
 
-@own_error_state
 def verify_again(certificate: Certificate | PaperCertificate, plant: LinearPlant) -> Report:
     """What `shields.verify` or `shields.paper.verify` returns, judged without its code."""
     return Report(tuple(_conditions(certificate, plant)))

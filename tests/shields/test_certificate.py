@@ -1,5 +1,3 @@
-import pickle
-
 import numpy as np
 import pytest
 
@@ -15,12 +13,6 @@ def test_matrix_and_sets_are_derived_from_L(certificate):
 
 def test_short_form_has_no_numbers(certificate):
     assert repr(certificate) == f"<Certificate for the plant {certificate.fingerprint[:16]}, without a contract>"
-
-
-def test_arrays_are_read_only_even_after_pickling(certificate):
-    for twin in (certificate, pickle.loads(pickle.dumps(certificate))):
-        for name in ("L", "M", "K", "Sigma", "D"):
-            assert not getattr(twin, name).flags.writeable
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
-from ncs_gym.validation import own_error_state, read_only
+from ncs_gym.validation import read_only
 from shields.runtime.rows_within_step import RowsWithinStep, closed, rows_within_step, supports
 from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, judged_shapes
 
@@ -83,20 +83,17 @@ class PlanTest:
         """
         return self._row_limits(estimates, tightening, slice(None)), self._radius(estimates, tightening)
 
-    @own_error_state  # what is not finite is not certified
     def _row_limits(self, estimates: np.ndarray, tightening: Tightening, rows: slice) -> np.ndarray:
         """Returns what `limits_at` says of some rows."""
         limits, rounding = tightening.row_limits[:, :, rows], self._row_rounding[:, rows]
         size = np.abs(estimates) @ rounding.reshape(-1, estimates.shape[1]).T
         return limits - size.reshape(limits.shape) - self._margin
 
-    @own_error_state
     def _radius(self, estimates: np.ndarray, tightening: Tightening) -> np.ndarray:
         """Returns the same of the cone."""
         radius = tightening.radius - np.abs(estimates) @ self._end_rounding  # may be far below zero
         return np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
-    @own_error_state  # with what is not finite no plan begins
     def may_begin(self, estimates: np.ndarray, tightening: Tightening, firsts: np.ndarray) -> np.ndarray:
         """Returns where a plan may begin with an input, (E, m); shape (E,).
 
@@ -117,7 +114,6 @@ class PlanTest:
         limits = self._row_limits(estimates, tightening, rows) + self._reach_of_others[:, rows]
         return np.all(np.abs(values + others) <= limits, axis=2)
 
-    @own_error_state
     def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
         """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N)."""
         block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
@@ -158,7 +154,6 @@ class PlanTest:
         radius = self._radius(estimates, tightening)
         return np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
 
-    @own_error_state
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether c_i x_hat +- sqrt(c_i Sigma_k c_i') is between all ends: x is in the box then."""
         count, extents = len(self.prediction.plant.box), np.sqrt(np.diag(error_shape))
@@ -362,7 +357,6 @@ class Tightening(NamedTuple):
         return Tightening(*(part[chosen] for part in self))
 
 
-@own_error_state  # what overflows passes no test
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 

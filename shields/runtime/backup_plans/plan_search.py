@@ -14,7 +14,7 @@ import numpy as np
 from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.plants.lqr import lqr_gain
-from ncs_gym.validation import own_error_state, read_only
+from ncs_gym.validation import read_only
 from shields.certificate import Fallback
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
 from shields.runtime.set_test import SetTest
@@ -141,7 +141,6 @@ class Planner:
         beginnings[:, 0, 1:] = stored[:, 1:]
         return completed(self._plant, self._fallback, estimates, beginnings, self._gains[::-1])
 
-    @own_error_state  # what is not finite passes no test
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
         """Returns proposals followed by either loop, (E, 2, N, m), limited after the prediction: one product for all.
 
@@ -311,7 +310,6 @@ class PlanProgram:
         numbered.data = np.concatenate([self._linear, -(root @ self._end).ravel()])[self._order]
         self._typical = numbered
 
-    @own_error_state  # what is not finite has no plan
     def solve(
         self,
         estimate: np.ndarray,
@@ -394,7 +392,6 @@ def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate(inputs).T)
 
 
-@own_error_state  # what is not finite passes no test
 def completed(
     plant: LinearPlant, fallback: Fallback, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray
 ) -> np.ndarray:

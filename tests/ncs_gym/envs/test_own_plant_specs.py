@@ -3,7 +3,6 @@
 import copy
 import json
 import pickle
-import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -215,21 +214,6 @@ def test_what_holds_functions_stays_what_it_is():
     with pytest.raises(TypeError, match="not JSON serializable"):
         made.spec.to_json()
     assert_moves_alike(made, gym.make(made.spec))
-
-
-def test_starts_that_seem_to_be_absolute_are_told():
-    around = {"operating_state": [60.0], "state_limits": (50.0, 90.0), "operating_input": [0.5], "input_limits": (0, 1)}
-    plant = LinearPlant(A=[[0.8]], B=[[0.4]], dt=1.0, gamma=1e-4, **around)
-    one, many = gym.make(LINEAR, plant=plant), gym.make_vec(LINEAR, num_envs=2, plant=plant)
-    for env in (one, many):
-        with pytest.warns(UserWarning, match=r"inside if it is absolute: .* plant\.to_deviation\(state\) gives"):
-            env.reset(options={"state": [65.0]})
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            env.reset(options={"state": plant.to_deviation([65.0])})
-            env.reset(options={"state": [40.0]})  # 40 is outside, either way
-    with pytest.warns(UserWarning, match="inside if it is absolute"):
-        many.reset(options={"state": [[1.0], [65.0]]})
 
 
 @pytest.mark.parametrize("limits", [{"box": [5.0, np.inf]}, {"box": [[0.2, 0.0], [0.4, 0.0]]}, {"box": [[1.0, -1.0]]}])

@@ -10,7 +10,6 @@ from ncs_gym import Channel, ChannelContract, Packet, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.uncertainty.shape_matrices import is_inside
-from ncs_gym.validation import own_error_state
 from tests.plants import random_plant
 
 IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
@@ -27,7 +26,6 @@ def unstable(seed):
     return replace(plant, A=plant.A * (1.0 + 0.04 * (seed % 3)) / plant.spectral_radius), ChannelContract(1 + seed % 3)
 
 
-@own_error_state
 def steps_back(plant, contract, outage, period):
     """How many steps after an outage of so many the error's ellipsoid lies in the certified set again.
 

@@ -1,9 +1,7 @@
 """A family of plants: the bound that its middle is given, which members there are, and what is refused."""
 
-import copy
 import itertools
 import json
-import pickle
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -222,14 +220,6 @@ def _contract(plant):
     from ncs_gym import ChannelContract
 
     return {} if plant.spectral_radius < 1.0 else {"contract": ChannelContract(3)}
-
-
-def test_copies_and_pickles_are_read_only_and_keep_the_function():
-    for twin in (copy.deepcopy(TRUCK), pickle.loads(pickle.dumps(TRUCK))):
-        family = twin.remainder.family
-        assert family.function is truck_trailer
-        with pytest.raises(ValueError, match="read-only"):
-            family.members[0, 0, 0] = 1.0
 
 
 def test_members_are_those_of_the_continuous_model():

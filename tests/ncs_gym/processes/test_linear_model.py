@@ -1,6 +1,5 @@
 """Linear models of processes: the fit, the bound on the remainder, and how it is known."""
 
-import re
 import warnings
 from dataclasses import replace
 
@@ -290,31 +289,16 @@ def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
     assert 0.999 < largest <= 1.0
 
 
-def test_operating_point_that_does_not_stay_is_told_with_the_nearest_one_that_does():
-    """A tank that runs dry: with the named input the named level stays, and counted from there nothing is told."""
+def test_operating_point_that_does_not_stay_is_told():
+    """A tank that runs dry: counted from where an input holds the level nothing is told."""
 
     def tank(x, u):
         return x + 0.1 * (u - 0.5 * np.sqrt(np.maximum(x + 1.0, 0.0)))
 
     settings = {"disturbance_bound": 0.001, "sensor_bound": 0.01, "initial_bound": 0.01}
-    with pytest.warns(NoEquilibriumWarning, match=r"moves it by 0\.1 half-widths") as told:
+    with pytest.warns(NoEquilibriumWarning, match=r"moves it by 0\.1 half-widths"):
         model = linear_model(tank, [0.5], [0.6], 0.1, samples=500, **settings)
-    state, applied = (float(each) for each in re.findall(r"\[(-?[\d.e-]+)\]", str(told[0].message)))
-    assert abs(tank(np.array([state]), np.array([applied]))[0] - state) < 0.01
-    assert abs(state) < 0.5
     with warnings.catch_warnings():
         warnings.simplefilter("error", NoEquilibriumWarning)
         moved = linear_model(lambda x, u: tank(x, u + 0.5), [0.5], [0.6], 0.1, samples=500, **settings)
     assert moved.remainder.bound.shape_matrix.item() < model.remainder.bound.shape_matrix.item()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", NoEquilibriumWarning)
-        point = {"operating_state": [5.0], "operating_input": [0.5], **settings}
-        linear_model(lambda x, u: tank(x, u + 0.5), [0.5], [0.6], 0.1, samples=500, **point)
-        linear_model(
-            lambda x, u: 0.9 * x + 9.0 * u, [0.5], [0.6], 0.1, samples=500, **point | {"operating_state": [45]}
-        )
-    point = {"operating_state": [0.999], "operating_input": [0.5], **settings}  # rounded
-    with pytest.warns(NoEquilibriumWarning, match="if it takes absolute values"):
-        linear_model(lambda x, u: tank(x - 1.0, u) + 1.0, [0.5], [0.6], 0.1, samples=500, **point)
-    with pytest.warns(NoEquilibriumWarning, match="no point nearby stays"):
-        linear_model(lambda x, u: x + 0.01 + 0.0 * u, [0.5], [0.6], 0.1, samples=500, **settings)

@@ -1,7 +1,7 @@
 """What shields, filters and loops refuse, with the words that say why: a new refusal is a new row."""
 
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -111,8 +111,7 @@ INNER = {
     "Autoreset": Autoreset,
 }
 UNPROVED = r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"
-MISPLACED = r"delay is a setting of the channel: give channel=Channel\(delay=...\)"
-NO_MODEL = r"needs an NCSEnv inside, got PendulumEnv, which has no linear model .*: docs/own_plant\.md says how"
+NO_MODEL = "needs an NCSEnv inside, got PendulumEnv"
 SHIELDS = (partial(SafetyShield, SCALAR), partial(VectorSafetyShield, VECTOR))
 THIRTEEN = small([[0.9, 0.1], [0.0, 0.8]], B=np.ones((2, 13)))
 # What is called, the error, and words of its message.
@@ -132,10 +131,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         "the environment has a SafetyShield already: leave one out",
     ),
     (lambda: SafetyShield(Wider(SCALAR), CERTIFICATE), ValueError, "changes the action space"),
-    (lambda: SafetyShield(VECTOR, CERTIFICATE), ValueError, "use VectorSafetyShield"),
-    (lambda: SafetyShield(SYNC, CERTIFICATE), ValueError, r"wrappers=\[SafetyShield\]"),
-    (lambda: VectorSafetyShield(SYNC, CERTIFICATE), ValueError, r"wrappers=\[SafetyShield\]"),
-    (lambda: VectorSafetyShield(SCALAR, CERTIFICATE), ValueError, "use SafetyShield for"),
+    *((partial(SafetyShield, each, CERTIFICATE), ValueError, "needs an NCSEnv inside") for each in (VECTOR, SYNC)),
+    *(
+        (partial(VectorSafetyShield, each, CERTIFICATE), ValueError, "needs an NCSVectorEnv inside")
+        for each in (SCALAR, SYNC)
+    ),
     (lambda: VectorSafetyShield(Scaled(VECTOR), CERTIFICATE), ValueError, "must be inside Scaled"),
     (
         lambda: VectorSafetyShield(VectorSafetyShield(VECTOR, CERTIFICATE)),
@@ -175,8 +175,6 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for value in (np.nan, np.inf)
     ],
     # Environments.
-    (lambda: gym.make(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
-    (lambda: gym.make_vec(CRUISE, delay="a", loss=0.1), ValueError, MISPLACED),
     (lambda: LoopConfig(env="ncs_gym/CartPol-v0"), ValueError, "environment: did you mean 'ncs_gym/CartPole-v0'"),
     (lambda: LoopConfig(env="CSTR-v0"), ValueError, "environment: did you mean 'ncs_gym/CSTR-v0'"),
     (lambda: LoopConfig(env="ncs_gym/Nothing-v0"), ValueError, "'ncs_gym/Nothing-v0' is no registered environment"),
@@ -308,20 +306,8 @@ def test_what_is_refused_elsewhere_is_taken_where_it_belongs():
 
 
 @pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved", "channel"])
-@pytest.mark.parametrize(("kind", "env"), [(SafetyShield, SCALAR), (VectorSafetyShield, VECTOR)])
-def test_settings_of_a_shield_cannot_be_changed(kind, env, name):
-    shield = kind(env, CERTIFICATE)
-    with pytest.raises(AttributeError, match=f"{name} is a setting of {kind.__name__}"):
-        setattr(shield, name, getattr(shield, name))
-
-
-@pytest.mark.parametrize("name", ["filter", "contract", "input_delay"])
-def test_settings_of_a_loop_cannot_be_changed(name):
-    with pytest.raises(AttributeError, match=f"{name} is a setting of SafeLoop"):
-        setattr(loop_of(), name, None)
-
-
-@pytest.mark.parametrize("name", ["mode", "plant", "certificate", "test"])
-def test_filter_cannot_be_changed_once_it_is_verified(name):
-    with pytest.raises(FrozenInstanceError):
-        setattr(safety_filter(), name, getattr(safety_filter(), name))
+def test_settings_of_shields_and_loops_are_not_set(name):
+    for made in (SafetyShield(SCALAR, CERTIFICATE), VectorSafetyShield(VECTOR, CERTIFICATE), loop_of()):
+        if hasattr(made, name):
+            with pytest.raises(AttributeError):
+                setattr(made, name, getattr(made, name))

@@ -154,15 +154,13 @@ def test_decide_takes_numbers_where_there_is_one_state_or_one_input():
         assert one.input == shield.decide(np.array([0.2]), 1e-4 * np.eye(1), np.array([u])).input
         assert one.reason != "invalid"
     for estimate in (0.2, np.array([0.2])):
-        for bad, got in ((None, "None"), (np.zeros(2), r"shape \(2,\)")):
-            with pytest.warns(UserWarning, match=f"one input.* got {got}: it falls back to K x_hat"):
-                decision = shield.decide(estimate, 1e-4 * np.eye(1), bad)
+        for bad in (None, np.zeros(2)):
+            decision = shield.decide(estimate, 1e-4 * np.eye(1), bad)
             assert decision.fallback
             assert np.isclose(decision.input, shield.certificate.K @ [0.2])
         assert shield.decide(estimate, 1e-4 * np.eye(1), np.nan).fallback
-    for bad, answer in ((np.zeros(2), "it returns the operating input"), (np.zeros((1, 2)), "the operating input")):
-        with pytest.warns(UserWarning, match=answer):
-            assert not shield.decide(bad, 1e-4 * np.eye(1), 1.0).input.any()
+    for bad in (np.zeros(2), np.zeros((1, 2))):
+        assert not shield.decide(bad, 1e-4 * np.eye(1), 1.0).input.any()
 
 
 class Contrary:

@@ -17,7 +17,6 @@ from ncs_gym import (
     Actuator,
     Channel,
     Command,
-    Estimator,
     LinearPlant,
     NCSEnv,
     NCSVectorEnv,
@@ -32,7 +31,7 @@ from ncs_gym import (
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from tests.certificates import certificate_of
 
-PLANT = truck_trailer(mass=4000.0)
+PLANT, TWO = truck_trailer(mass=4000.0), np.zeros(2)
 
 
 @pytest.fixture(scope="module")
@@ -51,53 +50,36 @@ def test_stepping_after_the_end_of_an_episode_is_refused():
     env.step([1.0])
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    ("estimate", "proposed", "words"),
-    [
-        (np.zeros((5, 2)), np.zeros((5, 1)), r"one estimate, numbers of shape \(2,\), got shape \(5, 2\).*decide_many"),
-        (np.zeros(2), np.zeros((5, 1)), r"one input, numbers of shape \(1,\), got shape \(5, 1\)"),
-        (np.zeros(2), torch.zeros(1, requires_grad=True), "one input, .* got tensor.* detach it"),
-    ],
-)
-def test_batches_and_tensors_handed_to_a_filter_are_told_of(certificate, estimate, proposed, words):
+def test_batches_and_tensors_handed_to_a_filter_are_invalid(certificate):
     shield = SafetyFilter(certificate, PLANT)
-    with pytest.warns(UserWarning, match=words):
-        decision = shield.decide(estimate, certificate.Sigma, proposed)
-    assert decision.reason == "invalid"
+    gradient = torch.zeros(1, requires_grad=True)
+    for estimate, proposed in ((np.zeros((5, 2)), np.zeros((5, 1))), (np.zeros(2), np.zeros((5, 1))), (TWO, gradient)):
+        assert shield.decide(estimate, certificate.Sigma, proposed).reason == "invalid"
 
 
 @pytest.mark.filterwarnings("error")
-def test_proposals_that_are_no_input_by_mistake_are_told_of_once_and_not_applied(certificate):
-    wrong = {
-        r"got tensor\(\[0.5000\], requires_grad=True\), which has a gradient: detach it": torch.tensor(
-            [0.5], requires_grad=True
-        ),
-        r"got .* which has a gradient: detach it": [torch.tensor(0.5, requires_grad=True)],
-        r"got array\(\[\[0.5\]\]\)": np.full((1, 1), 0.5),
-        "got 'full throttle'": "full throttle",
-    }
-    for words, proposed in wrong.items():
+def test_proposals_that_are_no_input_are_told_of_once_and_not_applied(certificate):
+    gradient = torch.tensor([0.5], requires_grad=True)
+    for proposed in (gradient, [gradient[0]], np.full((1, 1), 0.5), "full throttle", np.nan, np.array([np.inf])):
         loop = SafeLoop(certificate, PLANT, Channel())
         loop.start([0.5, 0.0])
-        with pytest.warns(UserWarning, match=rf"one input, numbers of shape \(1,\), {words}.*K x_hat is applied"):
+        assert loop.step(None).reason == "invalid"  # a controller that failed is no mistake
+        with pytest.warns(UserWarning, match=r"one input, finite numbers of shape \(1,\), got .*K x_hat is applied"):
             decision = loop.step(proposed)
         assert decision.reason == "invalid"
         np.testing.assert_allclose(decision.input, certificate.K @ loop.estimate, atol=1e-6)
         loop.step(proposed)
-    for failed in (None, np.nan, np.array([np.inf])):  # a controller that failed is no mistake
-        assert loop.step(failed).reason == "invalid"
 
 
 @pytest.mark.parametrize("wrong", [torch.zeros(1, requires_grad=True), [torch.tensor(0.0, requires_grad=True)]])
-def test_actions_with_a_gradient_are_refused_with_what_to_do(certificate, wrong):
+def test_actions_with_a_gradient_are_refused(certificate, wrong):
     env, envs = NCSEnv(PLANT), NCSVectorEnv(1, plant=PLANT)
     asks = Channel(on_request=True)
     asking, many = RequestActions(NCSEnv(PLANT, asks)), VectorRequestActions(NCSVectorEnv(1, plant=PLANT, channel=asks))
     shields = SafetyShield(NCSEnv(PLANT), certificate), VectorSafetyShield(NCSVectorEnv(1, plant=PLANT), certificate)
     for each in (env, envs, asking, many, *shields):
         each.reset(seed=0)
-        with pytest.raises(ValueError, match=r"which has a gradient: detach it"):
+        with pytest.raises(ValueError, match="must be finite with shape"):
             each.step(wrong)
 
 
@@ -152,7 +134,7 @@ def test_packets_without_the_number_of_a_later_episode_are_named_once(certificat
         loop.start([0.0, 0.0])
         loop.step(0.0)
         loop.step(0.0, [Packet(1, np.zeros(2))])  # in the second episode this could be a straggler of the first
-    with pytest.warns(UnusedPacketsWarning, match=r"its episode is not that of the loop, 1; send Packet\(stamp"):
+    with pytest.warns(UnusedPacketsWarning, match="its episode is not that of the loop, 1"):
         loop.step(0.0, [Packet(2, np.zeros(2))])
     loop.step(0.0, [Packet(3, np.zeros(2))])
     assert loop.discarded.other_episode == 3
@@ -200,22 +182,6 @@ def test_copy_of_a_loop_shares_nothing_with_it(certificate):
         own.receive()
         np.testing.assert_array_equal(loop.decide([4.0]).input, own.decide([4.0]).input)
         assert loop.guaranteed == own.guaranteed
-
-
-def test_copies_of_estimators_and_actuators_share_nothing():
-    estimator, actuator = Estimator(PLANT, Channel()), Actuator(1, 1)
-    estimator.reset(np.zeros(2))
-    others = copy.copy(estimator), copy.copy(actuator)
-    before = others[0].mean.copy()
-    for _ in range(5):
-        estimator.advance(np.ones(1), [])
-    actuator.receive([Command(0, [[1.0], [2.0]])])
-    actuator.apply(0)
-    np.testing.assert_array_equal(others[0].mean, before)
-    assert others[0].step == 0
-    assert others[1].echo.steps == 0
-    assert others[1].apply(1).item() == 0.0
-    assert others[1].missing
 
 
 def test_commands_of_an_episode_that_an_actuator_has_not_begun_are_named_once():

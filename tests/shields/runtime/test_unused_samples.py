@@ -68,7 +68,7 @@ def test_every_reason_is_counted_and_named_once_and_apart():
     said = [str(warning.message) for warning in caught]
     assert len(said) == 3
     for text in (
-        "later than 1 step, the longest delay",
+        "older than 1 step, the longest delay",
         "is ahead of the loop, which is at step 4",
         "episode is not that of the loop",
     ):

@@ -1,0 +1,147 @@
+"""What is made stays as it was made, in copies, pickles and threads: one test for all public values."""
+
+import importlib
+import inspect
+import pickle
+import pkgutil
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy, deepcopy
+from dataclasses import FrozenInstanceError, fields, is_dataclass
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import ncs_gym
+import shields
+from agents.loop import BasePolicy
+from ncs_gym import (
+    AdversarialDisturbance,
+    BallDisturbance,
+    BoxDisturbance,
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    FamilyProcess,
+    FunctionProcess,
+    GilbertElliott,
+    GymProcess,
+    LinearPlant,
+    LinearProcess,
+    NCSEnv,
+    PacketLog,
+    Regulation,
+    SetpointTracking,
+    SinusoidDisturbance,
+    SpeedTracking,
+    SphereDisturbance,
+    TraceChannel,
+    batch_reactor,
+    certified_error_set,
+    truck_trailer,
+)
+from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
+from ncs_gym.registration import TRUCK_TRAILER
+from ncs_gym.rendering.episode_record import Annotation
+from ncs_gym.uncertainty.disturbances import as_disturbance
+from ncs_gym.validation import ReadOnlyArrays
+from shields import SafetyFilter
+from shields.paper import PaperCertificate
+from tests.certificates import certificate_of
+
+DOWNLINK = {"downlink": Channel(delay=1), "downlink_contract": ChannelContract(2)}
+PLANT, ERRORS = pendulum(), certified_error_set(batch_reactor(), ChannelContract(3))
+FAMILY = LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
+CERTIFICATE = certificate_of(batch_reactor(), ChannelContract(2), "polytope")
+PAPER = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2, "fingerprint": "none"}
+VALUES = [
+    PLANT,
+    PLANT.remainder,
+    FAMILY,
+    FAMILY.remainder.family,
+    PLANT.disturbance,
+    truck_trailer().process_noise,
+    ERRORS,
+    certified_error_set(truck_trailer()),
+    Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5)),
+    GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5),
+    TraceChannel(trace=(0, -1)),
+    ChannelContract(3),
+    NCSEnv(truck_trailer(), **DOWNLINK).downlink_protocol,
+    PacketLog(np.arange(3.0), np.ones(3)),
+    TRUCK_TRAILER,
+    Regulation(state_cost=np.eye(2)),
+    SpeedTracking(),
+    SetpointTracking(output=[1.0, 0.0], reach=0.5, width=1.0),
+    BallDisturbance(),
+    SphereDisturbance(),
+    BoxDisturbance([0.1, 0.2]),
+    SinusoidDisturbance(),
+    AdversarialDisturbance(np.eye(2)),
+    as_disturbance(np.add, truck_trailer(), False),
+    LinearProcess(),
+    FamilyProcess(),
+    FunctionProcess(np.add),
+    GymProcess(gym.make, np.asarray),
+    CartPoleProcess(),
+    PendulumProcess(),
+    InvertedPendulumProcess(),
+    CERTIFICATE,
+    CERTIFICATE.polytope,
+    CERTIFICATE.proofs[0],
+    CERTIFICATE.updates,
+    PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),
+    SafetyFilter(CERTIFICATE, batch_reactor()),
+    BasePolicy(np.zeros((1, 2))),
+]
+PASSING = {Annotation}  # made anew for every frame
+
+
+def arrays_in(value):
+    """The arrays that a field holds, in tuples too."""
+    if isinstance(value, tuple):
+        return [array for each in value for array in arrays_in(each)]
+    return [value] if isinstance(value, np.ndarray) else []
+
+
+def assert_same(one, other):
+    """Both are of the same kind with the same values."""
+    assert type(one) is type(other)
+    if is_dataclass(one):
+        for each in fields(one):
+            assert_same(getattr(one, each.name), getattr(other, each.name))
+    elif isinstance(one, tuple):
+        for each, its_twin in zip(one, other, strict=True):
+            assert_same(each, its_twin)
+    elif isinstance(one, np.ndarray | float | int | str):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("made", VALUES, ids=lambda made: type(made).__name__)
+def test_values_their_copies_pickles_and_those_of_threads_are_equal_and_read_only(made):
+    with ThreadPoolExecutor(4) as pool:
+        of_threads = pool.map(lambda _: pickle.loads(pickle.dumps(made)), range(4))
+    for twin in (made, copy(made), deepcopy(made), pickle.loads(pickle.dumps(made)), *of_threads):
+        assert_same(twin, made)
+        for name in (*(each.name for each in fields(twin)), "something_else"):
+            with pytest.raises(FrozenInstanceError):
+                setattr(twin, name, None)
+            for array in arrays_in(getattr(twin, name, None)):
+                with pytest.raises(ValueError, match="read-only"):
+                    array[...] = 7.0
+
+
+def test_every_kind_of_value_is_looked_at_here():
+    for package, asked in ((ncs_gym, object), (shields, ReadOnlyArrays)):
+        name = f"{package.__name__}."
+        modules = [importlib.import_module(each.name) for each in pkgutil.walk_packages(package.__path__, name)]
+        kinds = {each for module in modules for each in vars(module).values() if inspect.isclass(each)}
+        own = {each for each in kinds if is_dataclass(each) and each.__module__.startswith(name)}
+        assert {each for each in own if issubclass(each, asked)} <= {*map(type, VALUES), *PASSING}
+
+
+def test_values_do_not_share_memory_with_what_they_were_made_from():
+    shape = np.eye(2)
+    ellipsoid = Ellipsoid(shape)
+    shape[0, 0] = 5.0
+    assert ellipsoid.shape_matrix[0, 0] == 1.0
