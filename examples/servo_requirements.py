@@ -1,4 +1,7 @@
-"""What network does a position servo need? Saves the plant for `ncs requirements`, and asks a first question here."""
+"""What network does a position servo need? Saves the plant for `ncs requirements`, and asks a first question here.
+
+Takes about nine seconds on one core.
+"""
 
 import shields
 from ncs_gym import LinearPlant
