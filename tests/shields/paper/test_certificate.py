@@ -113,6 +113,7 @@ def test_units_of_the_state_change_nothing(unit, paper):
     scaled = replace(
         SMALL,
         B=SMALL.B * unit,
+        continuous_model=None,
         box=SMALL.box_rows / unit,
         gamma=SMALL.gamma * unit**2,
         process_noise_cov=SMALL.process_noise_cov * unit**2,
