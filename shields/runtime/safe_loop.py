@@ -160,7 +160,7 @@ class SafeLoop(CopiedWhole):
             self._requests = Requests(channel, assumed, self._input_delay)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
-        # Samples of this episode that may be used, by stamp; the first stamp and the oldest age of these; and whether there
+        # Samples of this episode that may be used, by stamp; their first stamp and oldest age; and whether there
         # were two values of one.
         self._samples: dict[int, np.ndarray] = {}
         self._used, self._contradicted = (0, 0), False
