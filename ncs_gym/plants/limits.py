@@ -368,6 +368,11 @@ def _residual_of_equilibrium(
     )
 
 
+def _sizes(value: Any, n: int) -> np.ndarray:
+    """Returns the sizes of a constant disturbance, shape (n,); None stands for zero."""
+    return np.abs(as_operating_point(value, n, "step_offset"))
+
+
 def require_given_once(arguments: dict[str, Any]) -> None:
     """Raises ValueError if a field is given beside a published argument that it follows from."""
     follows = {"box_ends": ("state_limits",), "input_ends": ("u_max", "input_limits"), "step_offset": ("offset",)}
@@ -401,8 +406,9 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     _require_operating_input(arguments, state)
     lacking = np.zeros(n)
     if given["offset"] is not None:
-        fields["step_offset"] = as_vector(given["offset"], n, "offset")
-        lacking = _residual_of_equilibrium(A, B, fields["step_offset"], state, applied)
+        offset = as_vector(given["offset"], n, "offset")
+        fields["step_offset"] = np.abs(offset)
+        lacking = _residual_of_equilibrium(A, B, offset, state, applied)
     fields |= _input_fields(given, applied)
     fields = _row_fields(fields, given, state)
     fields = _mixed_fields(fields, given["mixed_limits"], state, applied)
@@ -584,5 +590,5 @@ def _around_middle_of_disturbance(
         "input_ends": inputs,
         "operating_state": point[0] + x,
         "operating_input": point[1] + u,
-        "step_offset": as_operating_point(fields.get("step_offset"), n, "step_offset") + exact.product(E, middle),
+        "step_offset": _sizes(fields.get("step_offset"), n) + exact.product(np.abs(E), np.abs(middle)),
     } | mixed

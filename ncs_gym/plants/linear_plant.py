@@ -169,9 +169,9 @@ class LinearPlant(LimitValues, HardBounds):
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
         operating_input: Input that deviations are counted from, shape (m,).
-        step_offset: What the operating point rests under in every step beside A and B, shape (n,): `offset` and the
-            middle of a disturbance with two ends. It is zero with `between_samples`, since how much of it has come by a
-            time within a step is not known.
+        step_offset: Sizes of what the operating point rests under in every step beside A and B, shape (n,): |offset|
+            and |E| |middle| of a disturbance with two ends, which do not cancel. Zero with `between_samples`, since how
+            much of either has come by a time within a step is not known.
         state_names: Names of the states, for tables and figures.
         state_units: Units of the states.
         input_names: Names of the inputs.
@@ -441,7 +441,7 @@ class LinearPlant(LimitValues, HardBounds):
             gamma=0.0,
             disturbance_bound=Ellipsoid(_symmetric_product(G, bound.shape_matrix)),
             process_noise_cov=_symmetric_product(G, self.process_noise_cov),
-            step_offset=exact.product(G, self.step_offset),
+            step_offset=exact.product(np.abs(G), self.step_offset),
         )
 
     def with_rate_limits(self, du_max: ArrayLike, *, per: str = "step") -> Self:

@@ -210,6 +210,16 @@ def test_constant_disturbance_is_refused_beside_between_samples_at_every_entranc
     assert make(between_samples=1).fingerprint == LinearPlant.read(document).fingerprint == plant.fingerprint
 
 
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+def test_constant_disturbances_that_cancel_at_the_samples_do_not_within_a_step():
+    cancel = {"disturbance_bound": ([[0.0], [0.6]], [-1.0], [0.0])}
+    both = ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])
+    for plant in (held(**cancel), pushed(disturbance_bound=both)):
+        assert plant.step_offset[1] > 0.5
+        with pytest.raises(ValueError, match="rests without a constant disturbance"):
+            replace(plant, between_samples=8)
+
+
 def test_model_in_continuous_time_is_the_one_that_was_sampled():
     plant = truck_trailer()
     for change in ({"A": 0.9 * plant.A}, {"dt": 1.0}, {"continuous_model": 1.1 * plant.continuous_model}):

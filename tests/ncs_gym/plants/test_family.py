@@ -379,6 +379,18 @@ def test_two_ended_disturbances_move_each_member():
     assert 0.02 <= width <= 0.02 + 5e-8  # what the members' rest lacks of an equilibrium by rounding is inside
 
 
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+@pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
+def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low):
+    def of(a):
+        model = {"A": [[a]], "B": [[0.5]], "dt": 1.0, "box": [1.0], "u_max": 0.9, "sensor_bound": 0.01}
+        return LinearPlant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))
+
+    family = LinearPlant.family(of, {"a": (low, low + 0.25)}, monotone=True, at_rest=True).members
+    for value in np.linspace(low, low + 0.25, 77):
+        assert family.member(np.array([value]))[0, 0] == value
+
+
 def bent(mass):
     """Its gain rises and falls again."""
     return LinearPlant(**SMALL | {"B": [[0.0], [0.3 + 0.01 * mass * (1.0 - mass)]]})
