@@ -148,8 +148,9 @@ def _around_center(plant: P, center: np.ndarray) -> P:
 def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
     """Returns a bound of the disturbances of all members, the one of the first if all have the same by themselves.
 
-    What members that rest under a constant disturbance lack of an equilibrium by rounding is part of their bounds, and is less
-    than SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_require_covered` compares.
+    What members that rest under a constant disturbance lack of an equilibrium by rounding is part of their bounds, and
+    is less than SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_require_covered`
+    compares.
     """
     first = plants[0]
     shape = _disturbance_shape(first)
