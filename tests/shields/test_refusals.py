@@ -72,7 +72,6 @@ def read_multipliers(first):
 
 
 REFUSED = [
-    (lambda: synthesize(plant(), method="magic"), ValueError, "method must be"),
     (lambda: synthesize(plant(), safe_set="Polytope"), ValueError, "safe_set must be"),
     (lambda: synthesize(plant(), safe_set=0), ValueError, "safe_set must be"),
     (lambda: synthesize(plant(), safe_set=["polytope"]), ValueError, "safe_set must be"),

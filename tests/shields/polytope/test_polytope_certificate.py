@@ -21,8 +21,7 @@ from shields import synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
-from shields.synthesis.polytope_certificates import certify_polytope, polytope_share, with_polytope
-from shields.synthesis.polytope_gain import regulators
+from shields.synthesis.polytope_certificates import certify_polytope, with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -61,16 +60,6 @@ def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
     assert search.share_of_points(feedback, plant, points) == pytest.approx(inside.mean(), abs=2.0 / len(points))
     unstable = feedback._replace(K=-1e3 * certificate.K)
     assert search.share_of_points(unstable, plant, points) == 0.0
-
-
-@pytest.mark.slow
-def test_polytope_of_a_candidate_is_kept_where_it_is_larger():
-    wide, _, plant = found("TruckTrailerCruise")
-    others = [certify_polytope(plant, K) for K in regulators(plant)]
-    wider = max(filter(None, others), key=polytope_share)
-    again = synthesize(plant, candidates=[wider])
-    assert polytope_share(wide) < polytope_share(wider) <= polytope_share(again)
-    assert verified(again, plant).valid
 
 
 def test_default_has_a_polytope_around_the_same_ellipsoid_bit_for_bit():
