@@ -93,18 +93,6 @@ def test_support_does_not_depend_on_units():
     np.testing.assert_allclose(flat.support([0.0, 1.0]), 2e9)
 
 
-def test_outline_is_around_the_projection_and_touches_it():
-    polytope = found("CartPole")[0].polytope
-    corners = polytope.outline((0, 2))
-    assert corners.shape == (120, 2)
-    normals = np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
-    directions = np.zeros((8, 4))
-    directions[:, [0, 2]] = normals
-    tight = (normals @ corners.T).max(axis=1) / polytope.support(directions)
-    assert (tight >= 1.0 - 1e-9).all()
-    assert (tight <= 1.01).all()
-
-
 def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypatch):
     plant = cart_pole()
     certificate = certificate_of(plant, contract_of(CART_POLE_CHANNEL))

@@ -384,14 +384,6 @@ def test_what_an_offset_lacks_of_an_equilibrium_by_rounding_is_in_the_bound():
     assert Fraction(float(plant.disturbance.shape_matrix[0, 0])) >= residual**2
 
 
-def test_ends_of_rows_that_are_swapped_are_refused():
-    for ends in (([1.0], [-1.0]), ([1.0], [1.0])):
-        with pytest.raises(ValueError, match="box_ends"):
-            LinearPlant(
-                A=[[0.9]], B=[[0.2]], dt=1.0, box=[[1.0]], u_max=1.0, box_ends=ends, disturbance_bound=0.1, **QUIET
-            )
-
-
 def test_resting_state_is_taken_where_it_is_one():
     plant = ANGLE
     state = np.array([0.1, 0.0])
