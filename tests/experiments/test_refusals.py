@@ -27,7 +27,6 @@ from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
 RAY = partial(BackendSettings, engine="ray")
-CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 HORIZON = "--horizon must be at least 1 and at most 50, got"
 
 SETTINGS = [

@@ -30,7 +30,6 @@ from tests.plants import named, servo, small
 Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
 SHARES = {"shares": np.array([0.9, 0.05, 0.05]), "inputs": np.array([0.5])}
 PAPER = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2}
-FIXED = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, disturbance_bound=0.0)
 
 
 def plant():
