@@ -58,6 +58,7 @@ VALUES = [
     PLANT.remainder,
     FAMILY,
     FAMILY.remainder.family,
+    FAMILY.remainder.family.check,
     PLANT.disturbance,
     truck_trailer().process_noise,
     ERRORS,

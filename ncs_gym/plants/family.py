@@ -41,7 +41,7 @@ _OWN = ("A", "B", "continuous_model", "step_offset")
 # What is the same of all members, but was rounded around other operating points, agrees to this, relatively.
 _ROUNDED = ("box", "box_ends", "input_ends", "mixed_rows", "mixed_ends")
 SAME = 1e-9
-# Bounds of disturbances that hold this rounding agree to this, in limits of the states.
+# Bounds of disturbances that hold this rounding agree to this, relative to the terms of a step.
 SAME_BOUND = 1e-8
 
 
@@ -149,13 +149,13 @@ def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
     """Returns a bound of the disturbances of all members, the one of the first if all have the same.
 
     What members that rest at different points lack of an equilibrium by rounding is part of their bounds, and is less
-    than SAME_BOUND of the limits. P_i <= P_0 + diag(row sums of |P_i - P_0|), which `_require_covered` compares.
+    than SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_require_covered` compares.
     """
     first = plants[0]
     shape = _disturbance_shape(first)
     if all(np.array_equal(shape, _disturbance_shape(each)) for each in plants):
         return first.disturbance_bound
-    widths = _finite_widths(first)
+    widths = _terms(first)
     size = np.sqrt((np.abs(shape) / (widths * widths[:, None])).sum(axis=1))
     return Ellipsoid(shape + np.diag((2.0 * size + SAME_BOUND) * SAME_BOUND * widths**2))
 
@@ -163,7 +163,7 @@ def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
 def _require_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearPlant, name: str) -> None:
     """Raises ValueError unless the bound of a member's disturbance is inside of the bound of the family's."""
     off = np.abs(_disturbance_shape(plant) - _disturbance_shape(first))
-    widths = _finite_widths(first)
+    widths = _terms(first)
     excess = (off / (widths * widths[:, None])).sum(axis=1) * widths**2
     room = np.zeros(first.n) if cover is None else np.diag(cover.shape_matrix - _disturbance_shape(first))
     if (excess > room).any():
@@ -177,10 +177,10 @@ def _disturbance_shape(plant: LinearPlant) -> np.ndarray:
     return np.zeros((plant.n, plant.n)) if bound is None else bound.shape_matrix
 
 
-def _finite_widths(plant: LinearPlant) -> np.ndarray:
-    """Returns the largest |x_j| in the safe box, shape (n,); 1 for a free state."""
-    reach = plant.reach[: plant.n]
-    return np.where(np.isfinite(reach), reach, 1.0)
+def _terms(plant: LinearPlant) -> np.ndarray:
+    """Returns the largest |x| + |A| |x| + |B| |u| within the limits, shape (n,); 1 stands for a free state."""
+    reach = np.where(np.isfinite(plant.reach), plant.reach, 1.0)
+    return reach[: plant.n] + exact.product(np.abs(np.hstack([plant.A, plant.B])), reach)
 
 
 def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:

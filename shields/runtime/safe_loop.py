@@ -160,9 +160,10 @@ class SafeLoop(CopiedWhole):
             self._requests = Requests(channel, assumed, self._input_delay)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
-        # Samples of the last steps of this episode by stamp, and whether there were two values of one.
+        # Samples of this episode that may be used, by stamp; the first stamp and the oldest age of these; and whether there
+        # were two values of one.
         self._samples: dict[int, np.ndarray] = {}
-        self._contradicted = False
+        self._used, self._contradicted = (0, 0), False
         # Inputs, the newest first, from which with samples the state is to be found; None once it is known.
         self._unknown: tuple[np.ndarray, ...] | None = None
         self._oldest_sought = STEPS_PER_STATE * plant.n + self._estimator.buffer
@@ -225,6 +226,7 @@ class SafeLoop(CopiedWhole):
         if self._requests is not None:
             self._requests.begin()
         self._samples, self._contradicted = {}, False
+        self._used = (1, self._estimator.buffer) if known else (0, self._oldest_sought)
         self._unknown = None if known else ()
         self._begin(inside)
         self._phase = _Phase.STARTED
@@ -239,7 +241,7 @@ class SafeLoop(CopiedWhole):
 
         At step 0 it is the first estimate: packets from before the first step are of no use, nor is a later sample of
         step 0, which a known first estimate stands for. Nothing compares the two.
-        Whether the start is known or not, two values of one sample end the guarantee of the episode.
+        Whether the start is known or not, two values of a sample that may be used end the guarantee of the episode.
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
@@ -459,12 +461,13 @@ class SafeLoop(CopiedWhole):
         self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
 
     def _take_in(self, packets: Iterable[Packet], step: int) -> None:
-        """Keeps the samples of this episode that arrive by a step, and notes two values of one."""
+        """Keeps the samples of this episode that arrive by a step and may be used, and notes two values of one."""
+        first, oldest = self._used
         for packet in packets:
-            if packet.episode == self.episode and 0 <= packet.stamp <= step <= packet.stamp + self._oldest_sought:
+            if packet.episode == self.episode and first <= packet.stamp <= step <= packet.stamp + oldest:
                 before = self._samples.setdefault(packet.stamp, packet.measurement)
                 self._contradicted |= not np.array_equal(before, packet.measurement, equal_nan=True)
-        self._samples = {stamp: y for stamp, y in self._samples.items() if step <= stamp + self._oldest_sought}
+        self._samples = {stamp: y for stamp, y in self._samples.items() if step <= stamp + oldest}
 
     def _recent(self, inputs: tuple[np.ndarray, ...]) -> dict[int, np.ndarray]:
         """Returns the samples, shape (p,), by stamp, since which all inputs are known."""

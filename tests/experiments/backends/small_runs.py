@@ -71,7 +71,7 @@ class Small:
 
 
 def waiting(settings: Any) -> None:
-    """Stands for `ncs attack`: one run works, another waits."""
+    """Stands for `ncs compare`: one run works, another waits."""
     from experiments.backends.execution import results_of
 
     out = settings.out
@@ -81,6 +81,6 @@ def waiting(settings: Any) -> None:
 if __name__ == "__main__":
     from experiments.__main__ import COMMANDS, main
 
-    COMMANDS["attack"] = ("AttackSettings", "tests.experiments.backends.small_runs:waiting", {})
-    sys.argv[:] = ["ncs", "attack", "--jobs", "2", "--out", sys.argv[1]]
+    COMMANDS["compare"] = ("CompareSettings", "tests.experiments.backends.small_runs:waiting", {})
+    sys.argv[:] = ["ncs", "compare", "--jobs", "2", "--out", sys.argv[1]]
     main()

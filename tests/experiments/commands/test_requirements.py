@@ -35,7 +35,7 @@ def test_requirements_of_an_environment_say_its_contract_of_today():
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [("0,1\n1,2\n", "a record is a table"), ("sent,received\n0,0.001\n0.01,0.011\n", "spans one control step")],
+    [("0,1\n1,2\n", "its columns are"), ("sent,received\n0,0.001\n0.01,0.011\n", "spans one control step")],
 )
 def test_channel_refuses_a_file_in_one_sentence(content, words, tmp_path):
     (tmp_path / "packets.csv").write_text(content)

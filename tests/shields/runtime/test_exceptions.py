@@ -148,7 +148,7 @@ def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypat
         with pytest.raises(RuntimeError, match="call"):
             refused()
     loop.start(np.zeros(2))
-    assert loop.step(0.1).passed
+    assert loop.step(0.1).proved
     assert loop.guaranteed
 
 
