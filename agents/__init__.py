@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
     from agents.hyperparams import tuned_hyperparams, tuned_steps
-    from agents.loop import BasePolicy, LagrangianSettings, LoopConfig, ShieldSettings
+    from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train, untrained
@@ -29,7 +29,6 @@ __all__ = [
     "Agent",
     "AgentError",
     "AppliedActionBuffer",
-    "BasePolicy",
     "DualAscentCallback",
     "Episode",
     "Evaluation",
@@ -56,7 +55,7 @@ _MODULES = {
     "agent": ("Agent", "pretrained"),
     "algorithms": ("AppliedActionBuffer",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
-    "loop": ("BasePolicy", "LagrangianSettings", "LoopConfig", "ShieldSettings"),
+    "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "hyperparams": ("tuned_hyperparams", "tuned_steps"),
     "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),

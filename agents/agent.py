@@ -29,7 +29,7 @@ from agents.agent_file import (
 )
 from agents.algorithms import algorithm_class, build_model
 from agents.hyperparams import complete_hyperparams
-from agents.loop import BasePolicy, LoopConfig, ShieldSettings
+from agents.loop import LoopConfig, ShieldSettings
 from agents.normalization import Normalization
 from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym import Channel, LinearPlant
@@ -50,7 +50,6 @@ class Agent:
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
         seed: Seed of the training; None where it is not known.
-        base_policy: Policy to whose action that of the model is added; None for none.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
         is_filtered: Whether it was trained behind another filter (`LoopConfig.filter`), which files do not keep.
@@ -64,7 +63,6 @@ class Agent:
     model: BaseAlgorithm
     normalization: Normalization
     seed: int | None = None
-    base_policy: BasePolicy | None = None
     shield_mode: str | None = None
     horizon: int | None = None
     is_filtered: bool = False
@@ -100,8 +98,6 @@ class Agent:
         if not np.isfinite(batch).all():
             raise ValueError("observations must be finite numbers, got NaN or infinity")
         actions = self.model.predict(self.normalization(batch), deterministic=True)[0]
-        if self.base_policy is not None:
-            actions = self.base_policy.plus(batch, actions)
         return actions[0] if len(shape) == 1 else actions
 
     def predict(
@@ -159,8 +155,6 @@ class Agent:
             },
             "sha256_of_model": hashlib.sha256(buffer.getvalue()).hexdigest(),
         }
-        if self.base_policy is not None:
-            content["base_policy"] = {name: each.tolist() for name, each in vars(self.base_policy).items()}
         if self.is_filtered:
             content["filtered"] = True
         if self.kwargs:
@@ -280,11 +274,6 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     usable = mean.shape == variance.shape == model.observation_space.shape
     if not (usable and np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise AgentError("the agent is damaged: its normalization has a wrong shape or value")
-    base = content.get("base_policy")
-    if base is not None:
-        base = BasePolicy(**base)
-        if base.gain.shape[:1] != model.action_space.shape or base.gain.shape[1] > len(mean):
-            raise AgentError("the agent is damaged: its base policy has a wrong shape")
     return Agent(
         algorithm=algorithm,
         hyperparams=hyperparams,
@@ -293,7 +282,6 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
         seed=content.get("seed"),
-        base_policy=base,
         shield_mode=shield_mode,
         horizon=horizon,
         is_filtered=is_filtered,
@@ -346,7 +334,7 @@ def _versions() -> dict[str, str]:
 # What an agent.json has: what else it says might be a part of the policy.
 _ENTRIES = {
     *("format", "env", "algorithm", "seed", "versions", "hyperparams", "kwargs", "channel", "plant", "shield"),
-    *("normalization", "base_policy", "filtered", "sha256_of_model"),
+    *("normalization", "filtered", "sha256_of_model"),
 }
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {

@@ -209,11 +209,10 @@ class EvaluationCallback(RegularCallback):
 
     def _actions(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
-        env, base, seen = self.model.get_env(), self._loop.base_policy, observations
+        env = self.model.get_env()
         if isinstance(env, VecNormalize):
-            seen = np.asarray(env.normalize_obs(observations))
-        actions = self.model.predict(seen, deterministic=True)[0]
-        return actions if base is None else base.plus(observations, actions)
+            observations = np.asarray(env.normalize_obs(observations))
+        return self.model.predict(observations, deterministic=True)[0]
 
 
 def _counted(callback: BaseCallback) -> dict[str, Any]:

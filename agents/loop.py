@@ -12,19 +12,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
-from ncs_gym import Channel, LinearPlant
+from ncs_gym import Channel
 from ncs_gym.envs.json_settings import from_json, read_plant, to_json
 from ncs_gym.validation import (
-    FILLED_IN_LATER,
     AroundEnvironments,
-    ReadOnlyArrays,
-    as_matrix,
     as_number,
-    as_vector,
     shown,
 )
 from shields import Certificate, SafetyShield, VectorSafetyShield
-from shields.certificate import Fallback
 from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import plan_horizon
 
@@ -79,53 +74,6 @@ class LagrangianSettings:
                 raise ValueError(f"{entry.name} must be >= 0, got {value!r}")
 
 
-@dataclass(frozen=True, eq=False)
-class BasePolicy(ReadOnlyArrays):
-    """The policy a = gain x_hat + offset, to whose action a residual agent adds its own (Silver et al. 2018).
-
-    Attributes:
-        gain: Shape (m, n), normalized actions per unit of each state.
-        offset: Shape (m,), in normalized actions; zero by default.
-
-    Raises:
-        ValueError: If one has a wrong shape or is not finite.
-    """
-
-    gain: np.ndarray
-    offset: np.ndarray = FILLED_IN_LATER
-
-    def __post_init__(self) -> None:
-        gain = as_matrix(self.gain, (None, None), "gain")
-        offset = np.zeros(len(gain)) if self.offset is None else as_vector(self.offset, len(gain), "offset")
-        object.__setattr__(self, "gain", gain)
-        object.__setattr__(self, "offset", offset)
-        self._make_arrays_read_only()
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, BasePolicy):
-            return NotImplemented
-        return np.array_equal(self.gain, other.gain) and np.array_equal(self.offset, other.offset)
-
-    def __hash__(self) -> int:
-        return hash((self.gain.tobytes(), self.offset.tobytes()))
-
-    @classmethod
-    def of(cls, fallback: Fallback, plant: LinearPlant) -> BasePolicy:
-        """Returns the input of a certificate's gain as normalized actions of its plant."""
-        half = plant.input_half
-        return cls(fallback.gain / half[:, None], (fallback.constant - plant.input_middle) / half)
-
-    def plus(self, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Returns actions (N, m) that add an agent's to those of this policy, within the limits.
-
-        Args:
-            observations: Shape (N, entries), the first n of which are the estimate.
-            actions: The agent's part, shape (N, m).
-        """
-        own = observations[:, : self.gain.shape[1]] @ self.gain.T + self.offset
-        return np.clip(own + actions, -1.0, 1.0).astype(np.float32)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LoopConfig:
     """A registered environment, and everything that stands between it and an agent.
@@ -140,10 +88,9 @@ class LoopConfig:
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
-        base_policy: Policy to whose action an agent in training adds its own.
 
     Raises:
-        ValueError: If shield or base policy are something else, another filter is given beside a shield, the id is
+        ValueError: If the shield is something else, another filter is given beside a shield, the id is
             not registered, a penalty is wrong, or `lagrangian` limits the cost of episodes without an end.
     """
 
@@ -153,7 +100,6 @@ class LoopConfig:
     filter: Callable[[VectorEnv], VectorEnv] | None = None
     violation_penalty: float = 0.0
     lagrangian: LagrangianSettings | None = None
-    base_policy: BasePolicy | None = None
 
     def __post_init__(self) -> None:
         if self.shield is not None and not isinstance(self.shield, ShieldSettings):
@@ -173,8 +119,6 @@ class LoopConfig:
         object.__setattr__(self, "violation_penalty", penalty)
         if penalty and self.lagrangian is not None:
             raise ValueError("give either violation_penalty or lagrangian, which adapts it from its own multiplier")
-        if not (self.base_policy is None or isinstance(self.base_policy, BasePolicy)):
-            raise ValueError(f"base_policy must be a BasePolicy, got {shown(self.base_policy)}")
         given = {name: value for name, value in self.kwargs.items() if value is not None}
         object.__setattr__(self, "kwargs", given)
         if self.lagrangian is not None and self.episode_steps is None:
@@ -208,15 +152,14 @@ class LoopConfig:
 
     @property
     def without_penalties(self) -> LoopConfig:
-        """The same loop as it is evaluated: with the environment's own rewards, the policy's actions being complete."""
+        """The same loop as it is evaluated: with the environment's own rewards."""
         shield, filtered = self.shield and replace(self.shield, penalty=0.0), self.filter
         if is_dataclass(filtered) and not isinstance(filtered, type) and hasattr(filtered, "penalty"):
             filtered = replace(filtered, penalty=0.0)
-        bare = {"violation_penalty": 0.0, "lagrangian": None, "base_policy": None}
-        return replace(self, shield=shield, filter=filtered, **bare)
+        return replace(self, shield=shield, filter=filtered, violation_penalty=0.0, lagrangian=None)
 
     def single(self, **settings: Any) -> gym.Env:
-        """Returns one environment, with the shield; penalties of violations, filter and base policy are for vectors.
+        """Returns one environment, with the shield; penalties of violations and filter are for vectors.
 
         `settings` are passed to `gym.make`.
         """
@@ -233,8 +176,6 @@ class LoopConfig:
                 envs = VectorSafetyShield(envs, **vars(self.shield))
         if self.filter is not None:
             envs = self.filter(envs)
-        if self.base_policy is not None:
-            envs = ResidualActions(envs, self.base_policy)
         if self.lagrangian is not None:
             return CostPenalty(envs, self.lagrangian.multiplier)
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
@@ -261,30 +202,3 @@ class CostPenalty(AroundEnvironments, VectorWrapper):
         if "final_info" in info:
             cost = np.where(done, info["final_info"]["cost"], cost)
         return observation, rewards - self.penalty * cost, terminated, truncated, info
-
-
-class ResidualActions(AroundEnvironments, VectorWrapper):
-    """Applies the action of a base policy plus the agent's part, clipped to the limits (Silver et al. 2018).
-
-    Args:
-        env: A vector environment whose observations begin with the estimate.
-        base: The base policy.
-    """
-
-    def __init__(self, env: VectorEnv, base: BasePolicy) -> None:
-        actions, observations = env.single_action_space.shape, env.single_observation_space.shape
-        (m, n) = base.gain.shape
-        if actions is None or observations is None or m != actions[0] or n > observations[0]:
-            raise ValueError(f"base_policy must have a gain of the shape (m, n) of actions and states, got {(m, n)}")
-        self.base = base
-        super().__init__(env)
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes."""
-        self._observation, info = self.env.reset(**options)
-        return self._observation, info
-
-    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps the environments with the sum of both parts."""
-        self._observation, *rest = self.env.step(self.base.plus(self._observation, actions))
-        return (self._observation, *rest)  # type: ignore[return-value]

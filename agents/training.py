@@ -170,8 +170,6 @@ def _trainable(
         )
     envs = loop.vector(hyperparams["n_envs"])
     stores_applied = hyperparams.get("stored_action") == "applied"
-    if stores_applied and loop.base_policy is not None:
-        raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
     try:
         seen = SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords if stores_applied else INFO_KEYWORDS)
     except ValueError as error:
@@ -195,11 +193,6 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
         raise ValueError(
             f"the agent to go on from is {start.algorithm} of {start.env}, this is {algorithm} of {loop.env}"
         )
-    if start.base_policy != loop.base_policy:
-        raise ValueError(
-            "the agent to go on from adds its actions to another base policy, or to none: make the loop with "
-            "base_policy=agent.base_policy"
-        )
     try:
         parameters: Any = deepcopy(start.model.get_parameters())  # optimizers go on using the tensors they load
         model.set_parameters(parameters, exact_match=True, device="cpu")
@@ -222,7 +215,6 @@ def _agent(
         model=model,
         normalization=Normalization.of(env),
         seed=seed,
-        base_policy=loop.base_policy,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
         is_filtered=loop.filter is not None,

@@ -36,14 +36,17 @@ FEATURES = ("contract", "polytope", "grid", "remainder", "lookahead", "downlink"
 def complexity() -> None:
     """How much code there is, and how much of it a step runs through.
 
-    Lines of the product and of the tests; branches that ask whether a feature is there at all (`x is None` of a
-    contract, a polytope, a grid, a remainder, a plan, a downlink, ages); and calls of functions of the product in one
-    step of an environment, as it comes and behind a shield whose action passes, and how often the module changes from
-    one to the next.
+    Lines of the product, of benchmarks, examples and tests, and of templates and data (those of the report, tuned
+    hyperparameters, JSON of the packages but for certificates and trained agents); branches that ask whether a feature
+    is there at all (`x is None` of a contract, a polytope, a grid, a remainder, a plan, a downlink, ages); and calls of
+    functions of the product in one step of an environment, as it comes and behind a shield whose action passes, and how
+    often the module changes from one to the next.
     """
-    product, tests = sources(*PACKAGES), sources("tests")
+    product = sources(*PACKAGES)
     nodes = [node for path in product for node in ast.walk(ast.parse(path.read_text()))]
-    print(f"{lines(product):,} lines of the product in {len(product)} modules, {lines(tests):,} of tests")
+    print(f"{lines(product):,} lines of the product in {len(product)} modules")
+    others = [f"{lines(sources(folder)):,} of {folder}" for folder in ("benchmarks", "examples", "tests")]
+    print(f"{', '.join(others)}, {lines(templates_and_data()):,} of templates and data")
     print(f"{sum(map(asks_for_feature, nodes))} branches ask whether a feature is there")
     case = "ncs_gym/TruckTrailerCruise-v0"
     for name, env in {"a step": gym.make(case), "a shielded step": SafetyShield(gym.make(case))}.items():
@@ -57,6 +60,15 @@ def complexity() -> None:
 def sources(*folders: str) -> list[Path]:
     """Returns the Python files below some folders."""
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def templates_and_data() -> list[Path]:
+    """Returns the templates of the report, and the JSON files of the packages but certificates and trained agents."""
+    data = [path for folder in PACKAGES for path in (ROOT / folder).rglob("*.json")]
+    return [
+        *(ROOT / "experiments" / "report" / "templates").iterdir(),
+        *(path for path in data if not {"packaged_certificates", "trained"} & set(path.parts)),
+    ]
 
 
 def lines(files: list[Path]) -> int:

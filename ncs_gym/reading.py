@@ -51,14 +51,14 @@ def _opened(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def read_text(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> str:
+def read_text(path: str | os.PathLike[str]) -> str:
     """Returns the text of a file in UTF-8, as `read_file` its bytes.
 
     Raises:
         OSError: As from `read_file`.
         UnicodeDecodeError: If it is no such text.
     """
-    return read_file(path, most).decode("utf-8").replace("\r\n", "\n")
+    return read_file(path).decode("utf-8").replace("\r\n", "\n")
 
 
 def json_values(text: str | bytes, **keywords: Any) -> Any:

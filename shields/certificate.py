@@ -236,11 +236,6 @@ class Certificate(ReadOnlyArrays):
         if len(around) == n and not np.array_equal(around, self.resting_state):
             raise ValueError("its polytope must be around its resting state")
 
-    @property
-    def method(self) -> str:
-        """It is "certified"; that of a `shields.paper.PaperCertificate` is "paper"."""
-        return "certified"
-
     @cached_property
     def M(self) -> np.ndarray:
         """The inverse of L, shape (n, n)."""

@@ -138,21 +138,6 @@ class Polytope(ReadOnlyArrays):
         reached = np.array(found) + given @ self.center
         return float(reached[0]) if np.ndim(directions) == 1 else reached
 
-    def outline(self, pair: tuple[int, int]) -> np.ndarray:
-        """Returns corners of a polygon around the projection onto two coordinates, shape (k, 2); for pictures.
-
-        It is bounded by tangents every 3 degrees, the axes among them.
-        """
-        angles = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
-        normals = np.column_stack([np.cos(angles), np.sin(angles)]) * np.abs(self.rows[:, pair]).max(axis=0)
-        directions = np.zeros((len(angles), self.dim))
-        directions[:, pair] = normals
-        heights = self.support(directions)
-        # Where every tangent meets the next one.
-        normals = np.stack([normals, np.roll(normals, -1, axis=0)], axis=1)
-        heights = np.stack([heights, np.roll(heights, -1)], axis=1)
-        return np.linalg.solve(normals, heights[..., None])[..., 0]
-
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0

@@ -151,27 +151,3 @@ NOTHING_USABLE = [
 ]
 # Numbers that no setting can have.
 WRONG_NUMBERS = [np.nan, np.inf, -np.inf, -1.0, True, np.True_, 10**400, -(10**400), 1e300, np.float64(1e76), [1.0]]
-
-
-# Any JSON values, among them texts that mean something on a command line or in a path.
-_TEXTS = [
-    "--help",
-    "-h",
-    "7",
-    "0.5",
-    " 7",
-    "None",
-    "True",
-    "PPO",
-    "unshielded",
-    "--seed=3",
-    "\x00",
-    "\ud800",
-    "../x",
-    "/x",
-]
-JSON_VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=6) | st.sampled_from(_TEXTS),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
-    max_leaves=5,
-)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import project
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,3 +58,18 @@ def test_values_without_a_name_are_taken_and_unknown_ones_refused(capsys):
             asked_for(module, given)
         assert ended.value.code == 2
     assert "nope" in capsys.readouterr().err
+
+
+def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(monkeypatch, capsys):
+    monkeypatch.setattr(project, "walked", lambda run: (0, 0))
+    project.complexity()
+    product, others = capsys.readouterr().out.splitlines()[:2]
+    assert re.fullmatch(r"[\d,]+ lines of the product in \d+ modules", product)
+    counts = re.fullmatch(
+        r"([\d,]+) of benchmarks, ([\d,]+) of examples, ([\d,]+) of tests, ([\d,]+) of templates and data", others
+    )
+    folders = [path.read_text().count("\n") for path in (ROOT / "tests").rglob("*.py")]
+    assert int(counts[3].replace(",", "")) == sum(folders)
+    names = {path.name for path in project.templates_and_data()}
+    assert {"comparison.html.j2", "style.css", "ppo.json", "tuned.json", "cart_pole_nonlinear.json"} <= names
+    assert not {"agent.json", "CSTR-v0.json"} & names

@@ -14,7 +14,6 @@ import pytest
 
 import ncs_gym
 import shields
-from agents.loop import BasePolicy
 from ncs_gym import (
     AdversarialDisturbance,
     BallDisturbance,
@@ -93,7 +92,6 @@ VALUES = [
     CERTIFICATE.updates,
     PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),
     SafetyFilter(CERTIFICATE, batch_reactor()),
-    BasePolicy(np.zeros((1, 2))),
 ]
 PASSING = {Annotation}  # made anew for every frame
 

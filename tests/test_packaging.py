@@ -265,17 +265,6 @@ def test_address_is_written_everywhere_and_taken_out_again(tmp_path):
     assert all((tmp_path / name).read_text() == (ROOT / name).read_text() for name in times)
 
 
-def test_virtual_environment_is_ignored_as_a_folder_and_as_a_link(tmp_path):
-    shutil.copy(ROOT / ".gitignore", tmp_path)
-    (tmp_path / ".venv").symlink_to(ROOT)
-    (tmp_path / "clone" / ".venv" / "bin").mkdir(parents=True)
-    (tmp_path / "clone" / ".venv" / "bin" / "ncs").touch()
-    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
-    seen = ["git", "-c", "core.excludesFile=/dev/null", "ls-files", "--others", "--exclude-standard"]
-    run = subprocess.run(seen, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert run.stdout.split() == [".gitignore"]
-
-
 def test_files_that_the_makefile_names_exist():
     named = re.findall(r"\b(?:\.ci|docs|examples|tests)/\S+?\.(?:py|txt)\b", (ROOT / "Makefile").read_text())
     assert len(named) > 3
@@ -382,5 +371,5 @@ def test_wheel_holds_the_four_packages_and_nothing_else(tmp_path):
     assert {name for name in names if not name.endswith(".dist-info")} == set(ORDER)
     sources = {path for package in ORDER for path in (ROOT / package).rglob("*") if path.is_file()}
     assert files >= {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
-    data = {"experiments/report/templates/page.html.j2", "agents/tuned/ppo.json"}
+    data = {"experiments/report/templates/comparison.html.j2", "agents/tuned/ppo.json"}
     assert {f"{package}/py.typed" for package in ORDER} | data <= files

@@ -16,7 +16,6 @@ from agents.agent import Agent
 from agents.agent_file import AgentError
 from agents.loop import LoopConfig
 from agents.training import untrained
-from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -144,13 +143,6 @@ def test_agents_of_others_import_no_module(evil):
     forge(evil, env="evil:Evil-v0")
     with pytest.raises(AgentError, match="evil:Evil-v0, which is not registered"):
         Agent.load(evil)
-
-
-@pytest.mark.parametrize("content", [b"\x80\x04cos\nsystem\n", b"[" * 100_000, b'{"format": ' + b"9" * 100_000 + b"}"])
-def test_certificates_that_are_none_are_refused(content, tmp_path):
-    (tmp_path / "c.json").write_bytes(content)
-    with pytest.raises(CertificateError):
-        Certificate.load(tmp_path / "c.json")
 
 
 @pytest.fixture

@@ -95,10 +95,10 @@ def how_often(row: dict[str, Any]) -> str:
     return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}] (by halves {halves})"
 
 
-def silences_text(oldest: int, row: dict[str, Any], contract: str = "the contract") -> str:
+def silences_text(oldest: int, row: dict[str, Any]) -> str:
     """Returns how often the box may be left behind a shield, given the oldest age and its row."""
     return (
-        f"From any belief that {contract} allows the box is kept until the newest sample is "
+        "From any belief that the contract allows the box is kept until the newest sample is "
         f"{counted(oldest, 'step')} old, "
         f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "
         "between and no late sample comes meanwhile, the box is left no more often."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,20 +65,11 @@ def with_unit(name: str, unit: str) -> str:
     return f"{name} [{unit}]".replace("^2", _SQUARED) if unit else name
 
 
-def state_labels(plant: LinearPlant) -> tuple[str, ...]:
-    """Returns what the entries of a state are, for axes: names, less the operating point, as "level - 1.16"."""
-    return _labels(plant.state_names, plant.operating_state)
-
-
 def input_labels(plant: LinearPlant) -> tuple[str, ...]:
-    """Returns what the entries of an input are, for axes: names, less the operating point."""
-    return _labels(plant.input_names, plant.operating_input)
-
-
-def _labels(names: Sequence[str], center: np.ndarray) -> tuple[str, ...]:
+    """Returns what the entries of an input are, for axes: names, less the operating point, as "level - 1.16"."""
     return tuple(
         f"{name} {'+' if value < 0.0 else '-'} {abs(value):.4g}" if value else name
-        for name, value in zip(names, center.tolist(), strict=True)
+        for name, value in zip(plant.input_names, plant.operating_input.tolist(), strict=True)
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.plots.figure_style import ArmStyle
@@ -27,9 +27,11 @@ Figures = Mapping[str, tuple[str, bytes]]
 def comparison_report(summary: dict[str, Any], verification: Report, figures: Figures, findings: list[str]) -> str:
     """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline."""
     settings, arms = summary["settings"], summary["arms"] | summary["references"]
-    return render_page(
-        "comparison.html.j2",
-        figures,
+    images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
+    return _template().render(
+        images=images,
+        percent=f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%",
+        resamples=RESAMPLES,
         title=f"Safe learning on {settings['env']}",
         runs=max(arm["runs"] for arm in summary["arms"].values()),
         trains=any(arm["train_steps"] for arm in arms.values()),
@@ -41,19 +43,6 @@ def comparison_report(summary: dict[str, Any], verification: Report, figures: Fi
     )
 
 
-def render_page(template: str, figures: Figures, **context: Any) -> str:
-    """Returns a page: HTML that contains its figures and opens offline, or Markdown.
-
-    Args:
-        template: Name of the template; only that of an HTML page escapes what it inserts.
-        figures: The figures.
-        **context: Further variables of the template.
-    """
-    images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
-    percent = f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%"
-    return _environment().get_template(template).render(images=images, percent=percent, resamples=RESAMPLES, **context)
-
-
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Returns JSON values by their dotted names, without the objects that hold others."""
     found: dict[str, Any] = {}
@@ -63,10 +52,10 @@ def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 @cache
-def _environment() -> Environment:
+def _template() -> Template:
     environment = Environment(
         loader=PackageLoader("experiments.report"),
-        autoescape=lambda template: not str(template).endswith(".md.j2"),
+        autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -81,7 +70,7 @@ def _environment() -> Environment:
         "signed_count": lambda count: _with_minus(f"{count:+,}"),
         "thousands": lambda count: f"{count:,}",
     }
-    return environment
+    return environment.get_template("comparison.html.j2")
 
 
 def _is_trained_arm(name: str) -> bool:

@@ -106,14 +106,13 @@ def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:
     return loop if changed is None else loop.with_kwargs(channel=asdict(changed))
 
 
-def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--channel") -> Channel | None:
+def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
     """Returns an environment's own channel with changes; None for no changes.
 
     Args:
         own: The environment's own channel.
         changes: Fields of `Channel` by name; None keeps a value. `burst_length` is the mean number of packets lost in a
             row (Gilbert-Elliott); losses are independent without it (a mean of 1 / (1 - loss)).
-        flag: What the changes were given by, for messages.
 
     Raises:
         ValueError: If a name is unknown or a value out of range, or bursts are asked for without a loss probability, or
@@ -122,17 +121,17 @@ def changed_channel(own: Channel, changes: Mapping[str, Any], flag: str = "--cha
     given = {name: value for name, value in changes.items() if value is not None}
     known = [each.name for each in fields(Channel)]
     for name in given.keys() - {*known, "burst_length"}:
-        raise ValueError(f"{flag} {name}: a channel has no such setting; known are {', '.join(known)}, burst_length")
+        raise ValueError(f"--channel {name}: a channel has no such setting; known are {', '.join(known)}, burst_length")
     if (length := given.pop("burst_length", None)) is not None:
         loss = given.get("loss", own.loss)
         if isinstance(loss, GilbertElliott):
-            raise ValueError(f"{flag} burst_length needs loss, too: the environment's own losses come in bursts")
+            raise ValueError("--channel burst_length needs loss, too: the environment's own losses come in bursts")
         given["loss"] = _bursts(loss, length, given.get("send_period", own.send_period))
     changed = replace(own, **given)
     most = changed.most_consecutive_losses
     if most is not None and length is not None and length > max(most, 1):
         raise ValueError(
-            f"{flag} burst_length={length:g}: the channel loses at most {counted(most, 'packet')} in a row, and no "
+            f"--channel burst_length={length:g}: the channel loses at most {counted(most, 'packet')} in a row, and no "
             "mean is longer; change max_consecutive_losses, too"
         )
     if "loss" in given and "max_consecutive_losses" not in given and (text := fewer_losses(changed)):

@@ -15,7 +15,7 @@ from experiments.settings import lasting_settings
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold results.
-_RESULTS = ("summary.json", "attack.json", "runs/*.json", "tensorboard/*/checkpoint/history.json")
+_RESULTS = ("summary.json", "runs/*.json", "tensorboard/*/checkpoint/history.json")
 # Settings that may change in the same folder: results of runs that are there become part of others.
 _FREE = {"seeds", "arms", "baselines", "losses", "delays", "quantization_steps", "burst_lengths", "mass_factors"}
 _FREE |= {"downlink_losses"}

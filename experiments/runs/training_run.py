@@ -257,8 +257,7 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
-    residual = loop.base_policy is not None
-    return values | {"lagrangian": loop.lagrangian and asdict(loop.lagrangian), "base_policy": residual}
+    return values | {"lagrangian": loop.lagrangian and asdict(loop.lagrangian)}
 
 
 def _agent_of(run: TrainingRun) -> Agent | None:

@@ -121,10 +121,6 @@ class Ellipsoid(ReadOnlyArrays):
         directions = rng.standard_normal(self.dim if count is None else (count, self.dim)) * self.drawn_axes
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)) @ self.factor.T
 
-    def outer_sum(self, other: Ellipsoid) -> Ellipsoid:
-        """Returns the trace-smallest ellipsoid of the family P1/nu + P2/(1-nu) around the Minkowski sum."""
-        return Ellipsoid(outer_sum(self.shape_matrix, other.shape_matrix, np.eye(self.dim)))
-
     def farthest_point(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).
 

@@ -55,11 +55,6 @@ class PaperCertificate(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     @property
-    def method(self) -> str:
-        """It is "paper"; that of a `shields.Certificate` is "certified"."""
-        return "paper"
-
-    @property
     def ellipsoid(self) -> Ellipsoid:
         """The ellipsoid E(L)."""
         return Ellipsoid(self.L)

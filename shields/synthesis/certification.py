@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,22 +40,19 @@ _LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
 @np.errstate(all="ignore")
 def synthesize(
     plant: LinearPlant,
-    method: str = "certified",
     *,
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
     resting_state: ArrayLike | None = None,
     progress: Progress | None = None,
-    candidates: Sequence[Certificate] = (),
 ) -> Certificate:
-    """Returns a verified certificate.
+    """Returns a verified certificate; that of the published method is `shields.paper.synthesize`.
 
     It seeks the largest ellipsoid with hard bounds, and the polytope around it (docs/shield_proof.md). Where there is
     no ellipsoid, a polytope alone is sought: it bears larger disturbances and errors.
 
     Args:
         plant: The plant with its bounds, Schur stable without a contract.
-        method: "certified"; the published method is `shields.paper.synthesize`.
         contract: Channel contract; with one, the error sets depend on the age of the newest sample.
         safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
@@ -65,9 +61,6 @@ def synthesize(
             for a polytope; by default the operating point where limits are symmetric about it, else one that leaves
             much of the box.
         progress: Called with a line of text per stage: what is sought, and the volume reached so far.
-        candidates: Certificates of tighter problems (closer limits, larger bounds, an older age, a coarser
-            quantization). The search is local; no set that one of them proves here is larger than the result's, so that
-            more room is never less.
 
     Raises:
         Infeasible: If no certificate is found; it names the binding condition and the shortfall.
@@ -76,19 +69,14 @@ def synthesize(
     """
     if not isinstance(plant, LinearPlant):
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
-    if not isinstance(method, str) or method != "certified":
-        raise ValueError(f"method must be 'certified' (the paper's is shields.paper.synthesize), got {shown(method)}")
     if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
-    if not all(isinstance(each, Certificate) for each in candidates):
-        raise ValueError("candidates must be certificates")
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
             f"None, got {shown(contract)}"
         )
     report, clock = progress or (lambda line: None), Clock(time.thread_time() + LONGEST_REFUSAL - _UNDER_WAY)
-    known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     if resting_state is not None or needs_resting_point(plant):
         if safe_set == "ellipsoid":
             raise ValueError(
@@ -97,7 +85,7 @@ def synthesize(
             )
         rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
         try:
-            return around_resting_point(plant, contract, report, known, clock, rest)
+            return around_resting_point(plant, contract, report, clock, rest)
         except Infeasible as infeasible:
             if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
                 raise Infeasible(
@@ -106,12 +94,12 @@ def synthesize(
                     infeasible.shortfall,
                 ) from None
             raise _with_changes(infeasible, plant, contract, report, clock, polytope=True) from None
-    if safe_set == "ellipsoid":
-        known = [each.without_polytope() for each in known if each.keeps_ellipsoid]
-    largest, *others = _certificates(plant, contract, report, known, clock, polytope=safe_set != "ellipsoid")
-    if safe_set == "ellipsoid":
-        return largest
-    return max((with_polytope(each, plant, report) for each in (largest, *others)), key=polytope_share)
+    polytope = safe_set != "ellipsoid"
+    try:
+        found = largest_ellipsoid(plant, contract, report)
+    except Infeasible as infeasible:
+        found = _second_search(infeasible, plant, contract, report, clock, polytope=polytope)
+    return with_polytope(found, plant, report) if polytope else found
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -186,31 +174,6 @@ def _nearby_around(
     return carried
 
 
-def _certificates(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress,
-    known: Sequence[Certificate],
-    clock: Clock,
-    *,
-    polytope: bool,
-) -> list[Certificate]:
-    """Returns the verified certificate that is found and known ones, that of the largest ellipsoid first.
-
-    Those of a polytope alone come last; where there is no other and `polytope` says so, one is sought.
-    """
-
-    def size(certificate: Certificate) -> tuple[bool, float]:
-        return certificate.keeps_ellipsoid, float(np.linalg.slogdet(certificate.L)[1])
-
-    try:
-        known = [largest_ellipsoid(plant, contract, progress), *known]
-    except Infeasible as infeasible:
-        if not known:
-            known = [_second_search(infeasible, plant, contract, progress, clock, polytope=polytope)]
-    return sorted(known, key=size, reverse=True)
-
-
 def _second_search(
     infeasible: Infeasible,
     plant: LinearPlant,
@@ -228,7 +191,7 @@ def _second_search(
     if polytope and LOST in infeasible.details:
         progress("no ellipsoid holds in exact arithmetic: seeking a polytope")
         try:
-            return around_resting_point(plant, contract, progress, (), clock)
+            return around_resting_point(plant, contract, progress, clock)
         except Infeasible:
             raise infeasible from None
     was_sought = "share_of_radii" in infeasible.details

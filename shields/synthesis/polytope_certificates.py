@@ -178,7 +178,6 @@ def around_resting_point(
     plant: LinearPlant,
     contract: ChannelContract | None,
     progress: Progress,
-    known: Sequence[Certificate],
     clock: Clock,
     fixed: Rest | None = None,
 ) -> Certificate:
@@ -192,16 +191,13 @@ def around_resting_point(
         Infeasible: If none is found.
     """
     progress("resting point")
-    if fixed is not None:
-        known = [each for each in known if np.array_equal(each.resting_state, fixed.state)]
     tried = _different(fallbacks_around(plant, contract, progress, fixed))
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
         larger = []
         for each in tried:
             try:
-                found = _certified_polytope(plant, each.K, contract, progress, each.rest, (margin,))
-                return max([found, *known], key=polytope_share)
+                return _certified_polytope(plant, each.K, contract, progress, each.rest, (margin,))
             except _NOT_CERTIFIED as failure:
                 reasons.append(str(failure))
                 if isinstance(failure, Infeasible) and is_too_large(failure):
@@ -209,8 +205,6 @@ def around_resting_point(
             if clock.is_over:
                 break
         tried = larger
-    if known:
-        return max(known, key=polytope_share)
     reason = reasons[0] if reasons else "no gain was found"
     raise Infeasible(reason, "P", 0.0) if fixed else infeasibility_around(plant, contract, reason)
 

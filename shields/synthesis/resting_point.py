@@ -69,21 +69,23 @@ class Farthest(NamedTuple):
     binding: np.ndarray
 
 
-def farthest_from_limits(plant: LinearPlant, needs: np.ndarray | None = None) -> Rest:
-    """Returns the equilibrium whose nearest limit is farthest away.
-
-    Args:
-        plant: The plant.
-        needs: What distances from the limits are in units of, shape (k + m + q,), > 0; half the range by default.
+def farthest_from_limits(plant: LinearPlant) -> Rest:
+    """Returns the equilibrium whose nearest limit is farthest away, in half ranges.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
     """
-    return farthest_equilibrium(plant, needs).rest
+    return farthest_equilibrium(plant).rest
 
 
 def farthest_equilibrium(plant: LinearPlant, needs: np.ndarray | None = None) -> Farthest:
-    """Returns what `farthest_from_limits` does with the limits that are nearest, by a linear program.
+    """Returns the equilibrium whose nearest limit is farthest away with the limits that are nearest.
+
+    It is found by a linear program.
+
+    Args:
+        plant: The plant.
+        needs: What distances from the limits are in units of, shape (k + m + q,), > 0; half the range by default.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.

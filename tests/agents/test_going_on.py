@@ -15,7 +15,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents import (
     Agent,
     AppliedActionBuffer,
-    BasePolicy,
     LagrangianSettings,
     LoopConfig,
     ShieldSettings,
@@ -165,22 +164,6 @@ def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
         learn(turned)
     with pytest.raises(ValueError, match="takes several steps of the environment"):
         learn(gym.wrappers.RepeatAction(shield(), 2))
-
-
-def test_agent_of_another_base_policy_is_refused(loop):
-    base = BasePolicy(np.array([[0.2, -0.1]]), np.array([0.1]))
-    residual = replace(loop, base_policy=base)
-    agent = train(residual, 128, 0, hyperparams=SMALL).agent
-    for other in (None, BasePolicy(base.gain), BasePolicy(2.0 * base.gain, base.offset)):
-        with pytest.raises(ValueError, match="adds its actions to another base policy"):
-            train(replace(loop, base_policy=other), 128, 1, hyperparams=SMALL, start=agent)
-    train(
-        replace(loop, base_policy=BasePolicy(base.gain.copy(), base.offset.copy())),
-        128,
-        1,
-        hyperparams=SMALL,
-        start=agent,
-    )
 
 
 def test_agent_trained_behind_a_filter_says_so_in_its_files(loop, tmp_path):

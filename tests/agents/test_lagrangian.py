@@ -1,23 +1,17 @@
-"""PPO-Lagrangian's price of a violation, and agents that add to a gain."""
-
-from dataclasses import replace
+"""PPO-Lagrangian's price of a violation."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.agent import Agent
-from agents.agent_file import AgentError
 from agents.callbacks import DualAscentCallback
-from agents.loop import BasePolicy, CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
+from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from agents.training import train
-from ncs_gym import LinearPlant, NCSEnv, truck_trailer
-from shields.certificate import Fallback
+from ncs_gym import NCSEnv, truck_trailer
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = dict(n_envs=4, n_steps=50, batch_size=200, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
-BASE = BasePolicy(np.array([[0.4, -0.3]]), np.array([0.2]))
 
 
 def raised(settings, rollouts, env_id=CRUISE.env):
@@ -117,42 +111,3 @@ def test_training_raises_the_price_of_what_the_agent_violates():
     plain = train(CRUISE, 1600, 0, hyperparams=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (plain.agent.act(observations) != result.agent.act(observations)).any()
-
-
-def test_residual_action_is_added_to_that_of_the_base_policy_and_clipped():
-    inner = CRUISE.vector(3)
-    envs = ResidualActions(inner, BASE)
-    observation, _ = envs.reset(seed=0)
-    for part in (0.1, -0.2, 3.0):
-        wanted = np.clip(observation[:, :2] @ BASE.gain.T + BASE.offset + part, -1.0, 1.0)
-        observation, *_, info = envs.step(np.full((3, 1), part))
-        np.testing.assert_allclose(info["input"], inner.unwrapped.plant.u_max * wanted, rtol=1e-6)
-
-
-def test_base_policy_of_a_certificate_applies_its_input_where_limits_have_two_ends():
-    plant = LinearPlant(
-        A=[[0.9]], B=[[0.1]], box=[1.0], input_limits=(0.0, 2.0), operating_input=0.5, dt=1.0,
-        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-    )  # fmt: skip
-    base = BasePolicy.of(Fallback(np.array([[-2.0]]), np.array([0.1]), np.array([0.05])), plant)
-    envs = ResidualActions(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, plant=plant), base)
-    observation, _ = envs.reset(seed=0, options={"state": [0.3]})
-    for _ in range(3):
-        wanted = 0.05 - 2.0 * (observation[:, :1] - 0.1)
-        observation, *_, info = envs.step(np.zeros((3, 1)))
-        np.testing.assert_allclose(info["input"], np.clip(wanted, -0.5, 1.5), atol=1e-6)
-
-
-def test_residual_agent_is_trained_saved_and_loaded_with_its_base_policy(tmp_path):
-    loop = LoopConfig(env=CRUISE.env, base_policy=BASE)
-    agent = train(loop, 400, 0, hyperparams=TINY).agent
-    observations = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3)).astype(np.float32)
-    part = agent.model.predict(agent.normalization(observations), deterministic=True)[0]
-    own = observations[:, :2] @ BASE.gain.T + BASE.offset
-    np.testing.assert_allclose(agent.act(observations), np.clip(part + own, -1, 1), rtol=1e-6)
-    agent.save(tmp_path)
-    np.testing.assert_array_equal(Agent.load(tmp_path).act(observations), agent.act(observations))
-    wrong = replace(agent, base_policy=BasePolicy(np.ones((2, 2))))
-    wrong.save(tmp_path)
-    with pytest.raises(AgentError, match="base policy"):
-        Agent.load(tmp_path)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents import evaluate
-from agents.loop import BasePolicy, LagrangianSettings, LoopConfig, ShieldSettings
+from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
 from ncs_gym import truck_trailer
 from shields.paper import PaperCertificate
@@ -82,11 +82,6 @@ CALLS = [
       for value in (-50.0, NAN, "5")),
     (partial(LoopConfig, env=CRUISE.env, violation_penalty=1.0, lagrangian=LagrangianSettings()),
      "give either violation_penalty or lagrangian"),
-    (partial(LoopConfig(env=CRUISE.env, base_policy=BasePolicy(np.ones((3, 3)))).vector, 2),
-     "base_policy must have a gain of the shape"),
-    (partial(LoopConfig, env=CRUISE.env, base_policy=np.ones((1, 2))), "base_policy must be a BasePolicy"),
-    *((partial(BasePolicy, *given), said) for given, said in
-      ((([[NAN]],), "gain must be finite"), (([[0.1]], [0.0, 0.0]), r"offset must have shape \(1,\)"))),
     (partial(ShieldSettings, CERTIFICATE, penalty=-1.0), "penalty must be a number >= 0"),
     (partial(LoopConfig, env=CRUISE.env, shield=CERTIFICATE),
      r"^shield must be ShieldSettings\(certificate\), got Certificate$"),

@@ -198,7 +198,6 @@ SHIELDED = {
     "the plant of verify": lambda env, many, certificate, value: verify(certificate, value),
     "the certificate of verify": lambda env, many, certificate, value: verify(value, env.plant),
     "the plant of synthesize": lambda env, many, certificate, value: synthesize(value),
-    "the method of synthesize": lambda env, many, certificate, value: synthesize(env.plant, method=value),
     "the contract of synthesize": lambda env, many, certificate, value: synthesize(env.plant, contract=value),
 }
 

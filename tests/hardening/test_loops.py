@@ -12,7 +12,6 @@ from ncs_gym.envs.env import NCSEnv
 from shields import SafetyShield, VectorSafetyShield
 from tests.fuzz import NOTHING_USABLE, examples
 
-CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 # Inside a safe set, and outside of any.
 CHANNEL = Channel(0.3, quantization_step=0.05, send_period=2, delay=1, jitter=1)
 STARTS = [[0.0, 0.0], [0.3, -0.1], [5.0, 5.0]]

@@ -334,6 +334,7 @@ PLANTS = [
     *changed(
         partial(LinearPlant, A=[[0.9]], B=[[0.2]], dt=60.0, box=1.0, **QUIET),
         {"u_max": 1.0, "box_ends": ([0.1], [1.0])},
+        {"u_max": 1.0, "box_ends": ([1.0], [-1.0])},
         {"u_max": 1.0, "output_limits": [([1.0], 0.0)]},
         {"u_max": 1.0, "output_limits": [([0.0], -1.0, 1.0)]},
         {"input_ends": ([-1.0], [np.inf])},

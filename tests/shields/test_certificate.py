@@ -16,7 +16,11 @@ def test_short_form_has_no_numbers(certificate):
 
 
 @pytest.mark.parametrize(
-    "content", ["", "{}", "[]", "null", '"text"', '{"format": "other"}', "[" * 100_000, "\x00\xff"]
+    "content",
+    [
+        *("", "{}", "[]", "null", '"text"', '{"format": "other"}', "[" * 100_000, "\x00\xff"),
+        *("\x80\x04cos\nsystem\n", '{"format": ' + "9" * 100_000 + "}"),
+    ],
 )
 def test_files_of_another_kind_are_refused_in_one_sentence(content, tmp_path):
     path = tmp_path / "file.json"

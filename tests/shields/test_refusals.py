@@ -30,7 +30,6 @@ from tests.plants import named, servo, small
 Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
 SHARES = {"shares": np.array([0.9, 0.05, 0.05]), "inputs": np.array([0.5])}
 PAPER = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2}
-FIXED = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=1.0, disturbance_bound=0.0)
 
 
 def plant():
@@ -72,7 +71,6 @@ def read_multipliers(first):
 
 
 REFUSED = [
-    (lambda: synthesize(plant(), method="magic"), ValueError, "method must be"),
     (lambda: synthesize(plant(), safe_set="Polytope"), ValueError, "safe_set must be"),
     (lambda: synthesize(plant(), safe_set=0), ValueError, "safe_set must be"),
     (lambda: synthesize(plant(), safe_set=["polytope"]), ValueError, "safe_set must be"),

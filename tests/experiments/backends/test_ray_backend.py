@@ -198,11 +198,6 @@ def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
     assert_same(tmp_path / "out", local)
 
 
-def one_sentence(run):
-    assert run.returncode == 2, run.stderr
-    return run.stderr.strip().splitlines()[-1]
-
-
 def test_error_of_a_run_is_not_retried_and_named(tmp_path):
     run = Small("its-name", "fail", tmp_path)
     with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1"):

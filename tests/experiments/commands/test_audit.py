@@ -118,13 +118,6 @@ def test_summary_counts_rows_and_distinct_defects(claims, monkeypatch):
 
 
 @pytest.mark.slow
-def test_text_takes_the_width_of_the_terminal(claims, monkeypatch):
-    longest = [max(map(len, text_at(claims, width, monkeypatch).splitlines())) for width in (70, 300)]
-    assert 60 < longest[0] <= 70
-    assert 70 < longest[1] <= 80
-
-
-@pytest.mark.slow
 def test_command_prints_json_and_writes_it(audit):
     printed, written = audit
     assert printed == written

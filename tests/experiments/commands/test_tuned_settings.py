@@ -21,5 +21,7 @@ def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_p
     expected = tuned | {"n_envs": 2, "n_steps": 16, "policy_kwargs": tuned["policy_kwargs"] | {"net_arch": [8, 8]}}
     assert settings["hyperparams"] == agent.hyperparams == expected
     assert settings["steps"] == 64
-    succeeded("train", "--env", ENV, *SMALL, networks, "--out", tmp_path / "again")
+    given = [f"{name}={json.dumps(value)}" for name, value in expected.items()]
+    again = succeeded("train", "--env", ENV, *SMALL[:4], "--hyperparams", *given, "--out", tmp_path / "again")
+    assert "PPO, hyperparameters as given: " in again.stdout
     assert Agent.load(tmp_path / "again" / "models" / "shielded-0").checksum == agent.checksum

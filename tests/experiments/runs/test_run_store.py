@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.loop import BasePolicy, LagrangianSettings
+from agents.loop import LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
 from experiments.runs.provenance import versions
@@ -55,7 +55,6 @@ def test_result_of_other_settings_is_not_taken(folder, run, change):
         {"kwargs": {"noise": "gaussian"}},
         {"kwargs": {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}}}},
         {"lagrangian": LagrangianSettings()},
-        {"base_policy": BasePolicy(np.ones((1, 2)))},
         {"shield": None},
     ],
 )

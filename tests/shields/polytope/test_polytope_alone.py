@@ -45,29 +45,6 @@ def test_ellipsoid_that_is_asked_for_is_infeasible_where_only_a_polytope_is_foun
         synthesize(found(name)[1], contract=AGE, safe_set="ellipsoid")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "given", ["smaller", pytest.param("same", marks=pytest.mark.slow), pytest.param("whole", marks=pytest.mark.slow)]
-)
-def test_a_candidate_never_makes_the_result_smaller(given):
-    whole, plant = found("servo, bearable")
-    assert whole.keeps_ellipsoid
-    smaller = certify_polytope(plant, np.array([[-12.66, -0.034]]), AGE)
-    share = whole.provenance["polytope_share_of_box"]
-    assert smaller.provenance["polytope_share_of_box"] < 0.99 * share
-    candidate = {"smaller": smaller, "same": certify_polytope(plant, whole.K, AGE), "whole": whole}[given]
-    again = synthesize(plant, contract=AGE, candidates=[candidate])
-    assert again.provenance["polytope_share_of_box"] > 0.999 * share
-    assert again.keeps_ellipsoid
-
-
-def test_an_ellipsoid_that_is_asked_for_comes_without_the_polytope_of_a_candidate():
-    whole, plant = found("stable")
-    ellipsoid = synthesize(plant, safe_set="ellipsoid", candidates=[whole])
-    assert ellipsoid.polytope is None
-    assert ellipsoid.keeps_ellipsoid
-
-
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_margin_of_a_gain_is_what_errors_and_disturbances_reach_together(seed):
     """There are signals that reach the sum of supports; 0.99 times the margin certifies, 1.02 times does not."""

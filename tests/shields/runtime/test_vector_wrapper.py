@@ -3,13 +3,9 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorWrapper
 
 from ncs_gym import NCSVectorEnv
 from shields import Decision, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import (
-    OTHER_STEPS,
-)
 from shields.runtime.vector_wrapper import overridden
 from tests import arrays
 from tests.certificates import certificate_of
@@ -48,29 +44,6 @@ def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
 
 def outwards(shield, info):
     return np.sign(info["estimate"] @ (shield.certificate.M @ shield.unwrapped.plant.B))
-
-
-@pytest.mark.parametrize("moved", [True, False])
-def test_interrupted_step_promises_nothing_until_a_reset(moved):
-    class Breaks(VectorWrapper):
-        broken = False
-
-        def step(self, actions):
-            result = self.env.step(actions) if moved or not self.broken else None
-            if self.broken:
-                raise KeyboardInterrupt
-            return result
-
-    inner = Breaks(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2))
-    env, actions = VectorSafetyShield(inner), np.ones((2, 1), np.float32)
-    env.reset(seed=0)
-    assert env.step(actions)[4]["shield_guaranteed"].all()
-    inner.broken = True
-    with pytest.raises(KeyboardInterrupt):
-        env.step(actions)
-    inner.broken = False
-    assert set(env.step(actions)[4]["shield_reason"]) == {OTHER_STEPS}
-    assert env.reset(seed=0)[1]["shield_guaranteed"].all()
 
 
 def test_last_steps_behind_the_shields_back_promise_nothing():
