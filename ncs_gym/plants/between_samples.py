@@ -15,7 +15,8 @@ from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.validation import read_only
 
 MOST_POINTS = 64
-# A and B of a plant are those of its model in continuous time up to this, relative to their largest entries.
+# A and B of a plant are those of its model in continuous time up to this, relative to the largest entry in units of the
+# limits.
 SAME_MODEL = 1e-9
 # What the bound between grid points is enlarged by, relative to itself and to what a row reaches: for the rounding of
 # the rows, which the verification of a certificate bounds.
@@ -111,11 +112,14 @@ def logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
     return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)
 
 
-def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float) -> None:
-    """Raises ValueError unless A and B are those of [Ac, Bc], shape (n, n + m), with the input held over a step."""
+def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float, widths: np.ndarray) -> None:
+    """Raises ValueError unless A and B are those of [Ac, Bc], shape (n, n + m), with the input held over a step.
+
+    Entries are compared in units of the limits, `widths` of shape (n + m,).
+    """
     n = len(A)
     sampled = np.concatenate(zero_order_hold(model[:, :n], model[:, n:], dt), axis=1)
-    given = np.concatenate([A, B], axis=1)
+    sampled, given = (each * widths / widths[:n, None] for each in (sampled, np.concatenate([A, B], axis=1)))
     if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
         raise ValueError(
             "continuous_model is not the one that A and B were sampled from: make the plant by "

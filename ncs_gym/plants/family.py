@@ -21,7 +21,7 @@ from ncs_gym.plants.limits import in_units_of_range
 from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.family import Family, entry_name, matrices_of
+from ncs_gym.uncertainty.family import Family, entry_name, grid_size, matrices_of
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import as_flag, as_names, as_number, shown
 
@@ -33,8 +33,6 @@ P = TypeVar("P", bound="LinearPlant")
 # Growth of the bound for the rounding of sums, and room for that of a function's entries, in units of the largest one
 # of their row where that varies.
 ROUNDING, ROOM = 1e-9, 1e-12
-# Plants of a function at about so many points of the ranges check that its entries are monotone.
-GRID = 256
 MOST_PARAMETERS = 6
 # In what members may differ; the plant of the middle has no model in continuous time.
 _OWN = ("A", "B", "continuous_model", "step_offset")
@@ -56,9 +54,9 @@ def plant_of_middle(
     """Returns what `LinearPlant.family` does, of plants of this class."""
     at_rest, monotone = as_flag(at_rest, "at_rest"), as_flag(monotone, "monotone")
     if callable(members):
-        family, plants, basis = _of_function(kind, members, ranges, monotone)
+        family, plants = _of_function(kind, members, ranges, monotone)
     elif ranges is None and not monotone:
-        family, plants, basis = _of_plants(kind, members)
+        family, plants = _of_plants(kind, members)
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
     rest_matters = _rest_matters(family, plants)
@@ -68,8 +66,6 @@ def plant_of_middle(
             "two ends moves it, too): say at_rest=True if each is at rest at its own one, as LinearPlant(offset=...) "
             "checks of a model in absolute coordinates"
         )
-    if rest_matters or family.members[..., -1].any():
-        basis += ", each being at rest at its operating point (given)"
     first = _around_center(plants[0], _center_of(plants))
     middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
     return replace(
@@ -78,7 +74,7 @@ def plant_of_middle(
         B=middle[:, first.n : -1],
         continuous_model=None,
         disturbance_bound=_covering(plants),
-        remainder=replace(family, basis=basis),
+        remainder=replace(family, at_rest=rest_matters),
     )
 
 
@@ -185,8 +181,8 @@ def _terms(plant: LinearPlant) -> np.ndarray:
     return reach[: plant.n] + exact.product(np.abs(np.hstack([plant.A, plant.B])), reach)
 
 
-def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:
-    """Returns the family of plants, the plants, and whose bound it is."""
+def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P]]:
+    """Returns the family of plants, and the plants."""
     if not isinstance(members, (list, tuple)) or len(members) < 2:
         raise ValueError(
             f"a family must be a list of two plants or more, or a function of ranges, got {shown(members)}"
@@ -195,11 +191,11 @@ def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P], str]:
     _require_alike(kind, plants)
     center, matrices = _center_of(plants), _matrices(plants)
     family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices, center=center)
-    return family, plants, f"for the convex hull of {len(plants)} plants"
+    return family, plants
 
 
-def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monotone: bool) -> tuple[Family, list[P], str]:
-    """Returns the family of a function, the plants of its corners, and whose bound it is."""
+def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monotone: bool) -> tuple[Family, list[P]]:
+    """Returns the family of a function, and the plants of its corners."""
     if not isinstance(ranges, Mapping) or not 1 <= len(ranges) <= MOST_PARAMETERS:
         raise ValueError(
             f"ranges must be a dictionary of 1 to {MOST_PARAMETERS} parameters with their (low, high), got "
@@ -231,13 +227,8 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
         center=_center_of(plants),
         check=_Shared(first, cover, "another one"),
     )
-    checked = _check_monotone(family, room)
-    shown_ranges = ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(names, ends, strict=True))
-    entries = "A, B and the step at the middle of the operating points" if matrices[..., -1].any() else "A and B"
-    basis = (
-        f"for {shown_ranges}, entries of {entries} being monotone in each (given, and checked at {checked:,} points)"
-    )
-    return family, plants, basis
+    _check_monotone(family, room)
+    return family, plants
 
 
 def _matrices(plants: list[P]) -> np.ndarray:
@@ -317,14 +308,14 @@ def _is_same(one: Any, other: Any, tolerance: float) -> bool:
     return bool(np.array_equal(one, other))
 
 
-def _check_monotone(family: Family, room: np.ndarray) -> int:
-    """Checks on a grid that entries are monotone up to `room`, shape (n, n + m + 1); returns its number of points.
+def _check_monotone(family: Family, room: np.ndarray) -> None:
+    """Checks on a grid that entries are monotone up to `room`, shape (n, n + m + 1).
 
     Raises:
         ValueError: If an entry is not, with its name and that of the parameter.
     """
     k, (low, high) = len(family.names), family.ranges
-    each = max(int(GRID ** (1.0 / k) + 1e-9), 3)
+    each = grid_size(k)
     points = np.array([*itertools.product(*np.linspace(low, high, each).T)])
     values = np.array([family.of_function(point) for point in points]).reshape(*[each] * k, *room.shape)
     for axis, name in enumerate(family.names):
@@ -336,7 +327,6 @@ def _check_monotone(family: Family, room: np.ndarray) -> int:
                 f"{entry_name(wrong)} is not monotone in {name} from {low[axis]:g} to {high[axis]:g}, as monotone=True "
                 "says: give a smaller range, or the list of plants whose convex hull holds yours"
             )
-    return each**k
 
 
 def _largest(reach: np.ndarray, off: np.ndarray, state_names: Sequence[str]) -> np.ndarray:

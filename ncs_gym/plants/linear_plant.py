@@ -323,7 +323,8 @@ class LinearPlant(LimitValues, HardBounds):
         if self.continuous_model is not None:
             shape = (self.n, self.n + self.m)
             self._set("continuous_model", as_matrix(self.continuous_model, shape, "continuous_model"))
-            between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt)
+            widths = np.concatenate([self.half_widths, self.input_half])
+            between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt, widths)
         if self.between_samples is None:
             return
         points = as_count(self.between_samples, "between_samples", low=1, high=between_samples.MOST_POINTS)

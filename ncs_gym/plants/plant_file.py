@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _FORMAT = "ncs-gym plant 1"
 # What of a remainder, and of the family that it is about, stands in a file.
-_OF_REMAINDER, _OF_FAMILY = ("bound", "proved", "basis"), ("names", "parameters", "members", "interval", "basis")
+_OF_REMAINDER, _OF_FAMILY = ("bound", "proved", "basis"), ("names", "parameters", "members", "interval", "at_rest")
 
 
 def document_of(plant: LinearPlant) -> dict[str, Any]:

@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_numbers, read_only, require_short_text, shown
+from ncs_gym.validation import ReadOnlyArrays, as_flag, as_matrix, as_names, as_numbers, read_only, shown
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
+
+
+# Plants of a function at about so many points of the ranges check that its entries are monotone.
+GRID = 256
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,11 +36,11 @@ class Family(ReadOnlyArrays):
         interval: The low and the high entries of [A, B, s] of all that the function returns, shape (2, n, n + m + 1);
             None without one.
         center: State and input that deviations are counted from, shape (n + m,); None is zero.
-        basis: Which plants the bound of a family is for, in a phrase.
+        at_rest: Whether it is given that every member rests at its own operating point.
         check: Raises ValueError unless a plant that the function returned differs from the others in [A, B, s] alone.
 
     Raises:
-        ValueError: If a shape is wrong.
+        ValueError: If a shape is wrong, or a family of parameters has no interval.
     """
 
     names: Sequence[str]
@@ -45,7 +49,7 @@ class Family(ReadOnlyArrays):
     function: Callable[..., LinearPlant] | None = None
     interval: np.ndarray | None = None
     center: np.ndarray | None = None
-    basis: str = ""
+    at_rest: bool = False
     check: Callable[[LinearPlant], None] | None = None
 
     def __post_init__(self) -> None:
@@ -66,8 +70,30 @@ class Family(ReadOnlyArrays):
             if not ((interval[0] <= members) & (members <= interval[1])).all():
                 raise ValueError("the members of a family must lie in its interval")
             object.__setattr__(self, "interval", np.array(interval))
-        require_short_text(self.basis, "the basis of a family")
+        if (self.names != ("member",)) != (self.interval is not None):
+            raise ValueError("a family of parameters needs the interval of its entries, and one of plants has none")
+        if self.function is not None and (self.interval is None or self.check is None):
+            raise ValueError("a family of a function needs its interval, and the check of its members")
+        object.__setattr__(self, "at_rest", as_flag(self.at_rest, "at_rest"))
         self._make_arrays_read_only()
+
+    @property
+    def basis(self) -> str:
+        """Which plants the bound of the family is for, and what is given of them, in a phrase."""
+        if self.interval is None:
+            text = f"for the convex hull of {len(self.members)} plants"
+        else:
+            ends = zip(self.names, *self.ranges.tolist(), strict=True)
+            entries = "A, B and the step at the middle of the operating points" if self._steps else "A and B"
+            ranges, k = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in ends), len(self.names)
+            points = f"{grid_size(k) ** k:,} points"
+            text = f"for {ranges}, entries of {entries} being monotone in each (given, and checked at {points})"
+        return text + ", each being at rest at its operating point (given)" * (self.at_rest or self._steps)
+
+    @property
+    def _steps(self) -> bool:
+        """Whether a member rests elsewhere."""
+        return bool(self.members[..., -1].any())
 
     @cached_property
     def ranges(self) -> np.ndarray:
@@ -165,6 +191,11 @@ class Family(ReadOnlyArrays):
             listed = [dict(zip(self.names, row, strict=True)) for row in self.parameters.tolist()]
             raise ValueError(f"no member of the family has {shown(wanted)}; it has {shown(listed)}")
         return rows
+
+
+def grid_size(parameters: int) -> int:
+    """Returns at how many values of each parameter a function is looked at."""
+    return max(int(GRID ** (1.0 / parameters) + 1e-9), 3)
 
 
 def matrices_of(plant: Any, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:

@@ -189,6 +189,7 @@ class SafeLoop(CopiedWhole):
         ]
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
+    @np.errstate(all="ignore")
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None, *, known: bool = True) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 

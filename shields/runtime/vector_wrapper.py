@@ -99,6 +99,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         self._no_reason.flags.writeable = False
         self._clock: Clock | None = None
 
+    @np.errstate(all="ignore")
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:

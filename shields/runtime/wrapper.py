@@ -238,6 +238,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
 
+    @np.errstate(all="ignore")
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`.
 

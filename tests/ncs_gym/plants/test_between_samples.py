@@ -226,3 +226,10 @@ def test_model_in_continuous_time_is_the_one_that_was_sampled():
         with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
             replace(plant, **change)
     assert replace(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None
+    small = LinearPlant.from_statespace(  # a state in units in which its limit is tiny
+        ([[0.0, 1e9], [0.0, -1.0]], [[0.0], [1e-9]], np.eye(2), np.zeros((2, 1))),
+        dt=0.1, box=[1e9, 1.0], u_max=1e9, disturbance_bound=0.0, sensor_bound=0.01, initial_bound=0.01,
+    )  # fmt: skip
+    wrong = small.A * [[1.0, 1.0], [1.0, 0.95]]
+    with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
+        replace(small, A=wrong)

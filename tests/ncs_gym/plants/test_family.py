@@ -339,6 +339,13 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
     wider = replace(HULL, box=[4.0, 4.0], remainder=smaller)
     assert largest_gauge(wider, wider.members.members, (4.0, 4.0, 4.0)) <= 1
     assert replace(HULL, remainder=smaller).fingerprint == HULL.fingerprint
+    for changes in ({"interval": None}, {"check": None}, {"function": None, "interval": None}):
+        with pytest.raises(ValueError, match="needs"):
+            replace(TRUCK.members, **changes)
+    document = json.loads(json.dumps(TRUCK.document))
+    document["plant"]["remainder"]["interval"] = None
+    with pytest.raises(ValueError, match="needs the interval of its entries"):
+        LinearPlant.read(document)
     document = json.loads(json.dumps(TRUCK.document))
     document["plant"]["remainder"]["members"][0][1][2] *= 3.0
     with pytest.raises(ValueError, match="must lie in its interval"):
@@ -447,7 +454,7 @@ REFUSED = {
                 HULL.remainder.bound,
                 True,
                 "an example",
-                Family(names=["a"], parameters=[[0.0]], members=np.zeros((1, 3, 5))),
+                Family(names=["member"], parameters=[[0.0]], members=np.zeros((1, 3, 5))),
             ),
         ),
         r"of shape \(2, 4\)",
