@@ -589,7 +589,7 @@ class LinearPlant(LimitValues, HardBounds):
             self._require_symmetric("box_ends and input_ends")
         u_max = np.minimum(-self.input_low, self.input_high)
         given = self.remainder  # bounded for more states and inputs than are left
-        remainder = given and (given.family or Remainder(given.bound, given.proved, given.basis))
+        remainder = given and (given.family or Remainder(given.bound, given.is_proved, given.basis))
         limits = {"box": self.symmetric_box, "box_ends": None, "input_ends": (-u_max, u_max)}
         return replace(self, **limits, remainder=remainder)
 
@@ -643,7 +643,8 @@ class LinearPlant(LimitValues, HardBounds):
                 digest.update(name.encode() + array.astype("<f8").tobytes())
         if self.remainder is not None:
             digest.update(
-                f"remainder{self.remainder.proved}".encode() + self.remainder.bound.shape_matrix.astype("<f8").tobytes()
+                f"remainder{self.remainder.is_proved}".encode()
+                + self.remainder.bound.shape_matrix.astype("<f8").tobytes()
             )
         if self.members is not None:
             digest.update(b"members" + self.members.members.astype("<f8").tobytes())

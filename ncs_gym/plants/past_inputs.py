@@ -128,7 +128,7 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
         if plant.members is not None:
             raise ValueError("inputs become states of the plants of a family one by one: give du_max to its members")
         padded = Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored)))
-        remainder = Remainder(padded, remainder.proved, remainder.basis)
+        remainder = Remainder(padded, remainder.is_proved, remainder.basis)
     return replace(
         plant,
         A=A,

@@ -69,7 +69,7 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, Remainder):
         if value.family is not None:  # the bound follows from it
             return _as_json(value.family)
-        return {name: _as_json(getattr(value, name)) for name in _OF_REMAINDER}
+        return {"bound": _as_json(value.bound), "proved": value.is_proved, "basis": value.basis}
     if isinstance(value, Family):
         return {name: _as_json(getattr(value, name)) for name in _OF_FAMILY}
     if isinstance(value, tuple):

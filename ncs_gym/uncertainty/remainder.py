@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import InitVar, dataclass
+from dataclasses import InitVar, dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -29,6 +29,7 @@ class Remainder:
         basis: Where the bound comes from, in a phrase.
         family: The plants that the process is one of, of which each episode has another (`LinearPlant.family`); None if
             it is something else.
+        is_proved: `proved`.
 
     Raises:
         ValueError: If the bound is not an ellipsoid, `proved` no truth value, `basis` no text, or `family` none.
@@ -38,12 +39,13 @@ class Remainder:
     proved: InitVar[bool]
     basis: str
     family: Family | None = None
+    is_proved: bool = field(init=False)
     _model: ClassVar[Mapping[str, np.ndarray] | None] = None
 
     def __post_init__(self, proved: bool) -> None:
         if not isinstance(self.bound, Ellipsoid):
             raise ValueError(f"the bound of a remainder must be an Ellipsoid, got {shown(self.bound)}")
-        object.__setattr__(self, "proved", as_flag(proved, "proved"))
+        object.__setattr__(self, "is_proved", as_flag(proved, "proved"))
         if not isinstance(self.basis, str):
             raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
         require_short_text(self.basis, "the basis of a remainder")
@@ -74,5 +76,5 @@ class Remainder:
     @property
     def sentence(self) -> str:
         """What a certificate says about it."""
-        kind = "bounded by proof" if self.proved else "assumed to lie in its bound"
+        kind = "bounded by proof" if self.is_proved else "assumed to lie in its bound"
         return f"What the linear model leaves out is {kind} while the state is in the box: {self.basis}."

@@ -93,7 +93,7 @@ def test_states_of_many_environments_are_moved_to_the_operating_point_and_back()
 def test_bound_holds_every_member_exactly_and_is_not_far_larger(plant, members, widths):
     gauge = largest_gauge(plant, members, widths)
     assert 0.4 < gauge <= 1
-    assert plant.remainder.proved
+    assert plant.remainder.is_proved
 
 
 def test_members_inside_the_hull_leave_out_less_than_its_vertices():
