@@ -83,8 +83,8 @@ class Shown:
         return printed("channel", record(0.02 * np.arange(500), delay=0.01, loss=0.2), "--env", "ncs_gym/CartPole-v0")
 
     def requirements(self):
-        asked = ("--ages", *range(12), "--resolutions", *(1e-4 * k for k in range(12)))
-        return printed("requirements", "--plant", self.plant, *asked, "--out", self.folder / "r.json")
+        wide = ("--ages", 0, "--resolutions", *(1e-4 * k for k in range(12))), ("--ages", *range(12))
+        return "\n".join(printed("requirements", "--plant", self.plant, *each) for each in wide)
 
     def attack(self):
         names = ("steps", "episodes", "outside S", "outside box", "no claim", "overridden")
