@@ -54,7 +54,7 @@ test-lowest: $(LOWEST)/.installed ## the tests, with the lowest versions of depe
 	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal
 
 # What calls a solver, or shows that nothing is printed by one.
-NEWEST_TESTS ?= tests/shields/synthesis tests/ncs_gym/plants
+NEWEST_TESTS ?= tests/shields/synthesis
 test-newest: $(NEWEST)/.installed ## what calls solvers, with the newest versions of dependencies that pyproject.toml allows
 	$(NEWEST)/bin/python -m pytest -n auto --dist worksteal $(NEWEST_TESTS)
 
