@@ -123,7 +123,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         # gymnasium's annotation leaves out the lists that its own vector environments take.
         observations, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorRequestActions")
-        self._packets = info["packets"]
+        self._packets = info["packets"].copy()
         return self._seen(observations), info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -136,7 +136,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         self._inner.request(asked)
         observations, rewards, terminated, truncated, info = self.env.step(inputs)
         sent = np.maximum(info["packets"] - self._packets, 0)  # nothing in a step that only begins an episode
-        self._packets = info["packets"]
+        self._packets = info["packets"].copy()
         return self._seen(observations), rewards - self.cost * sent, terminated, truncated, info
 
     def _seen(self, observations: np.ndarray) -> np.ndarray:

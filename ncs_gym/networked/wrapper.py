@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -300,7 +301,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             "action_age": action_age,
             "action_applied": snapshot(applied),
             "packets": self._packets,
-            **self._network,
+            **deepcopy(self._network),
         }
 
     def _by_part(self, values: list[Any]) -> Any:
