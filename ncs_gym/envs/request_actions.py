@@ -82,7 +82,8 @@ class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
         self._inner.request(bool(asked))
         observation, reward, terminated, truncated, info = self.env.step(inputs)
         sent, self._packets = info["packets"] - self._packets, info["packets"]
-        return self._seen(observation), float(reward) - self.cost * sent, terminated, truncated, info
+        reward = np.asarray(reward, np.float64).item() - self.cost * sent
+        return self._seen(observation), reward, terminated, truncated, info
 
     def _seen(self, observation: np.ndarray) -> np.ndarray:
         more = np.minimum(self._inner.request_state, self._most)
