@@ -1,5 +1,9 @@
-"""The docstrings of environment and shield describe every key of `info`; docs/ncs_gym.md names each once."""
+"""The docstrings of environment and shield describe every key of `info`; docs/ncs_gym.md names each once.
 
+What is told in a step belongs to whoever is told.
+"""
+
+import copy
 import inspect
 import re
 from pathlib import Path
@@ -7,10 +11,27 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ncs_gym import LinearPlant, NCSEnv
+from agents import SB3VecEnv
+from agents.loop import CostPenalty
+from experiments.baselines.filters import EstimateFilterSettings
+from ncs_gym import (
+    Channel,
+    LinearPlant,
+    NCSEnv,
+    Networked,
+    RandomChannel,
+    RequestActions,
+    VectorNetworked,
+    VectorRandomChannel,
+    VectorRequestActions,
+    truck_trailer,
+)
+from ncs_gym.registration import registered_ids
 from shields import SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
+from tests.ncs_gym.networked.environments import Counter
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "ncs_gym.md").read_text()
 ENVIRONMENTS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0")
@@ -143,3 +164,123 @@ def test_correction_is_what_the_docstring_says(loop):
     for info in steps:
         correction = np.linalg.norm(info["input_committed"] - info["input_proposed"])
         assert info["shield_correction"] == pytest.approx(correction, abs=1e-12)
+
+
+def spoil(told):
+    """Writes into everything that somebody was told and can write into."""
+    if isinstance(told, np.ndarray) and told.dtype != object:
+        if told.flags.writeable:
+            told[...] = 1
+    elif isinstance(told, dict):
+        for value in told.values():
+            spoil(value)
+        told.clear()
+    elif isinstance(told, (tuple, list, np.ndarray)):
+        for value in told:
+            spoil(value)
+
+
+def assert_equal(told, other):
+    """Two nests of dictionaries, sequences and arrays hold the same."""
+    if isinstance(told, dict):
+        assert told.keys() == other.keys()
+        told, other = (tuple(each[key] for key in told if key != "t") for each in (told, other))  # seconds
+    if isinstance(told, (tuple, list)) or getattr(told, "dtype", None) == np.dtype(object):
+        for one, another in zip(told, other, strict=True):
+            assert_equal(one, another)
+    else:
+        np.testing.assert_array_equal(told, other)
+
+
+def begun(env):
+    """What an environment tells of its first episodes; one of stable-baselines3 is seeded beforehand."""
+    if not isinstance(env, SB3VecEnv):
+        return env.reset(seed=0)
+    env.seed(0)
+    return env.reset(), env.reset_infos, env.batch_info
+
+
+def assert_tells_what_is_the_listeners_own(make):
+    """Two environments go alike, although everything that one of them tells is written over."""
+    kept, spoiled = make(), make()
+    kept.action_space.seed(0)
+    told = [begun(env) for env in (kept, spoiled)]
+    for _ in range(8):
+        assert_equal(*told)
+        told[0] = copy.deepcopy(told[0])
+        spoil(told[1])
+        action = kept.action_space.sample()
+        if isinstance(kept, SB3VecEnv):
+            action = np.repeat(action[None], kept.num_envs, axis=0)
+        told = [env.step(copy.deepcopy(action)) for env in (kept, spoiled)]
+
+
+VECTORS = ["NextStep", "SameStep"]
+FEW = {"num_envs": 3, "max_episode_steps": 5}
+
+
+@pytest.mark.parametrize("env_id", registered_ids())
+def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
+    assert_tells_what_is_the_listeners_own(lambda: gym.make(env_id))
+    for mode in VECTORS:
+        assert_tells_what_is_the_listeners_own(lambda mode=mode: gym.make_vec(env_id, autoreset_mode=mode, **FEW))
+
+
+@pytest.mark.parametrize("mode", ["project", "monitor", "lookahead"])
+def test_nobody_changes_a_shield_by_writing_into_what_it_told(loop, mode):
+    env_id, certificate = loop
+    assert_tells_what_is_the_listeners_own(lambda: SafetyShield(gym.make(env_id), certificate, mode))
+
+    def many(reset):
+        return VectorSafetyShield(gym.make_vec(env_id, autoreset_mode=reset, **FEW), certificate, mode)
+
+    for reset in VECTORS:
+        assert_tells_what_is_the_listeners_own(lambda reset=reset: many(reset))
+        assert_tells_what_is_the_listeners_own(lambda reset=reset: SB3VecEnv(many(reset)))
+
+
+def counters(mode, kind):
+    """Three environments of which each tells what nobody else has."""
+    return SyncVectorEnv([lambda: Counter(kind, length=5)] * 3, autoreset_mode=AutoresetMode(mode))
+
+
+LATE = Channel(loss=0.3, delay=1)
+CHANNELS = {"vector": LATE, "dict": {"count": LATE, "odd": Channel(loss=0.3)}, "buffers": LATE}
+NETWORK = {"downlink": Channel(delay=1), "observe": ("age", "arrived", "pending_actions"), "delay_reward": True}
+
+
+@pytest.mark.parametrize("kind", CHANNELS)
+@pytest.mark.parametrize("network", [{}, NETWORK])
+def test_nobody_changes_a_network_by_writing_into_what_it_told(kind, network):
+    channel = CHANNELS[kind]
+    assert_tells_what_is_the_listeners_own(lambda: Networked(Counter(kind), channel, **network))
+    assert_tells_what_is_the_listeners_own(lambda: RandomChannel(Networked(Counter(kind), channel, **network), [LATE]))
+    for mode in VECTORS:
+        assert_tells_what_is_the_listeners_own(
+            lambda mode=mode: VectorNetworked(counters(mode, kind), channel, **network)
+        )
+        assert_tells_what_is_the_listeners_own(
+            lambda mode=mode: VectorRandomChannel(VectorNetworked(counters(mode, kind), channel, **network), [LATE])
+        )
+
+
+FAMILY = {"plant": LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)}
+CONVOY = "ncs_gym/ConvoyOnRequest-v0"
+TRUCK = EstimateFilterSettings("trusting", certificate_of(gym.make(ENVIRONMENTS[0]).unwrapped.plant))
+OTHERS = {
+    "a plant that varies": lambda: NCSEnv(**FAMILY),
+    "plants that vary": lambda: gym.make_vec("ncs_gym/LinearNCS-v0", **FEW, **FAMILY),
+    "requests": lambda: RequestActions(gym.make(CONVOY), 0.1),
+    "requests of many": lambda: VectorRequestActions(gym.make_vec(CONVOY, **FEW), 0.1),
+    "requests of a network": lambda: RequestActions(Networked(Counter(), Channel(on_request=True)), 0.1),
+    "a filter": lambda: TRUCK(gym.make_vec(ENVIRONMENTS[0], **FEW)),
+    "a filter with autoreset in the step": lambda: TRUCK(
+        gym.make_vec(ENVIRONMENTS[0], autoreset_mode="SameStep", **FEW)
+    ),
+    "a penalty": lambda: CostPenalty(gym.make_vec(ENVIRONMENTS[0], **FEW), 1.0),
+}
+
+
+@pytest.mark.parametrize("make", OTHERS.values(), ids=OTHERS)
+def test_nobody_changes_other_wrappers_by_writing_into_what_they_told(make):
+    assert_tells_what_is_the_listeners_own(make)

@@ -201,8 +201,7 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
             continue
         evaluated = [arm, *arm.get("conditions", {}).values()]
         if not arm["train_intervention_rate"] and not any(each["intervention_rate"] for each in evaluated):
-            longer = ": train longer" if arm.get("train_steps") else ""
-            findings.append(f"{name}: nothing was overridden, so that this arm shows nothing of the shield{longer}.")
+            findings.append(f"{name}: all that was proposed was safe, so that this arm shows nothing of the shield.")
             continue
         leaves = ", which may be left in this mode; the box may not" if arm["mode"] == "lookahead" else ""
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"

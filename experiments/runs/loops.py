@@ -48,10 +48,11 @@ def registered_env(env_id: str) -> NCSEnv:
         for meant in (f"{whole}-v0", whole):
             if near := get_close_matches(meant, known, 1, 0.95):
                 raise ValueError(f"unknown environment {env_id!r}; did you mean {known[near[0]]!r}?")
-        if name in gym.registry and gym.spec(name).namespace == "ncs_gym":
+        if name in gym.registry:
             raise ValueError(
-                f"{env_id} has no plant of its own: register_plant makes an id of yours (--env module:id), and some "
-                "commands take the file of a plant (--plant)"
+                f"{env_id} has no plant of its own: register_plant makes an id of yours (--env module:id), some "
+                "commands take the file of a plant (--plant), and ncs_gym.Networked puts a network without a shield "
+                "around any environment"
             )
         raise ValueError(
             f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "

@@ -84,7 +84,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the
-    process. Truncation is `TimeLimit`'s, or that environment's.
+    process. Truncation is that of the `TimeLimit` around, or that environment's own.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
     States and inputs are deviations from the plant's operating point, if it has one (`plant.from_deviation`).
@@ -481,5 +481,8 @@ def ncs_env(env: gym.Env) -> NCSEnv:
     """
     inner = env.unwrapped
     if not isinstance(inner, NCSEnv):
-        raise ValueError(f"expected an NCSEnv inside, got {type(inner).__name__}")
+        raise ValueError(
+            f"expected an NCSEnv inside, got {type(inner).__name__}, which has no plant: ncs_gym.Networked puts a "
+            "network without a shield around any environment"
+        )
     return inner

@@ -82,7 +82,8 @@ class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
         self._inner.request(bool(asked))
         observation, reward, terminated, truncated, info = self.env.step(inputs)
         sent, self._packets = info["packets"] - self._packets, info["packets"]
-        return self._seen(observation), float(reward) - self.cost * sent, terminated, truncated, info
+        reward = np.asarray(reward, np.float64).item() - self.cost * sent
+        return self._seen(observation), reward, terminated, truncated, info
 
     def _seen(self, observation: np.ndarray) -> np.ndarray:
         more = np.minimum(self._inner.request_state, self._most)
@@ -123,7 +124,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         # gymnasium's annotation leaves out the lists that its own vector environments take.
         observations, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorRequestActions")
-        self._packets = info["packets"]
+        self._packets = info["packets"].copy()
         return self._seen(observations), info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -136,7 +137,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         self._inner.request(asked)
         observations, rewards, terminated, truncated, info = self.env.step(inputs)
         sent = np.maximum(info["packets"] - self._packets, 0)  # nothing in a step that only begins an episode
-        self._packets = info["packets"]
+        self._packets = info["packets"].copy()
         return self._seen(observations), rewards - self.cost * sent, terminated, truncated, info
 
     def _seen(self, observations: np.ndarray) -> np.ndarray:

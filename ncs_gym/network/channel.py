@@ -16,6 +16,8 @@ from ncs_gym.validation import as_count, as_flag, as_number, counted, read_only,
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
+# Share of steps in which the newest sample may be older than it usually is.
+UNUSUAL = 0.05
 
 
 class Packet(NamedTuple):
@@ -123,15 +125,17 @@ class Channel:
     @cached_property
     def mean_loss(self) -> float:
         """Long-run share of samples that are lost, one every `send_period` steps."""
-        bursts = (
-            self.loss
-            if isinstance(self.loss, GilbertElliott)
-            else GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=self.loss)
-        )
+        bursts = self._bursts
         if self.max_consecutive_losses is None:
             bad = bursts.stationary_bad
             return (1.0 - bad) * bursts.loss_good + bad * bursts.loss_bad
         return _mean_loss(bursts, self.send_period, self.max_consecutive_losses)
+
+    @property
+    def _bursts(self) -> GilbertElliott:
+        if isinstance(self.loss, GilbertElliott):
+            return self.loss
+        return GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=self.loss)
 
     @property
     def longest_delay(self) -> int:
@@ -147,6 +151,22 @@ class Channel:
         """
         losses = self.most_consecutive_losses
         return None if losses is None else (losses + 1) * self.send_period + self.longest_delay - 1
+
+    @property
+    def usual_age(self) -> int:
+        """An age that the newest sample exceeds in at most `UNUSUAL` of the steps, by losses in a row alone [steps].
+
+        That of no losses where they do not end, or last for longer than 1000 steps.
+        """
+        bursts, bad = self._bursts, self._bursts.stationary_bad
+        shares, N = np.array([1.0 - bad, bad]), _chain(bursts, self.send_period) * [bursts.loss_good, bursts.loss_bad]
+        shares = shares @ N
+        ages = range(self.send_period + self.longest_delay - 1, LONGEST_DELAY + 1, self.send_period)
+        for age in ages:
+            if shares.sum() <= UNUSUAL:
+                return age
+            shares = shares @ N
+        return ages.start
 
     @property
     def description(self) -> str:
@@ -184,14 +204,19 @@ def widest(channels: Sequence[Channel]) -> Channel:
     return replace(max(channels, key=oldest), quantization_step=coarsest)
 
 
+def _chain(bursts: GilbertElliott, period: int) -> np.ndarray:
+    """Returns the transition matrix of bursts from one packet to the next, shape (2, 2)."""
+    good, bad = bursts.p_good_to_bad, bursts.p_bad_to_good
+    return np.linalg.matrix_power(np.array([[1.0 - good, good], [bad, 1.0 - bad]]), period)
+
+
 def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     """Returns the long-run share of packets that are lost, of one every so many steps and at most `most` in a row.
 
     It is that of a cycle from one arrival to the next. With M the chain from one packet to the next and N its part with
     a loss, a cycle that begins in the states a has on average a (1 + N + .. + N^most) 1 packets, one of which arrives.
     """
-    good, bad = bursts.p_good_to_bad, bursts.p_bad_to_good
-    M = np.linalg.matrix_power(np.array([[1.0 - good, good], [bad, 1.0 - bad]]), period)
+    M = _chain(bursts, period)
     N = M * [bursts.loss_good, bursts.loss_bad]
     stacked = np.linalg.matrix_power(np.block([[N, np.eye(2)], [np.zeros((2, 2)), np.eye(2)]]), most)
     last, before = stacked[:2, :2], stacked[:2, 2:]  # N^most, and the sum of the powers below it
@@ -305,8 +330,19 @@ class TraceChannel(Channel):
         """
         if self.on_request or self.max_consecutive_losses is None:
             return super().oldest_age
+        return int(self._replay().max())
+
+    @property
+    def usual_age(self) -> int:
+        """An age that the newest sample exceeds in at most `UNUSUAL` of the steps of a replay [steps]."""
+        if self.on_request or self.oldest_age is None:
+            return super().usual_age
+        return int(np.quantile(self._replay(), 1.0 - UNUSUAL, method="higher"))
+
+    def _replay(self) -> np.ndarray:
+        """Returns the ages of the newest sample of a replay that goes around twice, shape (steps,) [steps]."""
         around = len(self.trace) * self.send_period
-        return int(replayed_ages(self.delays, self.send_period, 2 * around + self.longest_delay).max())
+        return replayed_ages(self.delays, self.send_period, 2 * around + self.longest_delay)
 
     @property
     def description(self) -> str:

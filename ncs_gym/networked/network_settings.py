@@ -130,8 +130,8 @@ class NetworkSettings:
             )
 
     def _memory(self) -> int:
-        """Returns how many actions the newest sample may lack: what the contracts allow, or without any the delays."""
-        ages = [largest_age(contract_of(each), each.longest_delay + each.send_period - 1) for each in self.channels]
+        """Returns how many actions the newest sample may lack: what the contracts allow, or the usual age."""
+        ages = [largest_age(contract_of(each), each.usual_age) for each in self.channels]
         if self.downlink is None:
             return max(*ages, 1)
         # In a queue what takes longest waits for those that have overtaken it, but for one that arrives after it.

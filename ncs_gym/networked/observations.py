@@ -158,7 +158,7 @@ class Entries:
         self.names, self._inner, self._actions = several, observations, actions
         made = {
             "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),
-            "arrived": lambda: spaces.MultiBinary(parts),
+            "arrived": lambda: spaces.Box(0, 1, (parts,), np.int8),
             "pending_actions": lambda: pending_space(actions, pending),
         }
         added = {name: made[name]() for name in self.names}
@@ -200,41 +200,34 @@ class Entries:
         values = {
             "age": lambda: np.minimum(age, OLDEST_OBSERVED).astype(np.float32),
             "arrived": lambda: np.asarray(arrived, np.int8),
-            "pending_actions": lambda: self._within_limits(np.array(pending)),  # the network writes on into its own
+            "pending_actions": lambda: self._told(np.array(pending)),  # the network writes on into its own
         }
         added = {name: values[name]() for name in self.names}
         if self._is_flat:
             lead = np.shape(observation)[:-1]
-            flat = [self._flattened(name, each).reshape(*lead, -1) for name, each in added.items()]
+            flat = [each.reshape(*lead, -1) for each in added.values()]
             return np.concatenate([observation, *flat], axis=-1, dtype=self.space.dtype, casting="unsafe")  # type: ignore[call-overload]
         if isinstance(self._inner, spaces.Tuple):
             return (*observation, *added.values())
         own = observation if isinstance(self._inner, spaces.Dict) else {"observation": observation}
         return {**own, **added}
 
-    def _within_limits(self, actions: np.ndarray) -> np.ndarray:
-        """Returns actions as the space of observations has them: what is beyond limits was sent like that."""
-        if not isinstance(self._actions, spaces.Box):
-            return actions
-        return np.clip(actions, self._actions.low, self._actions.high)
-
-    def _flattened(self, name: str, value: Any) -> np.ndarray:
-        """Returns what `gymnasium.spaces.flatten` makes of a value, of N values at once."""
-        if name != "pending_actions" or not isinstance(self._actions, spaces.Discrete | spaces.MultiDiscrete):
-            return np.asarray(value)
-        counts = self._actions.n if isinstance(self._actions, spaces.Discrete) else self._actions.nvec
-        counts, start = np.atleast_1d(counts), np.atleast_1d(self._actions.start)
-        number = np.asarray(value).reshape(*np.shape(value)[: np.ndim(value) - self._actions_ndim], -1) - start
-        one_hot = [np.arange(n) == number[..., index, None] for index, n in enumerate(counts.tolist())]
-        return np.concatenate(one_hot, axis=-1)
-
-    @property
-    def _actions_ndim(self) -> int:
-        return len(self._actions.shape or ())
+    def _told(self, actions: np.ndarray) -> np.ndarray:
+        """Returns pending actions as `pending_space` has them, also where they were sent beyond their limits."""
+        space = self._actions
+        if isinstance(space, spaces.Box):
+            return np.clip(actions, space.low, space.high)
+        entries = actions.reshape(*actions.shape[: actions.ndim - len(space.shape or ())], -1)
+        if isinstance(space, spaces.MultiBinary):
+            return entries.astype(np.int8)
+        counts = space.n if isinstance(space, spaces.Discrete) else space.nvec  # type: ignore[union-attr]
+        numbers = entries - np.ravel(space.start)  # type: ignore[union-attr]
+        one_hot = [np.arange(n) == numbers[..., k, None] for k, n in enumerate(np.ravel(counts).tolist())]
+        return np.concatenate(one_hot, axis=-1, dtype=np.int8)
 
 
-def pending_space(actions: spaces.Space, pending: int) -> spaces.Space:
-    """Returns the space of so many actions.
+def pending_space(actions: spaces.Space, pending: int) -> spaces.Box:
+    """Returns the space of so many actions, the first axis; those that are no numbers as vectors of zeros and ones.
 
     Raises:
         ValueError: If the actions are of a kind that is not told as an array.
@@ -242,10 +235,6 @@ def pending_space(actions: spaces.Space, pending: int) -> spaces.Space:
     if isinstance(actions, spaces.Box):
         low, high = (np.broadcast_to(end, (pending, *actions.shape)) for end in (actions.low, actions.high))
         return spaces.Box(low, high, dtype=actions.dtype)  # type: ignore[arg-type]
-    if isinstance(actions, spaces.Discrete):
-        return spaces.MultiDiscrete(np.full(pending, actions.n), start=np.full(pending, actions.start))
-    if isinstance(actions, spaces.MultiDiscrete):
-        return spaces.MultiDiscrete(np.tile(actions.nvec, (pending, 1)), start=np.tile(actions.start, (pending, 1)))
-    if isinstance(actions, spaces.MultiBinary):
-        return spaces.MultiBinary((pending, *actions.shape))
+    if isinstance(actions, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        return spaces.Box(0, 1, (pending, spaces.flatdim(actions)), np.int8)
     raise ValueError(f"pending_actions are for actions that are one array, got {shown(actions)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -67,9 +68,9 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             arrive at once. Ideal by default.
         downlink: The network of the actions (loss, delay, jitter and `max_consecutive_losses`); ideal by default.
         observe: Entries that are added to observations: "age" of the newest sample [steps, at most 1,000], "arrived",
-            and "pending_actions", the last ones decided, within their limits. A flat observation of floats becomes
-            longer, a `Dict` gets keys and a `Tuple` entries of these names; another one becomes a `Dict` with the key
-            "observation".
+            and "pending_actions", the last ones decided, within their limits, discrete ones as one-hot vectors; each is
+            a `Box`. A flat observation of floats becomes longer, a `Dict` gets keys and a `Tuple` entries of these
+            names; another one becomes a `Dict` with the key "observation".
         fill: What is seen where nothing new arrived: "last", the newest sample that did, or "zero". Or a function
             (last, age, actions) -> observation that predicts the present one wherever the newest sample is older: it
             is given that sample, its age and the last `pending` actions decided, oldest first (a list where actions are
@@ -81,7 +82,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         neutral: The action before the first command arrives; the zero of the actions by default, and needed behind a
             downlink where they have none.
         pending: How many of the last actions are kept; by default as many as the contracts of both channels allow the
-            newest sample to lack, or the delays where there is no contract (in a "queue" with what commands wait).
+            newest sample to lack, or where there is no contract as it lacks in 95 % of the steps (of a downlink those
+            of its delays, in a "queue" with what commands wait).
         delay_reward: Whether rewards travel with samples: the agent gets what was earned until the newest one was
             taken, and at the end of an episode the rest. A `TimeLimit` belongs inside: of an end outside nobody knows.
 
@@ -215,7 +217,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
                 "nothing but the first observation; put RequestActions around Networked, or call request before steps",
                 UserWarning,
             )
-        self._earned += float(reward) if settings.delay_reward else 0.0
+        self._earned += np.asarray(reward, np.float64).item() if settings.delay_reward else 0.0
         sample = None
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             link, packet = arrivals.link, None
@@ -300,7 +302,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             "action_age": action_age,
             "action_applied": snapshot(applied),
             "packets": self._packets,
-            **self._network,
+            **deepcopy(self._network),
         }
 
     def _by_part(self, values: list[Any]) -> Any:

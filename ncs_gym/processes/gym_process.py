@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.wrappers import TimeLimit
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
@@ -30,7 +31,7 @@ class GymProcess(Process):
     | start | drawn by `write_state` from `initial_set` or the option "state"; without it wherever the reset left it |
     | step | one `step` with the input as an action; reward and observation are not used |
     | disturbance | `write_state` with the next state plus d; without it none is added |
-    | termination, truncation | those of the control loop in that step |
+    | termination, truncation | those of the control loop in that step; a `TimeLimit` inside is taken off |
 
     In vectors one inner environment per episode is stepped in a loop.
 
@@ -90,7 +91,7 @@ class OpenedEnv(Process):
         env = process.make()
         if not isinstance(env, gym.Env):
             raise ValueError(f"GymProcess: make must return a gymnasium.Env, got {shown(env)}")
-        self.env: gym.Env = env
+        self.env: gym.Env = _without_time_limits(env)
         self._has_started = False
         try:
             self._dtype, self._shape = self._action_form(env.action_space, plant)
@@ -167,6 +168,15 @@ class OpenedEnv(Process):
                 f"{shown(value)}"
             )
         return np.array(state)
+
+
+def _without_time_limits(env: gym.Env) -> gym.Env:
+    """Returns an environment without its time limits: the control loop has one of its own."""
+    if isinstance(env, TimeLimit):
+        return _without_time_limits(env.env)
+    if isinstance(env, gym.Wrapper):
+        env.env = _without_time_limits(env.env)
+    return env
 
 
 class _OpenedEnvs(Process):

@@ -10,14 +10,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import ReadOnlyArrays, guarded, shown
+from ncs_gym.validation import ReadOnlyArrays, guarded, shown, storing_nothing
 
 
 class Task(ReadOnlyArrays, ABC):
     """A reward, and perfectly known extra entries of the observation.
 
     `begin` draws the task's state for an episode, `advance` moves it one step; neither stores anything in the settings,
-    so that one object serves any number of environments.
+    so that one object serves any number of environments; a vector environment refuses what does.
 
     Attributes:
         vectorized: Whether the methods also take arrays whose last axis is the environment, `begin` with a `size`. It
@@ -71,12 +71,13 @@ class Task(ReadOnlyArrays, ABC):
 
     def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
         """Returns the task states of `count` episodes along the last axis."""
-        if self.vectorized:
-            return self.begin(rng, plant, count)
-        states = np.empty(count, dtype=object)
-        for episode in range(count):
-            states[episode] = self.begin(rng, plant)
-        return states
+        with storing_nothing(self):
+            if self.vectorized:
+                return self.begin(rng, plant, count)
+            states = np.empty(count, dtype=object)
+            for episode in range(count):
+                states[episode] = self.begin(rng, plant)
+            return states
 
     def advance_many(
         self, rng: np.random.Generator, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray
@@ -85,8 +86,9 @@ class Task(ReadOnlyArrays, ABC):
         if self.vectorized:
             return self.advance(rng, plant, task_state, u)
         moved = np.empty_like(task_state)
-        for episode, (each, own) in enumerate(zip(task_state, u.T, strict=True)):
-            moved[episode] = self.advance(rng, plant, each, own)
+        with storing_nothing(self):
+            for episode, (each, own) in enumerate(zip(task_state, u.T, strict=True)):
+                moved[episode] = self.advance(rng, plant, each, own)
         return moved
 
     def predict_one(self, plant: LinearPlant, task_state: Any, u: np.ndarray) -> Any:
@@ -132,7 +134,8 @@ class Task(ReadOnlyArrays, ABC):
         state = guarded(state)
         if not self.vectorized:
             each = zip(task_state, state.T, u.T, strict=True)
-            return np.array([self.reward_one(plant, own, x, applied) for own, x, applied in each])
+            with storing_nothing(self):
+                return np.array([self.reward_one(plant, own, x, applied) for own, x, applied in each])
         rewards = np.array(self.reward(plant, task_state, state, u))
         if rewards.shape != u.shape[1:] or rewards.dtype.kind not in "fiu" or np.isnan(rewards).any():
             raise ValueError(

@@ -26,6 +26,7 @@ from ncs_gym.validation import (
     as_setting,
     as_vector,
     shown,
+    storing_nothing,
 )
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.
@@ -41,8 +42,9 @@ class Disturbance(ReadOnlyArrays, ABC):
     """A disturbance in the ball d'd <= gamma plus `disturbance_bound`; truncated process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
-    settings, so that one object serves any number of environments. The class attributes below are never inherited: a
-    subclass that overrides a method without declaring them anew is called for one environment at a time.
+    settings, so that one object serves any number of environments; a vector environment refuses what does. The class
+    attributes below are never inherited: a subclass that overrides a method without declaring them anew is called for
+    one environment at a time.
 
     Attributes:
         replaces_process_noise: Whether the whole of E(D) is used, process noise included. The environment checks what
@@ -82,12 +84,13 @@ class Disturbance(ReadOnlyArrays, ABC):
 
     def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
         """Returns the memories of `count` episodes along the last axis."""
-        if self.vectorized:
-            return self.begin(rng, plant, count)
-        memories = np.empty(count, dtype=object)
-        for episode in range(count):
-            memories[episode] = self.begin(rng, plant)
-        return memories
+        with storing_nothing(self):
+            if self.vectorized:
+                return self.begin(rng, plant, count)
+            memories = np.empty(count, dtype=object)
+            for episode in range(count):
+                memories[episode] = self.begin(rng, plant)
+            return memories
 
     def draw_many(
         self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, steps: np.ndarray, memory: Any
@@ -96,8 +99,8 @@ class Disturbance(ReadOnlyArrays, ABC):
         if self.vectorized:
             return self.draw(rng, plant, nominal_next, steps, memory)
         each = zip(nominal_next.T, steps.tolist(), memory, strict=True)
-        drawn = np.array([self.draw(rng, plant, nominal, step, own) for nominal, step, own in each])
-        return drawn.T
+        with storing_nothing(self):
+            return np.array([self.draw(rng, plant, nominal, step, own) for nominal, step, own in each]).T
 
     def check(self, plant: LinearPlant) -> str:
         """Returns why this disturbance does not fit the plant, or an empty string."""

@@ -203,16 +203,15 @@ def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(train
     others["zero input"]["eval_return_mean"] = -60.0
     summary = {"arms": {"unshielded": others["unshielded"], "shielded": arm}, "references": others}
     findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    nothing = [line for line in findings if "shielded: nothing was overridden" in line]
+    nothing = [line for line in findings if "shielded: all that was proposed was safe" in line]
     assert len(nothing) == (trained == evaluated == 0.0)
-    assert not any("train longer" in line for line in nothing)  # of what is not trained
     arm["train_steps"] = 100
     findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    assert any("train longer" in line for line in findings) == bool(nothing)
+    assert not any("train" in line for line in findings)  # nobody knows that it would change anything
     elsewhere = arm | {"conditions": {"attacked": {"intervention_rate": 0.1}}}
     several = summary | {"arms": summary["arms"] | {"shielded": elsewhere}}
     findings = findings_of(several | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    assert not any("nothing was overridden" in line for line in findings)
+    assert not any("all that was proposed was safe" in line for line in findings)
     findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
     assert any("came to 0.707 times the safe set" in line for line in findings) == (not nothing)  # x'Mx is 0.5
     assert any("covers" in line for line in findings) == (trained > 0.0)

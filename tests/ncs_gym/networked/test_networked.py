@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import DelayObservation, TimeLimit, TransformReward
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from ncs_gym import (
     Channel,
@@ -197,6 +198,62 @@ def test_entries_of_other_observations_have_names():
         Networked(Networked(Counter("dict"), LATE, observe=("age",)), observe=("age",))
 
 
+@pytest.mark.parametrize(
+    ("actions", "size"),
+    [
+        (spaces.Discrete(3, start=-1), 3),
+        (spaces.MultiDiscrete([2, 3], start=[4, 0]), 5),
+        (spaces.MultiBinary(3), 3),
+        (spaces.Box(-1.0, 1.0, (2,), np.float32), 2),
+    ],
+)
+@pytest.mark.parametrize("kind", ["image", "dict", "vector"])
+def test_entries_are_boxes_that_gymnasium_flattens_likewise_and_frames_can_be_stacked(kind, actions, size):
+    class Acting(Counter):
+        action_space = actions
+
+        def step(self, action):
+            return super().step([0.0])
+
+    class OfPixels(Acting):
+        observation_space = spaces.Dict(image=spaces.Box(0, 255, (84, 84, 4), np.uint8))
+
+        def __init__(self):
+            super().__init__("image")
+            self.observation_space = OfPixels.observation_space
+
+        def _observation(self):
+            return {"image": super()._observation()}
+
+    def make():
+        inner = OfPixels() if kind == "dict" else Acting(kind)
+        return Networked(inner, LATE, observe=("age", "arrived", "pending_actions"), pending=2)
+
+    env = make()
+    env.action_space.seed(1)
+    env.reset(seed=0)
+    sent = [env.action_space.sample() for _ in range(5)]
+    seen = [env.step(action)[0] for action in sent][-1]
+    flat = [spaces.flatten(actions, action) for action in sent[-2:]]
+    if kind == "vector":
+        np.testing.assert_array_equal(seen[-2 * size :], np.ravel(flat))
+    else:
+        assert all(isinstance(env.observation_space[name], spaces.Box) for name in seen)
+        np.testing.assert_array_equal(seen["pending_actions"], flat)
+    many = VectorNetworked(SyncVectorEnv([Acting]), LATE, observe="pending_actions", pending=2)
+    many.reset(seed=0)
+    told = [many.step(np.array([action]))[0] for action in sent][-1]
+    np.testing.assert_array_equal(told[0, -2 * size :], np.ravel(flat))
+    frames = VecFrameStack(DummyVecEnv([make]), 3)
+    frames.reset()
+    assert frames.observation_space.contains(unstacked(frames.step([sent[0]])[0]))
+
+
+def unstacked(observations):
+    """The observation of the only environment of stable-baselines3."""
+    return {key: each[0] for key, each in observations.items()} if isinstance(observations, dict) else observations[0]
+
+
 @pytest.mark.parametrize("channel", [Channel(loss=0.3, delay=2, jitter=3), Channel(delay=3), Channel(delay=9)])
 @pytest.mark.parametrize("kind", ["image", "buffers"])  # three buffers in turn
 def test_large_observations_are_what_they_were_when_they_were_taken(kind, channel):
@@ -267,6 +324,24 @@ def test_rewards_travel_with_samples_if_asked_to_and_nothing_is_lost():
     for k, each in enumerate(later[1:-1], 1):
         newest = k - each[-1]["measurement_age"]
         assert sum(other[1] for other in later[1 : k + 1]) == sum(range(1, newest + 1))
+
+
+def test_rewards_may_be_arrays_of_one_number():
+    class Paying(Counter):
+        def step(self, action):
+            seen, reward, *rest = super().step(action)
+            return seen, np.array([reward], np.float32), *rest
+
+    def paid(make, settings):
+        return [each[1] for each in run(Networked(make(), Channel(delay=1), **settings), 6)[1:]]
+
+    assert (
+        paid(Paying, {"delay_reward": True}) == paid(Counter, {"delay_reward": True}) == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    )
+    assert paid(Paying, {}) == paid(Counter, {})  # passed on as they are
+    asked = RequestActions(Networked(Paying(), Channel(on_request=True)), cost=0.5)
+    asked.reset(seed=0)
+    assert [asked.step(np.ones(2))[1] for _ in range(2)] == [0.5, 1.5]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -599,19 +674,48 @@ def test_number_zero_of_a_list_is_no_neutral_action(actions):
     assert Networked(env, downlink=Channel(delay=1), neutral=actions.sample()).neutral is not None
 
 
+@pytest.mark.parametrize(
+    "channel",
+    [
+        Channel(loss=0.3),
+        Channel(loss=0.6, delay=1, send_period=3),
+        Channel(loss=GilbertElliott(p_good_to_bad=0.25, p_bad_to_good=0.25)),
+        Channel(loss=GilbertElliott(p_good_to_bad=0.02, p_bad_to_good=0.1, loss_good=0.1, loss_bad=0.9), delay=2),
+    ],
+)
+def test_pending_actions_are_all_that_the_newest_sample_usually_lacks(channel):
+    assert channel.oldest_age is None  # no contract says how many
+    envs = VectorNetworked(SyncVectorEnv([Counter] * 20), channel, observe="pending_actions")
+    envs.reset(seed=0)
+    ages = np.array([envs.step(np.zeros((20, 1)))[-1]["measurement_age"] for _ in range(2000)][1000:])
+    assert 0.005 < np.mean(ages > envs.pending) < 0.07
+    assert np.mean(ages > envs.pending / 2) > 0.05  # no more of them than that takes
+
+
+def test_records_of_long_outages_say_what_is_usual():
+    trace = (0,) * 24_000 + (-1,) * 1_100 + (0, -1, -1, -1) * 2_500  # 7 % of the ages are 3, and 3 % more
+    assert Networked(Counter(), TraceChannel(trace=trace)).pending == 3
+
+
+def test_where_hardly_anything_arrives_the_delays_say_how_many_actions_are_pending():
+    staying = GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=0.9999)
+    for loss in (1.0, staying):
+        assert Networked(Counter(), Channel(loss=loss, delay=3, send_period=2)).pending == 4
+
+
 def test_predictor_that_lacks_actions_is_told_of_once():
     def steps(env):
         env.reset(seed=0)
         for _ in range(30):
             env.step(np.zeros(env.action_space.shape))
 
-    channel, settings = Channel(delay=1, loss=0.5), {"fill": lambda last, *_: last}
+    channel, settings = Channel(delay=1, loss=0.5), {"fill": lambda last, *_: last, "pending": 1}
     many = VectorNetworked(gym.vector.SyncVectorEnv([Counter] * 2), channel, **settings)
     for env in (Networked(Counter(), channel, **settings), many):
         with pytest.warns(UserWarning, match="is 2 steps old, and the predictor is given the last 1 action") as told:
             steps(env)
         assert len(told) == 1
-    steps(Networked(Counter(), channel, pending=30, **settings))
+    steps(Networked(Counter(), channel, **settings | {"pending": 30}))
 
 
 def test_pending_actions_are_told_within_their_limits():

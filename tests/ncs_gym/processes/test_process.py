@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
+from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from ncs_gym import (
     AdversarialDisturbance,
@@ -154,6 +155,26 @@ def test_inner_end_of_an_episode_is_that_of_the_loop():
         env.step(np.zeros(1))
     env.reset(options={"state": [0.9, 0.9]})
     assert env.step(np.zeros(1))[2:4] == (True, False)
+
+
+def test_time_limit_inside_is_not_that_of_the_loop():
+    """Of the environment inside only its own ends count, wherever it has a `TimeLimit`."""
+
+    def make():
+        return OrderEnforcing(TimeLimit(OrderEnforcing(TimeLimit(Inner(), 3)), 4))
+
+    process = GymProcess(make, read_state=lambda env: env.unwrapped.state)
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant(), process=process, max_episode_steps=7)
+    many = gym.make_vec("ncs_gym/LinearNCS-v0", 2, plant=plant(), process=process, max_episode_steps=7)
+    env.reset(seed=0)
+    many.reset(seed=0)
+    for k in range(7):
+        assert env.step(np.zeros(1))[2:4] == (False, k == 6)
+        assert many.step(np.zeros((2, 1)))[3].tolist() == [k == 6] * 2
+    swinging = GymProcess(lambda: gym.make("Pendulum-v1"), read_state=lambda env: env.unwrapped.state)
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant(), process=swinging, max_episode_steps=450)
+    env.reset(seed=0)
+    assert [env.step(np.zeros(1))[3] for _ in range(450)] == [False] * 449 + [True]
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])

@@ -1,11 +1,11 @@
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, LinearPlant, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
+from ncs_gym import Channel, Disturbance, LinearPlant, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
 from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
 
 
@@ -245,3 +245,110 @@ def test_what_a_task_begins_with_stays_its_own_and_as_it_was_drawn(pays):
         assert ((seen[2:] >= 0.2) & (seen[2:] <= 0.8)).all()
     else:
         np.testing.assert_array_equal(seen, [-0.5, 0.0, -0.5, 0.0])
+
+
+class Smooth(Paying):
+    """Remembers something in itself, as `how` says, when `moment` comes."""
+
+    def __init__(self, how, moment):
+        self.how, self.moment, self.count, self.seen, self.last = how, moment, 0, [], np.zeros(1)
+
+    def remember(self, moment, u):
+        if self.moment == moment:
+            self.how(self, u)
+
+    def begin(self, rng, plant, size=None):
+        self.remember("begin", np.ones(1))
+        return super().begin(rng, plant, size)
+
+    def advance(self, rng, plant, task_state, u):
+        self.remember("advance", u)
+        return task_state
+
+    def reward(self, plant, task_state, state, u):
+        self.remember("reward", u)
+        return -float(np.sum(state * self.weights))
+
+    @cached_property
+    def weights(self):
+        """Computed once, which is no memory of an episode."""
+        return np.ones((2, *[1] * (type(self) is SmoothMany)))
+
+
+class SmoothMany(Smooth):
+    vectorized = True
+
+    def reward(self, plant, task_state, state, u):
+        return -np.sum(state * self.weights, axis=0)
+
+
+def count(task, u):
+    task.count += 1
+
+
+def replace_last(task, u):
+    task.last = u.copy()
+
+
+def write_last(task, u):
+    task.last[:] = u[:1]
+
+
+def add(task, u):
+    task.seen.append(u)
+
+
+def name_anew(task, u):
+    task.previous = u
+
+
+REMEMBERED = {count: "count", replace_last: "last", write_last: "last", add: "seen", name_anew: "previous"}
+
+
+@pytest.mark.parametrize("how", REMEMBERED)
+@pytest.mark.parametrize(
+    ("kind", "moment"), [(Smooth, "begin"), (Smooth, "advance"), (Smooth, "reward"), (SmoothMany, "begin")]
+)
+def test_what_a_task_stores_in_itself_is_refused_where_environments_share_it(kind, how, moment):
+    settings = {"plant": truck_trailer(mass=4000.0), "task": kind(how, moment)}
+    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, **settings)
+    message = f"{kind.__name__} stores '{REMEMBERED[how]}' in itself, which all environments of a vector share"
+    if moment != "begin":
+        envs.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        envs.reset(seed=0) if moment == "begin" else envs.step(np.ones((3, 1), np.float32))
+    if kind is Smooth:
+        env = gym.make("ncs_gym/LinearNCS-v0", **settings)
+        env.reset(seed=0)
+        env.step(np.ones(1, np.float32))
+
+
+@pytest.mark.parametrize("kind", [Smooth, SmoothMany])
+def test_what_a_task_computes_once_is_not_refused(kind):
+    envs = gym.make_vec("ncs_gym/LinearNCS-v0", 3, plant=truck_trailer(mass=4000.0), task=kind(count, "never"))
+    envs.reset(seed=0)
+    envs.step(np.ones((3, 1), np.float32))
+
+
+class Drifting(Disturbance):
+    """A disturbance that remembers in itself where it is."""
+
+    def __init__(self, at_start):
+        self.at_start, self.at = at_start, 0.0
+
+    def begin(self, rng, plant, size=None):
+        self.at = 0.0 if self.at_start else self.at
+
+    def draw(self, rng, plant, nominal_next, step, memory):
+        self.at += 1e-6
+        return np.zeros(plant.n)
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_what_a_disturbance_stores_in_itself_is_refused_where_environments_share_it(at_start):
+    settings = {"plant": truck_trailer(mass=4000.0), "disturbance": Drifting(at_start)}
+    gym.make("ncs_gym/LinearNCS-v0", **settings).reset(seed=0)
+    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, **settings)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match="Drifting stores 'at' in itself, which all environments of a vector share"):
+        envs.step(np.ones((3, 1), np.float32))
