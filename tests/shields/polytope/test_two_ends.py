@@ -349,15 +349,6 @@ def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
         assert "polytope: its first rows are those of the safe box" in broken(forged, plant)
 
 
-def test_plants_that_differ_have_different_fingerprints_also_where_their_numbers_are_the_same():
-    """Three states, inputs and limits: two ends of rows and low ends of inputs are as many numbers as a gain has."""
-    model = {"A": 0.9 * np.eye(3), "B": np.eye(3), "dt": 1.0, "disturbance_bound": 0.01} | QUIET
-    ends = LinearPlant(**model, state_limits=(-1.6, 0.4), input_limits=(-0.2, 1.0))
-    numbers = np.concatenate([ends.box_ends.ravel(), ends.input_low]).reshape(3, 3)
-    gained = LinearPlant(**model, box=ends.box, u_max=ends.input_high, error_gain=numbers)
-    assert ends.fingerprint != gained.fingerprint
-
-
 def test_operating_point_that_a_disturbance_moves_is_told():
     with pytest.warns(MovedOperatingPointWarning, match=r"deviations are counted from the state \[.*\] and the input"):
         LinearPlant(
