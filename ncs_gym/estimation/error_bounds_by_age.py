@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.estimation.error_sets import ErrorSetsByAge, congruence_sum
+from ncs_gym.estimation.error_sets import ErrorSetError, ErrorSetsByAge, congruence_sum
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
@@ -30,13 +30,17 @@ THINNEST = 1e-5
 LARGEST = 1e6
 
 
-def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
-    """Returns error sets by age, without a solver; None if the iteration finds none, or none that float64 can hold."""
+def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge:
+    """Returns error sets by age, without a solver.
+
+    Raises:
+        ErrorSetError: If the iteration finds none, or none that float64 can hold; it says what was met.
+    """
     with np.errstate(all="ignore"):
         try:
             return _iterated_sets(plant, contract)
         except np.linalg.LinAlgError:
-            return None
+            raise ErrorSetError("the numbers of the sets are out of reach of float64") from None
 
 
 def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
@@ -49,8 +53,8 @@ def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
     )
 
 
-def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
-    """Returns error sets by age; None if the iteration finds none.
+def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge:
+    """Returns error sets by age.
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
@@ -59,6 +63,9 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     Args:
         plant: The plant with its bounds.
         contract: The channel's promise.
+
+    Raises:
+        ErrorSetError: If the iteration finds none.
     """
     # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
     inverse = np.linalg.cholesky(plant.weight).T
@@ -73,19 +80,17 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     start, steps = first, contract.max_age + 1
     for turn in range(ITERATIONS):
         shapes = _carried(start, A, D, steps)
-        if not float(np.trace(shapes[-1])) < LARGEST**2:
-            return None
+        _require_bounded(shapes[-1], LARGEST**2, plant, T)
         updates = [_update(shape, H, noise) for shape in shapes[1:]]
         grown = first
         for _, _, shape in reversed(updates):
             grown = joined(grown, shape + rounding)
-        if not float(np.trace(grown)) < LARGEST:
-            return None
+        _require_bounded(grown, LARGEST, plant, T)
         if is_inside(MARGIN * grown, start):
             break
         start = (1.0 + SMALLEST_GROWTH * 2.0 ** (turn / DOUBLING)) * grown
     else:
-        return None
+        raise ErrorSetError(f"the sets did not settle in {ITERATIONS} rounds")
     shapes = _carried(start, A, D, steps)
     gains, multipliers, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
     return ErrorSetsByAge(
@@ -96,6 +101,14 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
         multipliers=np.array(multipliers),
         noise=allowed,
     )
+
+
+def _require_bounded(shape: np.ndarray, largest: float, plant: LinearPlant, T: np.ndarray) -> None:
+    """Raises ErrorSetError, naming a state, unless a set of errors T z has a trace below the largest in z."""
+    if not float(np.trace(shape)) < largest:
+        sizes = np.diag(T @ shape @ T.T) / plant.half_widths**2
+        state = plant.state_names[int(np.argmax(np.nan_to_num(sizes, nan=np.inf)))]
+        raise ErrorSetError(f"the bound on the error of {state} outgrows the safe box by far")
 
 
 def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> list[np.ndarray]:
