@@ -10,6 +10,7 @@ from ncs_gym import exact
 from ncs_gym.estimation.error_sets import ErrorSetError, ErrorSetsByAge, congruence_sum
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
 
 # Digits of sets, relative to their extents, of gains and of rates: what differs between processors beyond them is cut
@@ -26,6 +27,12 @@ MULTIPLIERS = np.round(np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.log
 ITERATIONS = 1000
 # No set is thinner than this in any direction, in units of the weight: an input under way is known exactly.
 THINNEST = 1e-5
+# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts. It
+# is as fast as these units make it: one that has to be fast by the step asks for inputs beyond all limits where steps
+# are short.
+EFFORT, ANSWER = 10.0, 10.0
+# Digits of that regulator.
+REGULATOR_DIGITS = 6
 # Sets this much larger than the safe box are of no use.
 LARGEST = 1e6
 
@@ -58,7 +65,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
-    comes of it, which is (C0), (C1) and (C2). Shares minimize traces in units of the box.
+    comes of it, which is (C0), (C1) and (C2). Shares minimize traces weighted with what errors cost.
 
     Args:
         plant: The plant with its bounds.
@@ -68,7 +75,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
         ErrorSetError: If the iteration finds none.
     """
     # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
-    inverse = np.linalg.cholesky(plant.weight).T
+    inverse = np.linalg.cholesky(_cost(plant)).T
     T = np.linalg.inv(inverse)
     A, H = inverse @ plant.A @ T, plant.H @ T
     D = inverse @ plant.disturbance.shape_matrix @ inverse.T
@@ -109,6 +116,17 @@ def _require_bounded(shape: np.ndarray, largest: float, plant: LinearPlant, T: n
         sizes = np.diag(T @ shape @ T.T) / plant.half_widths**2
         state = plant.state_names[int(np.argmax(np.nan_to_num(sizes, nan=np.inf)))]
         raise ErrorSetError(f"the bound on the error of {state} outgrows the safe box by far")
+
+
+def _cost(plant: LinearPlant) -> np.ndarray:
+    """Returns W, shape (n, n): the size of an error in the box, and that of a regulator's answer to it."""
+    inverse = np.linalg.cholesky(plant.weight).T
+    T = np.linalg.inv(inverse)
+    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.input_half, EFFORT, decay=1.0)
+    if K is None:
+        return plant.weight
+    K = exact.rounded(K @ inverse, REGULATOR_DIGITS)
+    return plant.weight + ANSWER * K.T @ K
 
 
 def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> list[np.ndarray]:
