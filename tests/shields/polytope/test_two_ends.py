@@ -231,6 +231,10 @@ def test_disturbance_with_symmetric_ends_leaves_the_operating_point():
     settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
     both = LinearPlant(**settings, disturbance_bound=([[1.0]], [-0.1], [0.1]))
     assert both.fingerprint == LinearPlant(**settings, disturbance_bound=([[1.0]], 0.1)).fingerprint
+    of_two = LinearPlant(**settings, disturbance_bound=([[1.0, 5.0]], [-0.1, 0.0], [0.1, 0.0]))
+    assert of_two.fingerprint == both.fingerprint, "what is always 0 adds nothing"
+    with pytest.raises(ValueError, match="low <= high"):
+        LinearPlant(**settings, disturbance_bound=([[1.0]], [0.1], [-0.1]))
     with pytest.raises(ValueError, match="no state stays where it is"):
         LinearPlant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
     with pytest.raises(ValueError, match="not strictly within the limits"):

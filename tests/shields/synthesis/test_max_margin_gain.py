@@ -132,9 +132,15 @@ def drone(**changes):
 
 
 def test_sensor_that_is_louder_than_the_box_is_wide_is_named():
-    loud = "the sensor noise of x1 is 2 times as large as x1 gets in the safe box"
+    loud = "the sensor noise of x1 is 200 times as large as x1 gets in the safe box"
     with pytest.raises(Infeasible, match=f"no error set was found, not even for samples of age 0: {loud}"):
-        synthesize(drone(sensor_bound=2.0), contract=ChannelContract(3))
+        synthesize(drone(sensor_bound=200.0), contract=ChannelContract(3))
+
+
+def test_disturbance_that_no_sample_makes_up_for_is_not_blamed_on_what_the_outputs_show():
+    grown = "no error set was found, not even for samples of age 0: the bound on the error of x2 outgrows the safe box"
+    with pytest.raises(Infeasible, match=grown):
+        synthesize(drone(disturbance_bound=[100.0, 5e3]), contract=ChannelContract(3))
 
 
 def test_first_error_that_is_larger_than_the_box_is_named():
