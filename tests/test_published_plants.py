@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import published as script
 from experiments.commands.attack import attacked, worst_case
-from ncs_gym import LinearPlant, NCSVectorEnv
+from ncs_gym import LinearPlant, NCSVectorEnv, certified_error_set
 from shields import VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
@@ -48,3 +48,10 @@ def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
     plant = LinearPlant(A=np.diag([1.25, 0.5]), B=np.eye(2, 1), box=np.diag([0.1, -1.0]), u_max=1.0, **exact)
     assert script.largest_share(plant) == pytest.approx(0.4, abs=0.01)
     assert script.largest_share(replace(plant, box=np.array([[0.1, 0.0]]))) is None
+
+
+@pytest.mark.parametrize("name", ["spacecraft", "tvc_rocket", "propofol", "heli_tondel"])
+def test_error_sets_are_found_where_steps_are_short_or_inputs_weak(name):
+    """A regulator that had to decay by a quarter in every step weighed errors by 1e8 to 1e11 here."""
+    plant, contract = script.plant_of(name), script.contract_of_plant(name)
+    assert certified_error_set(plant, contract).contract == contract

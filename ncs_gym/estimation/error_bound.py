@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age, in_round_numbers
-from ncs_gym.estimation.error_sets import ErrorSet, InvariantErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError, InvariantErrorSet
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.description import outputs_of
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -36,10 +36,6 @@ class UnstablePlantError(ValueError):
     """Without a promise from the channel no error bound exists for a plant that is not Schur stable."""
 
 
-class ErrorSetError(ValueError):
-    """No error set could be computed accurately enough."""
-
-
 def certified_error_set(plant: LinearPlant, contract: ChannelContract | None = None) -> ErrorSet:
     """Returns the error set of a plant: of a stable one without a contract, of any under one.
 
@@ -58,18 +54,23 @@ _known: dict[tuple[str, ChannelContract | None], ErrorSet] = {}
 
 def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns the error sets by age under a contract; see `error_sets_by_age`."""
-    sets = error_sets_by_age(plant, contract)
-    if sets is None:
-        if (unseen := unseen_state(plant.A, plant.H, plant.half_widths, plant.state_names)) is not None:
-            raise ErrorSetError(f"no error set exists: the outputs do not show {unseen}, whose errors never decay")
-        if contract.max_age == 0 or error_sets_by_age(plant, replace(contract, max_age=0)) is None:
-            reason = _loudest_sensor(plant) or _least_shown_state(plant)
-            raise ErrorSetError(f"no error set was found, not even for samples of age 0{reason}")
-        raise ErrorSetError(
-            f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
-        )
+    try:
+        sets = error_sets_by_age(plant, contract)
+    except ErrorSetError:
+        raise ErrorSetError(_why_no_set(plant, contract)) from None
     require_error_set(sets, plant)
     return _round_if_it_holds(in_round_numbers(sets), sets, plant)
+
+
+def _why_no_set(plant: LinearPlant, contract: ChannelContract) -> str:
+    """Returns what an error says of a plant for which no sets are found under a contract."""
+    if (unseen := unseen_state(plant.A, plant.H, plant.half_widths, plant.state_names)) is not None:
+        return f"no error set exists: the outputs do not show {unseen}, whose errors never decay"
+    try:
+        error_sets_by_age(plant, replace(contract, max_age=0))
+    except ErrorSetError as none:
+        return f"no error set was found, not even for samples of age 0: {_loudest_sensor(plant) or none}"
+    return f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
 
 
 def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -> ErrorSet:
@@ -92,36 +93,24 @@ def unseen_state(A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequen
         widths: How large each state gets, shape (n,): their units.
         names: Of the states, n of them.
     """
-    shown, state = min(_persistent_modes(A, H, widths, names), default=(1.0, ""))
-    return state if shown <= UNDETECTABLE else None
+    A, H = A * widths / widths[:, None], H * widths
+    H = H / np.maximum(np.abs(H).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    for mode in np.linalg.eigvals(A):
+        if abs(mode) >= 1.0 - UNDETECTABLE:
+            _, shown, directions = np.linalg.svd(np.vstack([A - mode * np.eye(len(A)), H]))
+            if shown[-1] <= UNDETECTABLE * shown[0]:
+                return names[int(np.argmax(np.abs(directions[-1])))]
+    return None
 
 
 def _loudest_sensor(plant: LinearPlant) -> str:
-    """Returns which output is drowned in noise, as the rest of a sentence; an empty string if none is."""
+    """Returns which output is drowned in noise, as a sentence; an empty string if none is."""
     reach = np.abs(plant.H) @ plant.half_widths
     times = np.sqrt(np.diag(plant.sensor_error.shape_matrix)) / np.maximum(reach, np.finfo(float).tiny)
     j, (names, _) = int(np.argmax(times)), outputs_of(plant)
     if times[j] < 1.0:
         return ""
-    return f": the sensor noise of {names[j]} is {times[j]:.3g} times as large as {names[j]} gets in the safe box"
-
-
-def _least_shown_state(plant: LinearPlant) -> str:
-    """Returns which state the outputs show least, of those whose errors do not decay, as the rest of a sentence."""
-    _, state = min(_persistent_modes(plant.A, plant.H, plant.half_widths, plant.state_names), default=(1.0, ""))
-    return f": of the states whose errors do not decay the outputs show {state} least" if state else ""
-
-
-def _persistent_modes(
-    A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequence[str]
-) -> Iterator[tuple[float, str]]:
-    """Yields how much the outputs show of every mode that does not decay, and the state with the largest part in it."""
-    A, H = A * widths / widths[:, None], H * widths
-    H = H / np.maximum(np.abs(H).max(axis=1, keepdims=True), np.finfo(float).tiny)
-    for value in np.linalg.eigvals(A):
-        if abs(value) >= 1.0 - UNDETECTABLE:
-            _, sizes, modes = np.linalg.svd(np.vstack([A - value * np.eye(len(A)), H]))
-            yield float(sizes[-1] / sizes[0]), names[int(np.argmax(np.abs(modes[-1])))]
+    return f"the sensor noise of {names[j]} is {times[j]:.3g} times as large as {names[j]} gets in the safe box"
 
 
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:

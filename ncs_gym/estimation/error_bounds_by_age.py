@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.estimation.error_sets import ErrorSetsByAge, congruence_sum
+from ncs_gym.estimation.error_sets import ErrorSetError, ErrorSetsByAge, congruence_sum
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
@@ -27,24 +27,27 @@ MULTIPLIERS = np.round(np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.log
 ITERATIONS = 1000
 # No set is thinner than this in any direction, in units of the weight: an input under way is known exactly.
 THINNEST = 1e-5
-# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
-# of a few tried, the one that leaves the unstable plants of `benchmarks.networks` the largest disturbances.
-EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
-# How much the answer counts of a gain that the plant names.
-NAMED_ANSWER = 1000.0
+# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts. It
+# is as fast as these units make it: one that has to be fast by the step asks for inputs beyond all limits where steps
+# are short.
+EFFORT, ANSWER = 10.0, 10.0
 # Digits of that regulator.
 REGULATOR_DIGITS = 6
 # Sets this much larger than the safe box are of no use.
 LARGEST = 1e6
 
 
-def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
-    """Returns error sets by age, without a solver; None if the iteration finds none, or none that float64 can hold."""
+def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge:
+    """Returns error sets by age, without a solver.
+
+    Raises:
+        ErrorSetError: If the iteration finds none, or none that float64 can hold; it says what was met.
+    """
     with np.errstate(all="ignore"):
         try:
             return _iterated_sets(plant, contract)
         except np.linalg.LinAlgError:
-            return None
+            raise ErrorSetError("the numbers of the sets are out of reach of float64") from None
 
 
 def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
@@ -57,8 +60,8 @@ def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
     )
 
 
-def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
-    """Returns error sets by age; None if the iteration finds none.
+def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge:
+    """Returns error sets by age.
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
@@ -67,6 +70,9 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     Args:
         plant: The plant with its bounds.
         contract: The channel's promise.
+
+    Raises:
+        ErrorSetError: If the iteration finds none.
     """
     # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
     inverse = np.linalg.cholesky(_cost(plant)).T
@@ -81,19 +87,17 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     start, steps = first, contract.max_age + 1
     for turn in range(ITERATIONS):
         shapes = _carried(start, A, D, steps)
-        if not float(np.trace(shapes[-1])) < LARGEST**2:
-            return None
+        _require_bounded(shapes[-1], LARGEST**2, plant, T)
         updates = [_update(shape, H, noise) for shape in shapes[1:]]
         grown = first
         for _, _, shape in reversed(updates):
             grown = joined(grown, shape + rounding)
-        if not float(np.trace(grown)) < LARGEST:
-            return None
+        _require_bounded(grown, LARGEST, plant, T)
         if is_inside(MARGIN * grown, start):
             break
         start = (1.0 + SMALLEST_GROWTH * 2.0 ** (turn / DOUBLING)) * grown
     else:
-        return None
+        raise ErrorSetError(f"the sets did not settle in {ITERATIONS} rounds")
     shapes = _carried(start, A, D, steps)
     gains, multipliers, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
     return ErrorSetsByAge(
@@ -106,14 +110,19 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     )
 
 
+def _require_bounded(shape: np.ndarray, largest: float, plant: LinearPlant, T: np.ndarray) -> None:
+    """Raises ErrorSetError, naming a state, unless a set of errors T z has a trace below the largest in z."""
+    if not float(np.trace(shape)) < largest:
+        sizes = np.diag(T @ shape @ T.T) / plant.half_widths**2
+        state = plant.state_names[int(np.argmax(np.nan_to_num(sizes, nan=np.inf)))]
+        raise ErrorSetError(f"the bound on the error of {state} outgrows the safe box by far")
+
+
 def _cost(plant: LinearPlant) -> np.ndarray:
-    """Returns W, shape (n, n): the size of an error in the box, and that of a gain's answer to it."""
-    if plant.error_gain is not None:
-        K = plant.error_gain / plant.input_half[:, None]
-        return plant.weight + NAMED_ANSWER * K.T @ K
+    """Returns W, shape (n, n): the size of an error in the box, and that of a regulator's answer to it."""
     inverse = np.linalg.cholesky(plant.weight).T
     T = np.linalg.inv(inverse)
-    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.input_half, EFFORT, DECAY)
+    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.input_half, EFFORT, decay=1.0)
     if K is None:
         return plant.weight
     K = exact.rounded(K @ inverse, REGULATOR_DIGITS)

@@ -14,6 +14,11 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from ncs_gym.validation import ReadOnlyArrays
 
+
+class ErrorSetError(ValueError):
+    """No error set could be computed accurately enough."""
+
+
 # Of a condition: shapes (outer, inner, size), the outer one of which must hold the inner one, computed to `size`.
 Need = tuple[np.ndarray, np.ndarray, np.ndarray]
 

@@ -12,8 +12,6 @@ from ncs_gym.plants.statespace import noise_in_proportion, sampled_model
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box.
 DISTURBANCE_FRACTION = 5e-3
 SENSOR_FRACTION = 1e-3
-# The gain of shields.synthesis.max_margin_gain at max_age = 1, in round numbers.
-ERROR_GAIN = ((-0.4, -1.8, -1.0, 0.4), (2.2, 0.0, 1.2, -1.4))
 
 
 def batch_reactor(dt: float = 0.05, **bounds: Any) -> LinearPlant:
@@ -37,5 +35,5 @@ def batch_reactor(dt: float = 0.05, **bounds: Any) -> LinearPlant:
     H = np.array([[1.0, 0.0, 1.0, -1.0], [0.0, 1.0, 0.0, 0.0]])
     half_widths = np.ones(4)
     noise = noise_in_proportion(half_widths, H, DISTURBANCE_FRACTION, SENSOR_FRACTION, bounds.get("delta", 0.05))
-    defaults = {"box": half_widths, "u_max": 2.0, "H": H, "error_gain": ERROR_GAIN}
+    defaults = {"box": half_widths, "u_max": 2.0, "H": H}
     return LinearPlant(**sampled_model(A, B, dt) | defaults | noise | bounds)

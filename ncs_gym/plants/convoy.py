@@ -31,7 +31,6 @@ def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
         "disturbance_bound": (zero_order_hold(motion, leader, dt)[1], 0.45),
         "sensor_bound": 1e-3,
         "initial_bound": 0.02,
-        "error_gain": ((1.5, -0.25),),
         "state_names": ("distance error", "speed"),
         "state_units": ("m", "m/s"),
         "input_names": ("speed asked for",),

@@ -30,7 +30,6 @@ def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> Linear
         "disturbance_bound": (zero_order_hold(motion, push, dt)[1], 0.4),
         "sensor_bound": [1e-3, 2e-4],
         "initial_bound": [1e-2, 2e-3],
-        "error_gain": ((-0.55, -3.9),),
         "state_names": ("offset", "heading"),
         "state_units": ("m", "rad"),
         "input_names": ("yaw rate",),

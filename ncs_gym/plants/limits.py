@@ -118,13 +118,14 @@ def as_points(value: Any, size: int, name: str) -> np.ndarray:
     return np.array([as_point(row, size, name) for row in numbers]).reshape(len(numbers), size)
 
 
-def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
+def sides(limits: Any, size: int, name: str, *, may_meet: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Returns the low and the high ends of limits, shape (size,) each; infinite where there is none.
 
     Args:
         limits: Pair (low, high), each a number or shape (size,), possibly infinite.
         size: Number of limited quantities.
         name: What the error message calls the limits.
+        may_meet: Whether a low end may be the high one.
 
     Raises:
         ValueError: If it is no such pair, or a low end is not below the high one.
@@ -133,9 +134,10 @@ def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     if len(ends) != 2 or any(side is None or side.shape not in ((), (size,)) or np.isnan(side).any() for side in ends):
         raise ValueError(f"{name} must be a pair (low, high), each a number or shape ({size},), got {shown(limits)}")
     low, high = (np.broadcast_to(np.asarray(side), (size,)).copy() for side in ends)
-    if not (low < high).all():
+    if not (low <= high if may_meet else low < high).all():
+        order = "low <= high" if may_meet else "low < high"
         raise ValueError(
-            f"{name} must be (low, high), each a number or a vector, with low < high everywhere, got {shown(limits)}"
+            f"{name} must be (low, high), each a number or a vector, with {order} everywhere, got {shown(limits)}"
         )
     return low, high
 
@@ -539,7 +541,7 @@ def _around_middle_of_disturbance(
 
     (n, m), name = B.shape, "disturbance_bound"
     E = as_matrix(bound[0], (n, None), f"{name}: E of d = E w")
-    low, high = sides(bound[1:], E.shape[1], f"{name}: (E, low, high)")
+    low, high = sides(bound[1:], E.shape[1], f"{name}: (E, low, high)", may_meet=True)
     half, middle = 0.5 * (high - low), 0.5 * (low + high)
     declared = as_bound((E, half), n, name)
     if not middle.any():

@@ -165,8 +165,6 @@ class LinearPlant(LimitValues, HardBounds):
             certificates, with a bound on what is between them, keep it at all times (docs/shield_proof.md), if what
             disturbances have done by any time of a step respects the bound of a whole step. None, or 1: at the sampling
             instants alone. Needs a continuous model without remainder and a box that bounds every state.
-        error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age
-            are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
         operating_input: Input that deviations are counted from, shape (m,).
         step_offset: Sizes of what the operating point rests under in every step beside A and B, shape (n,): |offset|
@@ -202,7 +200,6 @@ class LinearPlant(LimitValues, HardBounds):
     remainder: Remainder | None = None
     continuous_model: np.ndarray | None = None
     between_samples: int | None = None
-    error_gain: np.ndarray | None = None
     operating_state: np.ndarray = FILLED_IN_LATER
     operating_input: np.ndarray = FILLED_IN_LATER
     step_offset: np.ndarray = FILLED_IN_LATER
@@ -244,7 +241,6 @@ class LinearPlant(LimitValues, HardBounds):
             remainder: Remainder | None = None,
             continuous_model: ArrayLike | None = None,
             between_samples: int | None = None,
-            error_gain: ArrayLike | None = None,
             operating_state: ArrayLike | None = None,
             operating_input: ArrayLike | None = None,
             step_offset: ArrayLike | None = None,
@@ -269,8 +265,6 @@ class LinearPlant(LimitValues, HardBounds):
         self._set("mixed_ends", limits.as_row_ends(self.mixed_ends, len(self.mixed_rows), "mixed_ends"))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
         is_given = self._check_declared()
-        if self.error_gain is not None:
-            self._set("error_gain", as_matrix(self.error_gain, (self.m, n), "error_gain"))
         self._set("step_offset", limits.as_operating_point(self.step_offset, n, "step_offset"))
         self._check_between_samples()
         for name, size, letter in (("state", n, "x"), ("input", self.m, "u")):
@@ -633,8 +627,6 @@ class LinearPlant(LimitValues, HardBounds):
             for name in ("box_ends", "input_ends", *(("mixed_rows", "mixed_ends") if len(self.mixed_rows) else ())):
                 array = getattr(self, name)
                 digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
-        if self.error_gain is not None:
-            digest.update(self.error_gain.astype("<f8").tobytes())
         bounds = "disturbance_bound", "sensor_bound", "initial_bound"
         for name in (*bounds, "operating_state", "operating_input", "step_offset"):
             value = getattr(self, name)

@@ -145,7 +145,6 @@ def storing(plant: Kind, stored_inputs: int, delay: int) -> Kind:
         initial_bound=_padded(plant.initial_bound, stored),
         remainder=remainder,
         continuous_model=None,
-        error_gain=None if plant.error_gain is None else np.pad(plant.error_gain, ((0, 0), (0, stored))),
         operating_state=np.concatenate([plant.operating_state, np.tile(plant.operating_input, stored_inputs)]),
         step_offset=np.pad(plant.step_offset, (0, stored)),
         state_names=[*plant.state_names, *(f"{name} of {age}" for age in ages for name in plant.input_names)],

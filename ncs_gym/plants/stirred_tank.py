@@ -33,7 +33,6 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
         "disturbance_bound": (zero_order_hold(reaction, feed, dt)[1], 2.0),
         "sensor_bound": 0.02,
         "initial_bound": 0.1,
-        "error_gain": ((-0.6, -3.0),),
         "state_names": ("concentration", "temperature"),
         "state_units": ("cmol/L", "K"),
         "input_names": ("coolant temperature",),

@@ -12,6 +12,7 @@ import numpy as np
 from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.estimation.error_bound import unseen_state
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
+from ncs_gym.estimation.error_sets import ErrorSetError
 from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
@@ -176,8 +177,16 @@ def with_age_that_helps(
 def _may_be_helped(infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> bool:
     """Returns whether less age may help."""
     if infeasible.binding == "E1":
-        return contract is not None and error_sets_by_age(plant, replace(contract, max_age=0)) is not None
+        return contract is not None and _has_error_sets(plant, replace(contract, max_age=0))
     return infeasible.binding != "S" and infeasible.details.get(_SHARE) != 0.0
+
+
+def _has_error_sets(plant: LinearPlant, contract: ChannelContract) -> bool:
+    try:
+        error_sets_by_age(plant, contract)
+    except ErrorSetError:
+        return False
+    return True
 
 
 def _largest_age(

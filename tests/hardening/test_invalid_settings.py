@@ -87,7 +87,6 @@ REFUSED = {
         "dt": [*WRONG, 0.0, 1e-80],
         "gamma": WRONG,
         "delta": BETWEEN,
-        "error_gain": but(NOT_MATRICES, [[1, 2]]),
         **dict.fromkeys(("process_noise_cov", "measurement_noise_cov", "initial_cov"), NOT_COVARIANCES),
         **dict.fromkeys(("state_names", "state_units", "input_names", "input_units"), NOT_NAMES),
     },

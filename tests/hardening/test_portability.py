@@ -241,7 +241,6 @@ def reordered(certificate, plant, order):
         H=plant.H[:, order],
         process_noise_cov=plant.process_noise_cov[square],
         initial_cov=plant.initial_cov[square],
-        error_gain=None if plant.error_gain is None else plant.error_gain[:, order],
         operating_state=plant.operating_state[order],
         continuous_model=None,
         **bounds,

@@ -86,7 +86,6 @@ def own_plant():
         disturbance_bound=[0.01, 0.02],
         sensor_bound=0.01,
         initial_bound=0.02,
-        error_gain=[[0.1, 0.2]],
         state_names=["level", "rate"],
         state_units=["m", "m/s"],
     )

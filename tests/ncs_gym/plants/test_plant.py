@@ -95,7 +95,6 @@ def test_fingerprint_changes_with_every_number():
         truck_trailer(u_max=4.0000001),
         truck_trailer(initial_cov=2e-4 * np.eye(2)),
         truck_trailer(H=np.array([[1.0, 0.0]])),
-        replace(base, error_gain=[[1.0, 0.0]]),
         replace(base, A=0.9 * base.A, continuous_model=None),
         replace(base, step_offset=[0.0, 0.1]),
         replace(base, operating_state=[1.0, 0.0]),

@@ -68,7 +68,7 @@ REGISTERED = {
     truck_trailer: "177ea6db2c10",
     lambda: truck_trailer(4000.0): "498d4365ce1b",
     ncs_gym.cart_pole: "415231d06116",
-    ncs_gym.batch_reactor: "11e922056fbb",
+    ncs_gym.batch_reactor: "00f031c94ead",
     pendulum: "cdde9a7c4fae",
     nonlinear_cart_pole: "24e3eb27d867",
     inverted_pendulum: "453be641a4ee",

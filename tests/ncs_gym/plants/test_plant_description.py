@@ -20,7 +20,6 @@ ODD = LinearPlant(
     disturbance_bound=Ellipsoid([[0.1, 0.03], [0.03, 0.7]]),
     sensor_bound=([[1.0], [1 / 7]], 0.3),
     initial_bound=0.0,
-    error_gain=[[0.1, 0.2]],
     operating_state=[20.0, 0.0],
     operating_input=[1 / 3],
     state_names=["heat", "flow"],

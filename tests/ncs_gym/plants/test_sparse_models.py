@@ -39,7 +39,7 @@ def test_sparse_feedthrough_is_told_of():
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_matrix_of_a_plant_may_be_sparse(kind):
     rows, covariance = np.array([[1.0, 0.0], [0.5, 1.0]]), np.diag([1e-4, 2e-4])
-    given = {"A": 0.5 * np.eye(2), "B": B, "H": C, "box": rows, "process_noise_cov": covariance, "error_gain": [[1, 2]]}
+    given = {"A": 0.5 * np.eye(2), "B": B, "H": C, "box": rows, "process_noise_cov": covariance}
     rest = {"u_max": 1.0, "dt": 1.0, "measurement_noise_cov": covariance, "initial_bound": 0.0}
     made = LinearPlant(**{name: kind(value) for name, value in given.items()}, **rest)
     assert made.fingerprint == LinearPlant(**given, **rest).fingerprint

@@ -231,6 +231,10 @@ def test_disturbance_with_symmetric_ends_leaves_the_operating_point():
     settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
     both = LinearPlant(**settings, disturbance_bound=([[1.0]], [-0.1], [0.1]))
     assert both.fingerprint == LinearPlant(**settings, disturbance_bound=([[1.0]], 0.1)).fingerprint
+    of_two = LinearPlant(**settings, disturbance_bound=([[1.0, 5.0]], [-0.1, 0.0], [0.1, 0.0]))
+    assert of_two.fingerprint == both.fingerprint, "what is always 0 adds nothing"
+    with pytest.raises(ValueError, match="low <= high"):
+        LinearPlant(**settings, disturbance_bound=([[1.0]], [0.1], [-0.1]))
     with pytest.raises(ValueError, match="no state stays where it is"):
         LinearPlant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
     with pytest.raises(ValueError, match="not strictly within the limits"):
@@ -347,15 +351,6 @@ def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
             continue
         forged = changed(certificate(name), **{field: ends})
         assert "polytope: its first rows are those of the safe box" in broken(forged, plant)
-
-
-def test_plants_that_differ_have_different_fingerprints_also_where_their_numbers_are_the_same():
-    """Three states, inputs and limits: two ends of rows and low ends of inputs are as many numbers as a gain has."""
-    model = {"A": 0.9 * np.eye(3), "B": np.eye(3), "dt": 1.0, "disturbance_bound": 0.01} | QUIET
-    ends = LinearPlant(**model, state_limits=(-1.6, 0.4), input_limits=(-0.2, 1.0))
-    numbers = np.concatenate([ends.box_ends.ravel(), ends.input_low]).reshape(3, 3)
-    gained = LinearPlant(**model, box=ends.box, u_max=ends.input_high, error_gain=numbers)
-    assert ends.fingerprint != gained.fingerprint
 
 
 def test_operating_point_that_a_disturbance_moves_is_told():
