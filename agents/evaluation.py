@@ -30,8 +30,9 @@ def evaluate(
     policy: Policy,
     episodes: int,
     seed: int,
-    level_matrix: np.ndarray | Polytope | None = None,
+    safe_set: np.ndarray | Polytope | None = None,
     on_progress: Callable[[int], None] | None = None,
+    shown: int = 0,
 ) -> Evaluation:
     """Returns what a policy does in a number of episodes, played side by side.
 
@@ -41,15 +42,18 @@ def evaluate(
         policy: Maps observations and infos to actions.
         episodes: Number of episodes, at least 1.
         seed: Seed of all random numbers (see `Episode.index`).
-        level_matrix: M, shape (n, n), for `Episode.largest_level`; or a polytope, of which the gauge is squared.
+        safe_set: M, shape (n, n), or a polytope, for `Episode.times_safe_set`.
         on_progress: Called with the number of steps taken since its last call.
+        shown: Number of the episode whose trajectory is returned.
 
     Raises:
-        ValueError: If there is no episode to play, episodes have no limit of steps, or the id is registered with
-            SAME_STEP autoreset.
+        ValueError: If there is no episode to play or to show, episodes have no limit of steps, or the id is registered
+            with SAME_STEP autoreset.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if not 0 <= shown < episodes:
+        raise ValueError(f"shown must be the number of one of {episodes} episodes, got {shown}")
     if loop.episode_steps is None:
         raise ValueError(f"{loop.env} has no max_episode_steps, without which an evaluation may not end: give some")
     alone = loop.without_penalties.with_kwargs(autoreset_mode=None)
@@ -57,7 +61,7 @@ def evaluate(
     trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
-        played, path = _played(alone, policy, indices, seed, level_matrix, on_progress)
+        played, path = _played(alone, policy, indices, seed, safe_set, on_progress, shown)
         trajectory = trajectory or path
         finished += played
     return Evaluation(loop, finished, trajectory)  # type: ignore[arg-type]
@@ -68,10 +72,11 @@ def _played(
     policy: Policy,
     indices: range,
     seed: int,
-    level_matrix: np.ndarray | Polytope | None,
+    safe_set: np.ndarray | Polytope | None,
     on_progress: Callable[[int], None] | None,
+    shown: int,
 ) -> tuple[list[Episode], Trajectory | None]:
-    """Returns episodes played side by side, and the trajectory of episode 0, None if it is not among them."""
+    """Returns episodes played side by side, and the trajectory of one, None if it is not among them."""
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
     if envs.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
@@ -85,19 +90,19 @@ def _played(
     observations, info = envs.reset(seed=env_seed)
     infos, nothing = [info], np.zeros(count, np.bool_)
     running, ended, guaranteed = ~nothing, nothing, ~nothing
-    returns, largest = np.zeros(count), np.full(count, np.nan if level_matrix is None else 0.0)
+    returns, largest = np.zeros(count), np.full(count, np.nan if safe_set is None else 0.0)
     names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "proved")
     totals = {name: np.zeros(count, np.int64) for name in names}
     while True:
         guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
-        if level_matrix is not None:
-            largest = np.maximum(largest, np.where(running, _levels(info["state"], level_matrix), 0.0))
+        if safe_set is not None:
+            largest = np.maximum(largest, np.where(running, _times(info["state"], safe_set), 0.0))
         running &= ~ended
         if not running.any():
             break
         actions = policy(observations, info)
         observations, rewards, terminated, truncated, info = envs.step(actions)
-        if running[0] and indices[0] == 0:
+        if shown in indices and running[shown - indices[0]]:
             # Filters of others need not report what was proposed to them.
             infos.append({"input_proposed": read_actions(plant, actions, count)[1].T} | info)
         returns += np.where(running, rewards, 0.0)
@@ -122,17 +127,21 @@ def _played(
             index=index,
             episode_return=float(returns[e]),
             guaranteed=bool(guaranteed[e]),
-            largest_level=float(largest[e]),
+            times_safe_set=float(largest[e]),
             **{name: int(total[e]) for name, total in totals.items()},
         )
         for e, index in enumerate(indices)
     ]
-    return episodes, _first_trajectory(infos, single.downlink_protocol.input_delay) if indices[0] == 0 else None
+    if shown not in indices:
+        return episodes, None
+    return episodes, _trajectory(infos, shown - indices[0], single.downlink_protocol.input_delay)
 
 
-def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
-    """Returns x'Mx of states, shape (N, n), or the squares of their gauges in a polytope: 1 on the boundary."""
-    return of.gauge(states) ** 2 if isinstance(of, Polytope) else np.einsum("ei,ij,ej->e", states, of, states)
+def _times(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
+    """Returns how many times a safe set holds states, shape (N, n): 1 on its boundary."""
+    if isinstance(of, Polytope):
+        return of.gauge(states)
+    return np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", states, of, states), 0.0))
 
 
 def _estimates(info: dict[str, np.ndarray]) -> np.ndarray:
@@ -140,21 +149,21 @@ def _estimates(info: dict[str, np.ndarray]) -> np.ndarray:
     return info["state"] + info["estimation_error"]
 
 
-def _first_trajectory(infos: list[dict[str, np.ndarray]], input_delay: int) -> Trajectory:
-    """Returns the trajectory of the first environment, whose inputs are applied some steps after they are decided."""
+def _trajectory(infos: list[dict[str, np.ndarray]], e: int, input_delay: int) -> Trajectory:
+    """Returns the trajectory of an environment, whose inputs are applied some steps after they are decided."""
     steps = infos[1:]
-    not_shielded = np.zeros(1, np.bool_)
-    inputs = np.array([info["input"][0] for info in steps])
+    not_shielded = np.zeros(e + 1, np.bool_)
+    inputs = np.array([info["input"][e] for info in steps])
     proposed, intervened = inputs.copy(), np.zeros(len(steps), np.bool_)
     for step, info in enumerate(steps[: max(len(steps) - input_delay, 0)], input_delay):
-        proposed[step] = info["input_proposed"][0]
-        intervened[step] = info.get("shield_intervened", not_shielded)[0]
+        proposed[step] = info["input_proposed"][e]
+        intervened[step] = info.get("shield_intervened", not_shielded)[e]
     return Trajectory(
-        states=np.array([info["state"][0] for info in infos]),
-        estimates=np.array([_estimates(info)[0] for info in infos]),
+        states=np.array([info["state"][e] for info in infos]),
+        estimates=np.array([_estimates(info)[e] for info in infos]),
         inputs=inputs,
         proposed=proposed,
         intervened=intervened,
-        arrivals=np.array([info["packet_arrived"][0] for info in steps], dtype=np.bool_),
-        violated=np.array([info["cost"][0] > 0.0 for info in steps], dtype=np.bool_),
+        arrivals=np.array([info["packet_arrived"][e] for info in steps], dtype=np.bool_),
+        violated=np.array([info["cost"][e] > 0.0 for info in steps], dtype=np.bool_),
     )

@@ -72,8 +72,8 @@ class Episode(_Totals):
         estimate_violation_steps: Steps after which the estimate was outside the safe box.
         interventions: Steps in which the shield intervened, or would have in mode "monitor".
         guaranteed: Whether the shield's guarantee held at every step; False without a shield.
-        largest_level: Largest x'Mx of the true state, or square of its gauge in the certificate's polytope; above 1 it
-            was out of the safe set. NaN unless `evaluate` was given a `level_matrix`.
+        times_safe_set: The true state came to this many times the safe set: the root of the largest x'Mx, or the
+            largest gauge in a polytope; above 1 it was outside. NaN unless `evaluate` was given a `safe_set`.
         planned: Steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store; 0 in
             other modes.
         proved: Steps after which the shield's guarantee held; 0 without a shield.
@@ -86,7 +86,7 @@ class Episode(_Totals):
     estimate_violation_steps: int
     interventions: int
     guaranteed: bool
-    largest_level: float
+    times_safe_set: float
     planned: int = 0
     proved: int = 0
 
@@ -122,7 +122,7 @@ class Evaluation:
     Attributes:
         loop: The control loop that they were played in, but for its penalties.
         episodes: All episodes, in order of their index.
-        trajectory: The first episode, step by step.
+        trajectory: The episode that was asked for, the first by default, step by step.
     """
 
     loop: LoopConfig

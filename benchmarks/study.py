@@ -171,7 +171,7 @@ def channel_switches(settings: CompareSettings, comparison: Comparison) -> list[
                 run_of_agent = run_of_arm(part, loop, certificate, name, index, point)
                 runs.append(replace(run_of_agent, agent_files=agent.files))
         played = episodes_table(results_of(runs, settings.out, settings))
-        for arm, attacked in played[played["condition"] == ATTACKED].groupby("arm", sort=False):
+        for arm, attacked in played[played["scenario"] == ATTACKED].groupby("arm", sort=False):
             violating = int(attacked["violating"].sum())
             rows.append({"on": list(on), "arm": arm, "episodes": len(attacked), "violating": violating})
     return rows
@@ -206,7 +206,7 @@ def difference(
     Runs with the same number have the same seeds and episodes with the same index the same random numbers, so that
     differences are taken episode by episode; runs are resampled, then episodes within each.
     """
-    played = episodes[episodes["condition"] == pair[2]]
+    played = episodes[episodes["scenario"] == pair[2]]
     first, second = (_by_run(played[played["arm"] == name], column) for name in pair[:2])
     if not (first.size and second.size):
         return None
@@ -218,7 +218,7 @@ def difference(
 def _arm(arm: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
     kept = ("mode", "train_steps", "train_violation_steps", "train_violation_steps_by_run")
     scenarios = {
-        scenario: _evaluated(numbers, episodes[episodes["condition"] == scenario])
+        scenario: _evaluated(numbers, episodes[episodes["scenario"] == scenario])
         for scenario, numbers in ({AS_TRAINED: arm} | arm["conditions"]).items()
     }
     return {key: arm[key] for key in kept} | {"scenarios": scenarios}
@@ -231,7 +231,7 @@ def _evaluated(numbers: dict[str, Any], played: pd.DataFrame) -> dict[str, Any]:
     resampling says little and of none nothing: the interval of the rate reaches as far as the exact one of a single
     proportion, too.
     """
-    violating, returns = _by_run(played, "violating"), _by_run(played, "episode_return")
+    violating, returns = _by_run(played, "violating"), _by_run(played, "return")
     if numbers["eval_return_ci95_over"] == "episodes":
         violating, returns = violating.reshape(-1, 1), returns.reshape(-1, 1)
     rate, exact = numbers["eval_violation_rate"], numbers["eval_violation_rate_ci95"]
@@ -255,7 +255,7 @@ def outer_interval(resampled: list[float] | None, exact: list[float]) -> list[fl
 
 def _by_run(played: pd.DataFrame, column: str) -> np.ndarray:
     """Returns a column by run and episode, shape (runs, episodes)."""
-    return played.pivot(index="run", columns="index", values=column).to_numpy(np.float64)
+    return played.pivot(index="run", columns="episode", values=column).to_numpy(np.float64)
 
 
 def _prices(arms: Mapping[str, dict[str, Any]], episodes: pd.DataFrame) -> list[dict[str, Any]]:
@@ -270,7 +270,7 @@ def _prices(arms: Mapping[str, dict[str, Any]], episodes: pd.DataFrame) -> list[
         }
         if sound in arms and rivals:
             best = max(rivals, key=lambda name: rivals[name])
-            prices.append(difference(episodes, (sound, best, AS_TRAINED), "episode_return"))
+            prices.append(difference(episodes, (sound, best, AS_TRAINED), "return"))
     return prices
 
 

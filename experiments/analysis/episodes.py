@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -12,47 +12,64 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
-from experiments.runs.arms import Arm, is_shield
+from experiments.runs.arms import Arm, by_arm, is_shield
 from experiments.runs.loops import AS_TRAINED
 from experiments.runs.training_run import RunResult
 
 # Key of the metadata in a file, and entries of summary.json that it holds.
 _METADATA = b"ncs-gym"
 _ORIGIN = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
-# Totals of a run's training, in each of its rows.
-TRAINING = ["train_steps", "train_violation_steps", "train_interventions"]
+# Columns of the tables, named as printed, by the fields of an episode and of a point of a training.
+_OF_EPISODE = {
+    "index": "episode",
+    "steps": "steps",
+    "episode_return": "return",
+    "violation_steps": "violating_steps",
+    "estimate_violation_steps": "estimate_violating_steps",
+    "interventions": "overridden",
+    "times_safe_set": "times_safe_set",
+    "planned": "from_plan",
+    "guaranteed": "proof_held",
+    "proved": "proved_steps",
+}
+_OF_TRAINING = {
+    "steps": "steps",
+    "episode_return": "return",
+    "violation_steps": "violating_steps",
+    "interventions": "overridden",
+    "multiplier": "price",
+}
 
 
 def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
-    """Returns a row per evaluation episode.
+    """Returns a row per evaluation episode; docs/experiments.md explains the columns.
 
     Args:
         results: Results of training runs.
-        **common: Columns with the same value in all rows, such as the environment or what a sweep varies.
-
-    Returns:
-        The common columns; `arm`, `run` and `condition`; the fields of `agents.results.Episode`; `violating` and
-        `outside_set`, whether the true state left the safe box or the safe set at some step; and the totals of the
-        run's training, `TRAINING`.
+        **common: Columns with the same value in all rows: the environment, the algorithm, what a sweep varies.
     """
     rows = [
         common
-        | {"arm": result.arm, "run": result.index, "condition": scenario}
-        | vars(episode)
-        | {name: getattr(result, name) for name in TRAINING}
+        | {"arm": result.arm, "run": result.index, "scenario": scenario}
+        | {column: getattr(episode, name) for name, column in _OF_EPISODE.items()}
         for result in results
         for scenario, played in ({AS_TRAINED: result.episodes} | result.scenarios).items()
         for episode in played
     ]
     table = pd.DataFrame(rows)
-    return table.assign(violating=table["violation_steps"] > 0, outside_set=~(table["largest_level"] <= 1.0))
+    return table.assign(violating=table["violating_steps"] > 0, outside_S=~(table["times_safe_set"] <= 1.0))
 
 
-def training_table(results: Iterable[RunResult]) -> pd.DataFrame:
-    """Returns a row per point of a training's history: `arm`, `run`, the fields of `agents.results.TrainingPoint`."""
-    return pd.DataFrame(
-        [{"arm": result.arm, "run": result.index} | vars(point) for result in results for point in result.history]
-    )
+def training_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
+    """Returns a row per point of a training's history, with totals so far; docs/experiments.md explains the columns."""
+    rows = [
+        common
+        | {"arm": result.arm, "run": result.index}
+        | {column: getattr(point, name) for name, column in _OF_TRAINING.items()}
+        for result in results
+        for point in result.history
+    ]
+    return pd.DataFrame(rows, columns=[*common, "arm", "run", *_OF_TRAINING.values()])
 
 
 def parquet(table: pd.DataFrame, summary: Mapping[str, Any]) -> bytes:
@@ -65,24 +82,23 @@ def parquet(table: pd.DataFrame, summary: Mapping[str, Any]) -> bytes:
 
 
 # Columns of which a run has a sum, and a mean over its episodes.
-_COUNTED = ["steps", "violation_steps", "estimate_violation_steps", "interventions", "planned"]
-_COUNTED += ["proved", "guaranteed", "violating", "outside_set"]
-_AVERAGED = ["episode_return", "violating", "outside_set"]
+_COUNTED = ["steps", "violating_steps", "estimate_violating_steps", "overridden", "from_plan"]
+_COUNTED += ["proved_steps", "proof_held", "violating", "outside_S"]
+_AVERAGED = ["return", "violating", "outside_S"]
 
 
-def arm_summaries(episodes: pd.DataFrame, mode: str) -> dict[str, dict[str, Any]]:
-    """Returns what `arm_summary` says of every arm, by its name and in the order of the rows."""
-    arms = {str(name): (Arm.of(str(name), mode), rows) for name, rows in episodes.groupby("arm", sort=False)}
-    return {
-        name: arm_summary(
-            rows, arm.mode, fixed_policy=not arm.differs_from_run_to_run, filters_training=arm.filters_training
-        )
-        for name, (arm, rows) in arms.items()
-    }
+def arm_summaries(results: Sequence[RunResult], mode: str) -> dict[str, dict[str, Any]]:
+    """Returns what `arm_summary` says of every arm, by its name and in the order of the results."""
+    summaries = {}
+    for name, runs in by_arm(results).items():
+        arm = Arm.of(name, mode)
+        kinds = {"fixed_policy": not arm.differs_from_run_to_run, "filters_training": arm.filters_training}
+        summaries[name] = arm_summary(runs, arm.mode, **kinds)
+    return summaries
 
 
 def arm_summary(
-    episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool, filters_training: bool = True
+    results: Sequence[RunResult], mode: str | None, *, fixed_policy: bool, filters_training: bool = True
 ) -> dict[str, Any]:
     """Returns the summary of an arm, JSON values only.
 
@@ -97,26 +113,26 @@ def arm_summary(
     guarantee held. `conditions` holds the same numbers of the evaluation in each other scenario.
 
     Args:
-        episodes: Rows of the arm in what `episodes_table` returns.
+        results: Results of the arm's runs, in their order.
         mode: Mode of its shield, or name of its other filter; None for neither.
         fixed_policy: Whether the policy is the same in all runs.
         filters_training: Whether the shield or filter acts in training, too.
     """
-    training = episodes.groupby("run")[TRAINING].first()
-    steps, violations, interventions = (int(total) for total in training.sum())
+    steps = sum(result.train_steps for result in results)
+    violations = [result.train_violation_steps for result in results]
     conditions = {
         name: _evaluated(played, fixed_policy=fixed_policy)
-        for name, played in episodes.groupby("condition", sort=False)
+        for name, played in episodes_table(results).groupby("scenario", sort=False)
     }
     return {
         "mode": mode,
         "train_mode": mode if filters_training else None,
         "shielded": is_shield(mode),
-        "runs": len(training),
+        "runs": len(results),
         "train_steps": steps,
-        "train_violation_steps": violations,
-        "train_violation_steps_by_run": training["train_violation_steps"].tolist(),
-        "train_intervention_rate": interventions / steps if steps else 0.0,
+        "train_violation_steps": sum(violations),
+        "train_violation_steps_by_run": violations,
+        "train_intervention_rate": sum(result.train_interventions for result in results) / steps if steps else 0.0,
         **conditions.pop(AS_TRAINED),
         "conditions": conditions,
     }
@@ -127,31 +143,31 @@ def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
     runs, count = episodes.groupby("run"), len(episodes)
     means, sums = runs[_AVERAGED].mean(), runs[_COUNTED].sum()
     total = {name: int(number) for name, number in sums.sum().items()}
-    values = (episodes if fixed_policy else means)["episode_return"].to_numpy()
+    values = (episodes if fixed_policy else means)["return"].to_numpy()
     return {
         "eval_episodes": count,
         "eval_steps": total["steps"],
-        "eval_violation_steps": total["violation_steps"],
-        "eval_estimate_violation_steps": total["estimate_violation_steps"],
-        "eval_proved_steps": total["proved"],
+        "eval_violation_steps": total["violating_steps"],
+        "eval_estimate_violation_steps": total["estimate_violating_steps"],
+        "eval_proved_steps": total["proved_steps"],
         "eval_violating_episodes": total["violating"],
         "eval_violation_rate": total["violating"] / count,
         "eval_violation_rate_ci95": clopper_pearson(total["violating"], count),
-        "eval_episodes_outside_set": total["outside_set"],
-        "eval_return_mean": float(means["episode_return"].mean()),
+        "eval_episodes_outside_set": total["outside_S"],
+        "eval_return_mean": float(means["return"].mean()),
         "eval_return_ci95": mean_interval(values),
         "eval_return_bootstrap_ci95": bootstrap_interval(values),
         "eval_return_iqm": float(interquartile_mean(values)),
         "eval_return_iqm_bootstrap_ci95": bootstrap_interval(values, statistic=interquartile_mean),
         "eval_return_ci95_over": "episodes" if fixed_policy else "runs",
-        "eval_return_by_run": means["episode_return"].tolist(),
+        "eval_return_by_run": means["return"].tolist(),
         "eval_violation_rate_by_run": means["violating"].tolist(),
-        "eval_outside_set_rate_by_run": means["outside_set"].tolist(),
-        "intervention_rate_by_run": (sums["interventions"] / sums["steps"]).tolist(),
-        "intervention_rate": total["interventions"] / total["steps"],
-        "plan_rate": total["planned"] / total["steps"],
-        "guaranteed_episodes": total["guaranteed"],
-        "largest_level": float(episodes["largest_level"].max()),
+        "eval_outside_set_rate_by_run": means["outside_S"].tolist(),
+        "intervention_rate_by_run": (sums["overridden"] / sums["steps"]).tolist(),
+        "intervention_rate": total["overridden"] / total["steps"],
+        "plan_rate": total["from_plan"] / total["steps"],
+        "guaranteed_episodes": total["proof_held"],
+        "times_safe_set": float(episodes["times_safe_set"].max()),
     }
 
 
@@ -162,14 +178,14 @@ def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
     interval over the runs, or over the episodes where both policies are the same in all runs (`return_ci95_over`), and
     the differences of the numbers of violating episodes.
     """
-    as_trained = episodes[episodes["condition"] == AS_TRAINED]
+    as_trained = episodes[episodes["scenario"] == AS_TRAINED]
     differences = {}
     for name in episodes["arm"].unique():
         if name == baseline:
             continue
         both = as_trained[as_trained["arm"].isin([baseline, name])]
         over_runs = any(Arm.of(each).differs_from_run_to_run for each in (baseline, name))
-        pairs = both.groupby([*(["run"] if over_runs else ["run", "index"]), "arm"])["episode_return"].mean().unstack()
+        pairs = both.groupby([*(["run"] if over_runs else ["run", "episode"]), "arm"])["return"].mean().unstack()
         returns = (pairs[name] - pairs[baseline]).to_numpy()
         counts = both.groupby(["run", "arm"])["violating"].sum().unstack()
         violating = (counts[name] - counts[baseline]).astype(int)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import sqrt
 from typing import Any, NamedTuple
 
 import pandas as pd
 
 from agents.agent_file import has_pretrained
 from agents.loop import LoopConfig
+from agents.results import Trajectory
 from experiments.analysis.episodes import (
     arm_summaries,
     covered_fraction,
@@ -23,7 +23,7 @@ from experiments.analysis.statistics import gaussian_sentences, gaussian_summary
 from experiments.backends.execution import results_of
 from experiments.baselines import why_aimless
 from experiments.commands import short_version
-from experiments.plots.comparison_figures import comparison_figures
+from experiments.plots.comparison_figures import comparison_figures, most_overridden
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
@@ -44,8 +44,8 @@ from shields.runtime.starts import starts_known
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
 # What it trains and evaluates where nothing else is asked for: agents that have hardly learned beside one that has.
-_SMOKE_ARMS = ("unshielded", "shielded")
-_SMOKE_BASELINES = ("zero input", PRETRAINED, f"{PRETRAINED}+shielded")
+_SMOKE_ARMS, _SMOKE_PAIR = ("unshielded", "shielded"), (PRETRAINED, f"{PRETRAINED}+shielded")
+_SMOKE_BASELINES = ("zero input",)
 
 
 class Comparison(NamedTuple):
@@ -79,16 +79,23 @@ def compare(settings: CompareSettings) -> Comparison:
     settings = settings.completed
     runs = _training_runs(settings, loop, certificate)
     results = results_of(runs, settings.out, settings)
-    episodes = episodes_table(results)
-    summary = _summary(settings, loop, certificate, runs, episodes)
+    common = {"environment": id_alone(settings.env), "algorithm": settings.algo}
+    episodes = episodes_table(results, **common)
+    summary = _summary(settings, loop, certificate, runs, results, episodes)
     findings = findings_of(summary)
     if "gaussian_noise" in summary:
         findings += gaussian_sentences(summary["gaussian_noise"])
-    figures = comparison_figures(plant, summary, by_arm(results))
+    by_name = {(run.arm, run.index): run for run in runs}
+
+    def path_of(arm: str, index: int, scenario: str, episode: int) -> Trajectory:
+        return by_name[arm, index].trajectory(settings.out / "models", scenario, episode)
+
+    shown = most_overridden(episodes, settings.arms, path_of)
+    figures = comparison_figures(plant, summary, by_arm(results), shown)
     certificate.save(settings.out / "certificate.json")
     files = {
         "episodes.parquet": parquet(episodes, summary),
-        "training.parquet": parquet(training_table(results), summary),
+        "training.parquet": parquet(training_table(results, **common), summary),
         "report.html": comparison_report(summary, verification, figures, findings),
     }
     write_results(settings.out, summary, files, figures)
@@ -104,9 +111,10 @@ def compare(settings: CompareSettings) -> Comparison:
 def shortened(settings: CompareSettings) -> CompareSettings:
     """Returns the settings of the short version if `--smoke` is given, otherwise the same settings."""
     chosen, default = {}, type(settings)
+    pair = _SMOKE_PAIR if has_pretrained(id_alone(settings.env)) else ()
     if settings.arms == default.arms:
-        chosen["arms"] = _SMOKE_ARMS
-    if settings.baselines == default.baselines and has_pretrained(id_alone(settings.env)):
+        chosen["arms"] = _SMOKE_ARMS + pair
+    if settings.baselines == default.baselines and pair:
         chosen["baselines"] = _SMOKE_BASELINES
     return short_version(settings, **_SMOKE, **chosen)
 
@@ -132,7 +140,7 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
 def _smoke_text(settings: CompareSettings) -> str:
     """Returns what a short version shows."""
     text = "A smoke run shows that everything runs; the agents that it trains have hardly learned."
-    if PRETRAINED in settings.baselines:
+    if PRETRAINED in settings.arms:
         text += " What a shield does, the rows of the pretrained agent show."
     return text
 
@@ -156,9 +164,10 @@ def _summary(
     loop: LoopConfig,
     certificate: Certificate,
     runs: Sequence[TrainingRun],
+    results: Sequence[RunResult],
     episodes: pd.DataFrame,
 ) -> dict[str, Any]:
-    arms = arm_summaries(episodes, settings.mode)
+    arms = arm_summaries(results, settings.mode)
     gaussian = {}
     if settings.noise == "gaussian":
         gaussian["gaussian_noise"] = gaussian_noise_of(loop, certificate, arms)
@@ -207,7 +216,7 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings.append(
             f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes; the "
-            f"true state came to {sqrt(arm['largest_level']):.3f} times the safe set{leaves}."
+            f"true state came to {arm['times_safe_set']:.3f} times the safe set{leaves}."
         )
     paired = summary["paired_differences"]
     for name, difference in paired["arms"].items():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.analysis.episodes import arm_summary, episodes_table
+from experiments.analysis.episodes import arm_summary
 from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
 from experiments.runs.loops import certificate_of, registered_env, with_channel
@@ -68,8 +68,8 @@ def evaluate(settings: EvaluateSettings) -> None:
         certificate.polytope or certificate.M,
     )
     shield_name = mode or "none"
-    result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
-    arms = {f"shield: {shield_name}": arm_summary(episodes_table([result]), mode, fixed_policy=True)}
+    result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes)
+    arms = {f"shield: {shield_name}": arm_summary([result], mode, fixed_policy=True)}
     statistics = "" if settings.vec_normalize is None else f" with --vec-normalize {settings.vec_normalize}"
     others = {name: value for name, value in loop.kwargs.items() if name != "channel"}
     made = ", the plant of its files" if "plant" in others else ""

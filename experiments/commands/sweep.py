@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import arm_summaries, episodes_table, parquet
+from experiments.analysis.episodes import arm_summaries, episodes_table, parquet, training_table
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_map
@@ -20,6 +20,7 @@ from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import CERTIFICATES
 from experiments.runs.provenance import experiment_provenance
 from experiments.settings import SweepSettings
+from experiments.settings.arguments import id_alone
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
@@ -63,14 +64,10 @@ def sweep(settings: SweepSettings) -> None:
     ]
     results = results_of(runs, settings.out, settings)
     per_point = len(runs) // len(points)
-    parts = [
-        episodes_table(
-            results[i * per_point : (i + 1) * per_point],
-            **{name: float("nan" if value is None else value) for name, value in point.items()},
-        )
-        for i, point in enumerate(points)
-    ]
+    parts = [results[i * per_point : (i + 1) * per_point] for i in range(len(points))]
     arms = [arm_summaries(part, settings.mode) for part in parts]
+    common = {"environment": id_alone(settings.env), "algorithm": settings.algo}
+    sides = [common | {side: float("nan" if at is None else at) for side, at in point.items()} for point in points]
     losses = [{"mean_loss": ncs_env(loop.single()).channel.mean_loss} for loop in loops]
     summary = {
         "cells": [point | lost | {"arms": each} for point, lost, each in zip(points, losses, arms, strict=True)]
@@ -80,7 +77,10 @@ def sweep(settings: SweepSettings) -> None:
     (settings.out / CERTIFICATES).mkdir(exist_ok=True)
     for point, certificate in zip(points, certificates, strict=True):
         certificate.save(settings.out / CERTIFICATES / f"{name_of(point)}.json")
-    files = {"episodes.parquet": parquet(pd.concat(parts), summary)}
+    files = {
+        f"{name}.parquet": parquet(pd.concat(table(p, **side) for p, side in zip(parts, sides, strict=True)), summary)
+        for name, table in (("episodes", episodes_table), ("training", training_table))
+    }
     write_results(settings.out, summary, files, {"violations": (figure.caption, figure.png)})
     count = counted(settings.seeds, "run")
     print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from shutil import rmtree
 
-from experiments.analysis.episodes import arm_summary, episodes_table
+from experiments.analysis.episodes import arm_summary
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
@@ -43,7 +43,7 @@ def train(settings: TrainSettings) -> None:
     results = results_of([run], settings.out, settings)
     rmtree(checkpoint, ignore_errors=True)
     mode = Arm.of(settings.arm, settings.mode).mode
-    arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
+    arms = {settings.arm: arm_summary(results, mode, fixed_policy=True)}
     certificate.save(settings.out / "certificate.json")
     summary = {"arms": arms, "went_on_after": results[0].went_on_after}
     summary |= experiment_provenance(settings, loop, certificate, [run])

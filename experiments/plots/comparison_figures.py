@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -19,6 +20,7 @@ from experiments.plots.figure_style import (
     STYLE,
     ArmStyle,
     CaptionedFigure,
+    arm_styles,
     draw_estimate,
     input_labels,
     label,
@@ -27,6 +29,7 @@ from experiments.plots.figure_style import (
     with_unit,
 )
 from experiments.runs.arms import Arm, ResultsByArm
+from experiments.runs.loops import AS_TRAINED
 from experiments.runs.training_run import RunResult
 from ncs_gym import LinearPlant
 
@@ -34,6 +37,10 @@ _INK = "#222222"
 _LIMIT = {"color": _INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
 # Marker sizes of the first and of the last arm [points], and widths of lines: where arms coincide, all are visible.
 _SIZES, _WIDTHS = (12.0, 7.5), (2.6, 1.2)
+# Panels of the scatter figure beside each other.
+_PANELS = 3
+# What happened in an episode, by the name of the arm.
+_Paths = dict[str, Trajectory]
 # Curves of fewer points show each point.
 _FEW_POINTS = 5
 # The rate of interventions is averaged over this many steps, an episode of 200 in each of 64 environments: it rises and
@@ -42,46 +49,66 @@ RATE_WINDOW = 64 * 200
 
 
 def comparison_figures(
-    plant: LinearPlant, summary: dict[str, Any], results: ResultsByArm
+    plant: LinearPlant, summary: dict[str, Any], results: ResultsByArm, shown: ShownEpisode
 ) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name, what the findings are about first."""
-    arms = {name: results[name] for name in summary["arms"]}
+    """Returns caption and PNG file of every figure by name, what the findings are about first.
+
+    There is none of the training where nothing happened in it: no episode was finished, nothing violated or overridden.
+    """
+    arms, styles = {name: results[name] for name in summary["arms"]}, arm_styles(summary["arms"])
     trained = {name: runs for name, runs in arms.items() if runs[0].history}
-    figures = {"scatter": scatter_figure(summary["arms"])}
-    if trained:
-        figures["training"] = training_figure(trained)
-    figures["episode"] = episode_figure(plant, arms)
+    points = [point for runs in trained.values() for result in runs for point in result.history]
+    figures = {"scatter": scatter_figure(summary["arms"], styles)}
+    if any(np.isfinite(each.episode_return) or each.violation_steps or each.interventions for each in points):
+        figures["training"] = training_figure(trained, styles)
+    figures["episode"] = episode_figure(plant, shown, styles)
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}
 
 
-def scatter_figure(summary: dict[str, dict[str, Any]]) -> CaptionedFigure:
-    """Returns mean return against violating episodes of every arm, from the summaries of the arms."""
+def scatter_figure(summary: dict[str, dict[str, Any]], styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
+    """Returns mean return against violating episodes of every arm, a panel per scenario, from the arms' summaries."""
     caption = (
         f"Cost and return in evaluation, better to the upper left. {_vertical_bars(summary)}"
         " horizontal bars Clopper and Pearson's 95 % interval of violating episodes given the trained"
-        " agents. Markers differ in size only to show where they coincide. Violations are those of the true state,"
+        " agents; long ones leave the figure, tables have all ends."
+        " Markers differ in size only to show where they coincide. Violations are those of the true state,"
         " returns the environment's own, without penalties. Episodes that end early sum fewer steps."
     )
+    scenarios = [AS_TRAINED, *next(iter(summary.values()))["conditions"]]
     with matplotlib.rc_context(STYLE):
-        figure = CaptionedFigure((7.5, 4.4), caption)
-        axis, handles = figure.subplots(), {}
-        for (name, arm), size in zip(summary.items(), np.linspace(*_SIZES, len(summary)), strict=True):
-            style = replace(ArmStyle.of(name), size=float(size))
-            handles[name] = style.handle(line=False, points=True)
-            if arm["runs"] > 1:
-                rates = [100.0 * rate for rate in arm["eval_violation_rate_by_run"]]
-                dots = {"mfc": style.color, "mec": "white", "mew": 0.6, "zorder": 2.5}
-                axis.plot(rates, arm["eval_return_by_run"], "o", ms=4.5, **dots)
-            rate, mean = arm["eval_violation_rate"], arm["eval_return_mean"]
-            draw_estimate(axis, style, rate, arm["eval_violation_rate_ci95"], mean, arm["eval_return_ci95"])
-        label(axis, "violating evaluation episodes [%]", "mean return per episode")
-        high = axis.dataLim.x1 if axis.dataLim.x1 > 0.0 else 1.0
-        axis.set_xlim(-0.04 * high, 1.06 * high)  # space for markers at zero
-        axis.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
-        axis.xaxis.set_major_formatter(thousands)
-        axis.yaxis.set_major_formatter(thousands)
-        legend_below(figure, handles)
+        rows, columns = -(-len(scenarios) // _PANELS), min(len(scenarios), _PANELS)
+        figure = CaptionedFigure((7.5 if columns == 1 else 5.0 * columns, 0.8 + 3.6 * rows), caption)
+        axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        sizes = np.linspace(*_SIZES, len(summary)).tolist()
+        styles = {name: replace(styles[name], size=size) for name, size in zip(summary, sizes, strict=True)}
+        for axis, scenario in zip(axes, scenarios, strict=False):
+            for name, style in styles.items():
+                _draw_evaluated(axis, style, summary[name] | summary[name]["conditions"].get(scenario, {}))
+            title = scenario if len(scenarios) > 1 else ""
+            label(axis, "violating evaluation episodes [%]", "mean return per episode", title)
+            axis.label_outer()
+        for axis in axes[len(scenarios) :]:
+            axis.set_visible(False)
+        high = max(max(axis.dataLim.x1 for axis in axes), 1.0)
+        axes[0].set_xlim(-0.04 * high, 1.06 * high)  # space for markers at zero
+        returns = [y for axis in axes for line in axis.get_lines() if line.get_ls() == "None" for y in line.get_ydata()]
+        if (reach := max(returns) - min(returns)) > 0.0:
+            axes[0].set_ylim(min(returns) - 0.25 * reach, max(returns) + 0.25 * reach)
+        axes[0].xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+        axes[0].xaxis.set_major_formatter(thousands)
+        axes[0].yaxis.set_major_formatter(thousands)
+        legend_below(figure, {name: style.handle(line=False, points=True) for name, style in styles.items()})
         return figure
+
+
+def _draw_evaluated(axis: Axes, style: ArmStyle, arm: dict[str, Any]) -> None:
+    """Draws an arm's runs, its mean and the intervals of both."""
+    if arm["runs"] > 1:
+        rates = [100.0 * rate for rate in arm["eval_violation_rate_by_run"]]
+        dots = {"ms": 4.5, "mfc": style.color, "mec": "white", "mew": 0.6, "zorder": 2.5}
+        axis.plot(rates, arm["eval_return_by_run"], ls="none", marker="o", **dots)
+    rate, mean = arm["eval_violation_rate"], arm["eval_return_mean"]
+    draw_estimate(axis, style, rate, arm["eval_violation_rate_ci95"], mean, arm["eval_return_ci95"])
 
 
 def _vertical_bars(summary: dict[str, dict[str, Any]]) -> str:
@@ -98,7 +125,7 @@ def _vertical_bars(summary: dict[str, dict[str, Any]]) -> str:
     return f"{text}vertical bars are Student's 95 % interval of the mean return over runs{fixed},"
 
 
-def training_figure(arms: ResultsByArm) -> CaptionedFigure:
+def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
     """Returns return, violating steps so far and intervention rate against training steps, bands over runs.
 
     Without an arm that watches for unsafe actions there is no third panel.
@@ -110,7 +137,7 @@ def training_figure(arms: ResultsByArm) -> CaptionedFigure:
         axes = figure.subplots(1, 3 if watching else 2)
         for name, results in arms.items():
             steps, returns, violations, interventions = _histories(results)
-            style, few = ArmStyle.of(name), few or len(steps) < _FEW_POINTS
+            style, few = styles[name], few or len(steps) < _FEW_POINTS
             _draw_curve(axes[0], steps, returns, style)
             # Before the first step nothing has happened: true, and a curve even where the history is one point.
             _draw_curve(axes[1], np.array([0.0, *steps]), np.pad(violations, ((0, 0), (1, 0))), style)
@@ -131,7 +158,7 @@ def training_figure(arms: ResultsByArm) -> CaptionedFigure:
             axis.set_ylim(-0.02 * high, 1.06 * high)  # a curve at zero keeps its width above the axis
         if not np.isfinite(axes[0].dataLim.y1):
             axes[0].text(0.5, 0.5, "no episode was finished", ha="center", transform=axes[0].transAxes)
-        handles: dict[str, Artist] = {name: ArmStyle.of(name).handle(points=few) for name in arms}
+        handles: dict[str, Artist] = {name: styles[name].handle(points=few) for name in arms}
         if any(len(results) > 1 for results in arms.values()):
             handles["lowest to highest run"] = Patch(color="#555555", alpha=0.2, lw=0.0)
         legend_below(figure, handles)
@@ -189,39 +216,67 @@ def _draw_curve(axis: Axes, steps: np.ndarray, values: np.ndarray, style: ArmSty
     axis.plot(steps, values.mean(axis=0), lw=1.9, **style.line, **points)
 
 
-def _shown_arms(names: Sequence[str]) -> list[str]:
-    """Returns the pair to show: the unshielded arm, or else another one without a shield, and the first shielded one.
+class ShownEpisode(NamedTuple):
+    """The evaluation episode that is drawn, of one or two arms.
 
-    There are fewer where no arm is shielded or all are.
+    Attributes:
+        run: Number of the run.
+        scenario: Scenario of the evaluation.
+        episode: Number of the episode.
+        paths: What happened in it by the name of the arm, that without a shield first.
     """
-    shielded = [name for name in names if Arm.of(name).is_shielded]
-    bare = sorted((name for name in names if name not in shielded), key=lambda name: name != "unshielded")
-    return bare[:1] + shielded[:1]
+
+    run: int
+    scenario: str
+    episode: int
+    paths: _Paths
 
 
-def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
-    """Returns the same evaluation episode of the first runs of the shown arms.
+def most_overridden(
+    episodes: pd.DataFrame, arms: Sequence[str], path_of: Callable[[str, int, str, int], Trajectory]
+) -> ShownEpisode:
+    """Returns the episode in which a shielded arm is overridden most, beside an arm without a shield if there is one.
+
+    Args:
+        episodes: The table of all episodes.
+        arms: Names of the arms of which it may be.
+        path_of: Returns what happened, given arm, run, scenario and episode.
+    """
+    known = {name: Arm.of(name) for name in arms}
+    shielded = [name for name in arms if known[name].is_shielded]
+    rows = episodes[episodes["arm"].isin(shielded or arms[:1])]
+    row = rows.iloc[int(rows["overridden"].argmax())]
+    bare = [name for name in arms if name not in shielded and name != row["arm"]]
+    bare.sort(key=lambda name: (known[name].policy != known[row["arm"]].policy, name != "unshielded"))
+    at = int(row["run"]), str(row["scenario"]), int(row["episode"])
+    return ShownEpisode(*at, {name: path_of(name, *at) for name in [*bare[: bool(shielded)], str(row["arm"])]})
+
+
+def episode_figure(plant: LinearPlant, shown: ShownEpisode, styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
+    """Returns an evaluation episode of one or two arms over time.
 
     From above: how close state and estimate come to a limit, a panel per input, and a row of ticks per kind of event.
     """
-    paths = {name: arms[name][0].trajectory for name in _shown_arms(list(arms))}
+    paths, title = shown.paths, f"Episode {shown.episode} of run {shown.run}, {shown.scenario}"
+    why = ", where the shield overrides most" if any(path.intervened.any() for path in paths.values()) else ""
     caption = (
-        f"Time series: the first evaluation episode of the first run, {' and '.join(paths)}, with common random"
-        " numbers. Above, how close true state and estimate come to the limits: one beyond 1 violates a limit. Crosses"
-        " mark violations, also of limits of inputs and between two samples, which the curve does not show. Below, the"
-        " applied inputs. Ticks mark packet arrivals and interventions; a monitor's are what the shield would have"
-        " done."
-        " An episode that is shorter ended at its first violation."
+        f"Time series: episode {shown.episode} of run {shown.run} ({shown.scenario}){why}, {' and '.join(paths)}, with"
+        " common random numbers. Above, how close true state and estimate come to the limits: one beyond 1 violates a"
+        " limit. Crosses mark violations, also of limits of inputs and between two samples, which the curve does not"
+        " show. Below, the applied inputs. Ticks mark packet arrivals and interventions; a monitor's are what the"
+        " shield would have done. An episode that is shorter ended at its first violation."
     )
     rows = len(paths) + sum(Arm.of(name).mode is not None for name in paths)
     heights = [1.5, *[1.0] * plant.m, 0.16 + 0.17 * rows]
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((11.0, 1.2 + 1.45 * sum(heights)), caption)
         axes = figure.subplots(2 + plant.m, 1, sharex=True, height_ratios=heights)
-        handles = _draw_states(axes[0], paths, plant)
+        colors = {name: styles[name].color for name in paths}
+        handles = _draw_states(axes[0], paths, colors, plant)
         for i in range(plant.m):
-            handles |= _draw_input(axes[1 + i], paths, plant, i)
-        _draw_events(axes[-1], paths, plant)
+            handles |= _draw_input(axes[1 + i], paths, colors, plant, i)
+        _draw_events(axes[-1], paths, colors, plant)
+        axes[0].set_title(title)
         label(axes[-1], "time [s]", "")
         axes[-1].set_xlim(0.0, plant.dt * max(len(path.inputs) for path in paths.values()))
         figure.align_ylabels(axes[:-1])
@@ -229,11 +284,11 @@ def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
         return figure
 
 
-def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, Artist]:
+def _draw_states(axis: Axes, paths: _Paths, colors: dict[str, str], plant: LinearPlant) -> dict[str, Artist]:
     """Draws how close states and estimates come to a limit, 1 for one that is reached, and marks the violations."""
     handles: dict[str, Artist] = {}
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
-        color, time = ArmStyle.of(name).color, plant.dt * np.arange(len(path.states))
+        color, time = colors[name], plant.dt * np.arange(len(path.states))
         true, estimated = (1.0 + plant.constraint_values(x.T).max(axis=0) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
         (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_INK, lw=1.1, ls=":", zorder=3)
@@ -241,7 +296,7 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
             (cross,) = axis.plot(time[violating], true[violating], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
             handles["violation"] = cross
     handles["limit"] = axis.axhline(1.0, **_LIMIT)
-    label(axis, "", "closest limit", "First evaluation episode of the first run")
+    label(axis, "", "closest limit")
     axis.set_ylim(0.0, max(1.12, axis.get_ylim()[1]))
     return handles
 
@@ -252,11 +307,11 @@ def _violating(path: Trajectory, plant: LinearPlant) -> np.ndarray:
     return outside | np.concatenate([[False], path.violated])
 
 
-def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i: int) -> dict[str, Artist]:
+def _draw_input(axis: Axes, paths: _Paths, colors: dict[str, str], plant: LinearPlant, i: int) -> dict[str, Artist]:
     """Draws one input of all arms, and what was proposed in its place."""
     handles: dict[str, Artist] = {}
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
-        color, edges = ArmStyle.of(name).color, plant.dt * np.arange(len(path.inputs) + 1)
+        color, edges = colors[name], plant.dt * np.arange(len(path.inputs) + 1)
         axis.stairs(path.inputs[:, i], edges, baseline=None, color=color, lw=width)
         changed = path.intervened & (path.inputs != path.proposed).any(axis=1)
         if changed.any():
@@ -272,14 +327,14 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
     return handles
 
 
-def _draw_events(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -> None:
+def _draw_events(axis: Axes, paths: _Paths, colors: dict[str, str], plant: LinearPlant) -> None:
     names = []
     for name, path in paths.items():
-        mode, color = Arm.of(name).mode, ArmStyle.of(name).color
+        mode = Arm.of(name).mode
         rows = [("packet arrivals", 1.0 + np.flatnonzero(path.arrivals), _INK)]
         if mode is not None:
             acted = "would override" if mode == "monitor" else "interventions"
-            rows.append((acted, 0.5 + np.flatnonzero(path.intervened), color))
+            rows.append((acted, 0.5 + np.flatnonzero(path.intervened), colors[name]))
         for event, steps, shown in rows:
             axis.vlines(plant.dt * steps, len(names) - 0.36, len(names) + 0.36, color=shown, lw=1.2)
             names.append(f"{event}, {name} ({len(steps):,})")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import matplotlib
@@ -101,16 +102,16 @@ def _width(names: list[str], columns: int) -> float:
 # Color (Okabe and Ito's palette, which color-blind readers can distinguish) and marker (for print without color).
 ARM_COLORS_AND_MARKERS = {
     "unshielded": ("#D55E00", "o"),
-    "monitor": ("#4D4D4D", "D"),
-    "penalized": ("#E69F00", "s"),
     "shielded": ("#0072B2", "^"),
-    "shielded:project": ("#56B4E9", "v"),
     "shielded:switch": ("#009E73", "P"),
     "shielded:boundary": ("#CC79A7", "X"),
     "shielded:lookahead": ("#000080", "p"),
-    "lagrangian": ("#DDCC77", "d"),
+    "penalized": ("#E69F00", "s"),
+    "shielded:project": ("#56B4E9", "v"),
     "trusting": ("#7F0000", "<"),
     "psf": ("#117733", ">"),
+    "lagrangian": ("#DDCC77", "d"),
+    "monitor": ("#4D4D4D", "D"),
     "controller": ("#BBBBBB", "*"),
 }
 # Markers of policies that are not trained, in the color of what they are behind.
@@ -121,7 +122,7 @@ _CONTROLLER_MARKERS = {
     "K x_hat": "1",
     "zero input": "2",
     "untrained": "3",
-    "pretrained": "4",
+    "pretrained": "*",
 }
 # Filters that share the color of another one.
 _HOLLOW = ("psf:tube",)
@@ -150,7 +151,7 @@ class ArmStyle:
 
     @classmethod
     def of(cls, name: str) -> ArmStyle:
-        """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
+        """Returns an arm's own style: the color stands for the shield, dashed lines and hollow markers for a penalty.
 
         Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
         is the unshielded one and whose curves lie on that arm's. A price of one's own has long dashes and
@@ -204,6 +205,17 @@ def _look_of(arm: Arm) -> str:
         return arm.mode.partition(":")[0]
     named = f"shielded:{arm.mode}"
     return named if named in arm.name or arm.mode == "lookahead" else "shielded"
+
+
+def arm_styles(names: Iterable[str]) -> dict[str, ArmStyle]:
+    """Returns the styles of arms that are drawn together: where two would share a color, the later gets a free one."""
+    styles = {name: ArmStyle.of(name) for name in names}
+    wanted, seen = {style.color for style in styles.values()}, set()
+    free = iter([color for color, _ in ARM_COLORS_AND_MARKERS.values() if color not in wanted])
+    for name, style in styles.items():
+        styles[name] = replace(style, color=next(free, style.color)) if style.color in seen else style
+        seen.add(style.color)
+    return styles
 
 
 def draw_estimate(

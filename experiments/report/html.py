@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
-from experiments.plots.figure_style import ArmStyle
+from experiments.plots.figure_style import arm_styles
 from experiments.runs.arms import Arm
 from shields import Report
 
@@ -30,6 +30,7 @@ def comparison_report(summary: dict[str, Any], verification: Report, figures: Fi
     images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
     return _template().render(
         images=images,
+        colors={name: style.color for name, style in arm_styles(summary["arms"]).items()},
         percent=f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%",
         resamples=RESAMPLES,
         title=f"Safe learning on {settings['env']}",
@@ -60,10 +61,8 @@ def _template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.tests["arm"] = _is_trained_arm
     environment.filters |= {
         "arm_of": Arm.of,
-        "arm_color": lambda name: ArmStyle.of(name).color,
         "combined": lambda first, second: first | second,
         "decimal": _decimal,
         "interval": _interval,
@@ -71,14 +70,6 @@ def _template() -> Template:
         "thousands": lambda count: f"{count:,}",
     }
     return environment.get_template("comparison.html.j2")
-
-
-def _is_trained_arm(name: str) -> bool:
-    """Returns whether a text is the name of an arm whose agents are trained: figures give it a color."""
-    try:
-        return Arm.of(name).is_trained
-    except ValueError:
-        return False
 
 
 def _image(caption: str, png: bytes) -> dict[str, Any]:

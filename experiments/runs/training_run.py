@@ -18,7 +18,7 @@ from agents.agent_file import AGENT_FILES, write_files
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
-from agents.results import HISTORY_FILE, Episode, TrainingPoint, Trajectory
+from agents.results import HISTORY_FILE, Episode, Evaluation, TrainingPoint, Trajectory
 from experiments.baselines import controller, tuned_weights
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
@@ -48,7 +48,6 @@ class RunResult:
         train_interventions: Number of training steps in which the shield intervened.
         history: Running totals during the training.
         episodes: Evaluation episodes.
-        trajectory: Trajectory of the first evaluation episode.
         files: Contents of the trained agent's files by name; empty if nothing was trained.
         scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
         went_on_after: Steps of an interrupted training that this one went on from; 0 for none.
@@ -61,7 +60,6 @@ class RunResult:
     train_interventions: int
     history: list[TrainingPoint]
     episodes: list[Episode]
-    trajectory: Trajectory
     files: dict[str, bytes] = field(default_factory=dict)
     scenarios: dict[str, list[Episode]] = field(default_factory=dict)
     went_on_after: int = 0
@@ -71,10 +69,8 @@ class RunResult:
         """Returns the result of what `dataclasses.asdict` made of it, arrays as lists, without files."""
         episodes = [Episode(**each) for each in values["episodes"]]
         history = [TrainingPoint(**each) for each in values["history"]]
-        trajectory = Trajectory(**{name: np.array(each) for name, each in values["trajectory"].items()})
         scenarios = {name: [Episode(**each) for each in played] for name, played in values["scenarios"].items()}
-        parts = {"episodes": episodes, "history": history, "trajectory": trajectory, "scenarios": scenarios}
-        return cls(**values | parts)
+        return cls(**values | {"episodes": episodes, "history": history, "scenarios": scenarios})
 
     @property
     def outcome(self) -> str:
@@ -227,12 +223,7 @@ class TrainingRun:
                 history=history,
             )
         agent = trained.agent if trained else _agent_of(self)
-        evaluations = {}
-        for scenario in (AS_TRAINED, *self.scenarios):
-            loop, policy = under(scenario, self.loop), _policy(self, agent)  # a random policy begins anew each time
-            level = self.certificate.polytope or self.certificate.M
-            evaluations[scenario] = evaluate(loop, policy, self.episodes, self.evaluation_seed, level, on_progress)
-        evaluation = evaluations.pop(AS_TRAINED)
+        played = {name: self._evaluated(agent, name, on_progress).episodes for name in (AS_TRAINED, *self.scenarios)}
         return RunResult(
             arm=self.arm,
             index=self.index,
@@ -240,12 +231,23 @@ class TrainingRun:
             train_violation_steps=trained.violation_steps if trained else 0,
             train_interventions=trained.interventions if trained else 0,
             history=trained.history if trained else [],
-            episodes=evaluation.episodes,
-            trajectory=evaluation.trajectory,
+            episodes=played.pop(AS_TRAINED),
             files=trained.agent.files() if trained else {},
-            scenarios={scenario: each.episodes for scenario, each in evaluations.items()},
+            scenarios=played,
             went_on_after=self.went_on_after,
         )
+
+    def trajectory(self, models: Path, scenario: str, episode: int) -> Trajectory:
+        """Returns an episode of the evaluation of this run, played again with its agent from the folder of all."""
+        agent = _loaded(models / self.name) if self.trains else _agent_of(self)
+        return self._evaluated(agent, scenario, None, episode).trajectory
+
+    def _evaluated(
+        self, agent: Agent | None, scenario: str, on_progress: Callable[[int], None] | None, shown: int = 0
+    ) -> Evaluation:
+        loop, policy = under(scenario, self.loop), _policy(self, agent)  # a random policy begins anew each time
+        safe_set = self.certificate.polytope or self.certificate.M
+        return evaluate(loop, policy, self.episodes, self.evaluation_seed, safe_set, on_progress, shown)
 
     def _seeds(self, *more: int) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""

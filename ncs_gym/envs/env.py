@@ -410,7 +410,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     def annotate(self, annotation: Annotation) -> None:
         """Shows what a shield knows in the picture of the next step or reset; nothing where nothing is drawn."""
         if self.renderer is not None:
-            self.renderer.annotate(annotation)
+            self.renderer.episode.next_annotation = annotation
 
     @property
     def episode_channel(self) -> Channel:

@@ -86,35 +86,28 @@ class EpisodeRecord:
         path: The recent states, oldest first, each of shape (n,).
         interventions: Whether the shield replaced the input that led to each of these states.
         packets: The recent packets, oldest first.
-        missing_inputs: Number of steps of this episode in which the downlink broke and zero was applied.
         annotation: What the shield knows about the step that led here; None without a shield.
-        distance: Distance driven in this episode, if the task knows a speed [m].
+        next_annotation: What it knows about the next step or reset, until that is recorded.
     """
 
     def __init__(self, plant: LinearPlant, task: Task) -> None:
         self.plant, self._task = plant, task
-        self._next_annotation: Annotation | None = None
-
-    def annotate(self, annotation: Annotation) -> None:
-        """Stores what is to be shown with the next step or reset."""
-        self._next_annotation = annotation
+        self.next_annotation: Annotation | None = None
 
     def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
         """Starts an episode, with the info of its reset."""
-        self.step, self.distance, self.missing_inputs = 0, 0.0, 0
+        self.step = 0
         self.path: deque[np.ndarray] = deque(maxlen=RECENT_STEPS)
         self.interventions: deque[bool] = deque(maxlen=RECENT_STEPS)
         self.packets: deque[PacketRecord] = deque(maxlen=RECENT_STEPS)
-        note = self._next_annotation
+        note = self.next_annotation
         if note is not None:  # nothing is proposed at a start, also where a step led to it
-            self._next_annotation = replace(note, proposed=None, intervened=False, interventions=0)
+            self.next_annotation = replace(note, proposed=None, intervened=False, interventions=0)
         self._store(info, task_state)
 
     def add(self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None) -> None:
         """Adds a step, with its info and what became of its sample; None where none is sent."""
         self.step += 1
-        if isinstance(self._task, SpeedTracking):
-            self.distance += self.plant.dt * float(task_state[0])
         self._store(info, task_state)
         if sent is not None:
             self.packets.append(sent)
@@ -122,20 +115,16 @@ class EpisodeRecord:
     def _store(self, info: Mapping[str, Any], task_state: Any) -> None:
         self.info, self._task_state = deepcopy(dict(info)), task_state
         self.state, self.estimate, self.violated = self.info["state"], self.info["estimate"], bool(info["cost"] > 0.0)
-        self.annotation, self._next_annotation = (note := self._next_annotation), None
+        self.annotation, self.next_annotation = (note := self.next_annotation), None
         self.intervened = note is not None and note.intervened and note.protects
         self.path.append(self.state)
         self.interventions.append(note is not None and note.intervened)
-        self.missing_inputs += bool(info["downlink_broken"])
 
     @property
     def planned_states(self) -> np.ndarray:
-        """Where the inputs in the shield's store lead from the estimate, undisturbed, shape (k + 1, n), or (0, n)."""
-        plan = None if self.annotation is None else self.annotation.plan
-        if plan is None or len(plan) == 0:
-            return np.empty((0, self.plant.n))
-        states = [self.estimate]
-        for u in plan:
+        """Where the inputs in the shield's store lead from the estimate, undisturbed, shape (k + 1, n)."""
+        plan, states = self.annotation and self.annotation.plan, [self.estimate]
+        for u in () if plan is None else plan:
             states.append(self.plant.A @ states[-1] + self.plant.B @ u)
         return np.array(states)
 
@@ -148,14 +137,11 @@ class EpisodeRecord:
             return TrackedOutput("speed", "m/s", value, target, 0.0, task.fastest)
         if not isinstance(task, SetpointTracking):
             return None
-        used, name, unit, factor = np.flatnonzero(task.output), "output", "", 1.0
-        if len(used) == 1:  # a multiple of a state, which is shown itself
-            i = int(used[0])
-            name, unit, factor = plant.state_names[i], plant.state_units[i], float(task.output[i])
-        value, target = float(task.output @ self.state), float(task.target(self._task_state))
-        numbers = float(task.output @ plant.operating_state) + np.array([value, target, -task.reach, task.reach])
-        value, target, *ends = (numbers / factor).tolist()
-        return TrackedOutput(name, unit, value, target, min(ends), max(ends))
+        first = int(np.argmax(task.output))
+        is_state = np.array_equal(task.output, np.eye(plant.n)[first])
+        name, unit = (plant.state_names[first], plant.state_units[first]) if is_state else ("output", "")
+        numbers = [task.output @ self.state, float(task.target(self._task_state)), -task.reach, task.reach]
+        return TrackedOutput(name, unit, *(task.output @ plant.operating_state + np.array(numbers)).tolist())
 
 
 def sent_at(step: int, network: ChannelState, arrived: list[Packet]) -> PacketRecord | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import ceil, log10
 
 import numpy as np
@@ -12,7 +13,7 @@ from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, TrackedO
 from ncs_gym.validation import counted
 
 # The largest number of inputs that are drawn, and the height of a row [pixels].
-_MAX_INPUTS, _ROW = 3, 42.0
+_MAX_INPUTS, ROW = 3, 42.0
 
 
 def draw_header(canvas: Canvas, episode: EpisodeRecord) -> None:
@@ -25,42 +26,29 @@ def draw_header(canvas: Canvas, episode: EpisodeRecord) -> None:
     text = counted(count, "violation") if count else "no violation"
     color, fill = (theme.DANGER, theme.DANGER_FILL) if count else (theme.SAFE, theme.SAFE_FILL)
     left = _draw_label(canvas, theme.WIDTH - 16, text, color, fill, filled=episode.violated)
-    if (note := episode.annotation) is None:
-        _draw_label(canvas, left - 10, "no shield", theme.INK, theme.GRID, filled=False)
-    else:
-        _draw_label(canvas, left - 10, _shield_text(note), theme.SHIELD, theme.SHIELD_FILL, filled=episode.intervened)
+    color, fill = (theme.SHIELD, theme.SHIELD_FILL) if episode.annotation else (theme.INK, theme.GRID)
+    _draw_label(canvas, left - 10, _shield_text(episode.annotation), color, fill, filled=episode.intervened)
 
 
 def draw_panel(canvas: Canvas, episode: EpisodeRecord) -> None:
     """Draws inputs, tracked output and the legend."""
-    inputs, tracked, y = min(episode.plant.m, _MAX_INPUTS), episode.tracked, theme.PANEL.y
+    inputs = min(episode.plant.m, _MAX_INPUTS)
     for i in range(inputs):
-        _draw_input(canvas, episode, i, y + _ROW * i)
-    y += _ROW * inputs
-    if tracked is not None:
-        _draw_tracked_output(canvas, tracked, y)
-        y += _ROW
-    if hidden := episode.plant.m - inputs:
-        canvas.text(f"and {counted(hidden, 'more input')}", (theme.PANEL.right, y), theme.MUTED, align=1.0)
+        _draw_input(canvas, episode, i, theme.PANEL.y + ROW * i)
+    if (tracked := episode.tracked) is not None:
+        _draw_tracked_output(canvas, tracked, theme.PANEL.y + ROW * inputs)
+    if episode.info["downlink_broken"]:
+        canvas.text("downlink broken: zero input", (theme.PANEL.x, 412), theme.DANGER, bold=True)
     _draw_legend(canvas, episode.annotation)
 
 
-def draw_plan(canvas: Canvas, points: np.ndarray) -> None:
-    """Draws where a stored plan leads as a dotted tail with a dot at each step; nothing without a plan."""
-    if len(points) > 1:
-        canvas.dashed(points, theme.PLAN, 1.5, dash=2.0)
-    for point in points[1:]:
-        canvas.circle(point, 2.5, theme.PLAN)
-
-
-def _shield_text(note: Annotation) -> str:
+def _shield_text(note: Annotation | None) -> str:
+    if note is None:
+        return "no shield"
     count = f"{note.interventions}\N{MULTIPLICATION SIGN}"
     if not note.protects:
         return f"shield only watches: would act {count}"
-    if note.intervened:
-        return f"SHIELD ACTS {count}"
-    ahead = 0 if note.plan is None else len(note.plan)  # for as long the box is kept in any case
-    return f"shield ({f'{ahead} steps ahead' if ahead else note.label}): acted {count}"
+    return f"SHIELD ACTS {count}" if note.intervened else f"shield ({note.label}): acted {count}"
 
 
 def _draw_label(
@@ -74,24 +62,30 @@ def _draw_label(
     return right - width
 
 
-def _draw_row(canvas: Canvas, y: float, name: str, value: str, color: theme.Color) -> theme.Rect:
-    """Draws the name and the value of a row of the panel and its empty bar; returns where the bar is."""
-    width = canvas.text(value, (theme.PANEL.right, y + 6), color, align=1.0, bold=True)
-    canvas.text(name, (theme.PANEL.x, y + 6), theme.INK, max_width=theme.PANEL.w - width - 8)
-    bar = theme.Rect(theme.PANEL.x, y + 18, theme.PANEL.w, 12)
-    canvas.rect(bar, theme.MIST, radius=4)
-    return bar
+def draw_bar(
+    canvas: Canvas,
+    place: tuple[float, float],
+    name: str,
+    text: str,
+    colors: tuple[theme.Color, theme.Color],
+    ends: np.ndarray,
+    values: Sequence[float],
+) -> tuple[theme.Rect, list[float]]:
+    """Draws a row at a place, its upper left corner: name, text, and below a bar from a zero to a value.
 
-
-def places_on(bar: theme.Rect, ends: np.ndarray, *values: float) -> list[float]:
-    """Returns where values are on a bar from the first to the second end, or at its ends if beyond [pixels]."""
+    `colors` are those of text and bar, `ends` the values at both ends of the bar, `values` the zero, the value and
+    others. Returns the bar's rectangle and where the others are on it, or its end if they are beyond [pixels].
+    """
+    x, y = place
+    width = canvas.text(text, (x + theme.PANEL.w, y + 6), colors[0], align=1.0, bold=True)
+    canvas.text(name, (x, y + 6), theme.INK, max_width=theme.PANEL.w - width - 8)
+    bar = theme.Rect(x, y + 18, theme.PANEL.w, 12)
+    canvas.rect(bar, theme.GRID, radius=4)
     loads = np.clip((np.array(values) - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
-    return (bar.x + 6 + (bar.w - 12) * loads).tolist()
-
-
-def fill(canvas: Canvas, bar: theme.Rect, start: float, end: float, color: theme.Color) -> None:
-    """Fills a bar between two places."""
-    canvas.rect(theme.Rect(min(start, end), bar.y + 2, abs(end - start), bar.h - 4), color)
+    zero, end, *others = (bar.x + 6 + (bar.w - 12) * loads).tolist()
+    canvas.rect(theme.Rect(min(zero, end), bar.y + 2, abs(end - zero), bar.h - 4), colors[1])
+    canvas.line([(zero, bar.y - 2), (zero, bar.bottom + 2)], theme.MUTED, 1.0)
+    return bar, others
 
 
 def _draw_input(canvas: Canvas, episode: EpisodeRecord, index: int, y: float) -> None:
@@ -100,58 +94,37 @@ def _draw_input(canvas: Canvas, episode: EpisodeRecord, index: int, y: float) ->
     limit, value = float(plant.largest_input[index]), float(info["input"][index])
     color = theme.SHIELD if episode.intervened else theme.STEEL
     text = theme.value_label(value + float(plant.operating_input[index]), limit, plant.input_units[index])
-    bar = _draw_row(canvas, y, plant.input_names[index], text, color)
     proposed = None if note is None or not note.intervened else note.proposed
     arrow = [] if proposed is None else [proposed[index], info["input_committed"][index]]
-    zero, x, *arrow = places_on(bar, plant.input_ends[:, index], 0.0, value, *arrow)
-    fill(canvas, bar, zero, x, color)
-    canvas.line([(zero, bar.y - 2), (zero, bar.bottom + 2)], theme.MUTED, 1.0)
-    if arrow:
-        _draw_correction(canvas, arrow[0], arrow[1], bar.y + bar.h / 2)
-
-
-def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None:
-    canvas.circle((start, y), 5.0, theme.PAPER)
-    canvas.circle((start, y), 5.0, theme.SHIELD, width=2.0)
+    place, ends, values = (theme.PANEL.x, y), plant.input_ends[:, index], [0.0, value, *arrow]
+    bar, arrow = draw_bar(canvas, place, plant.input_names[index], text, (color, color), ends, values)
+    if not arrow:
+        return
+    (start, end), height, side = arrow, bar.y + bar.h / 2, np.sign(arrow[1] - arrow[0])
+    canvas.circle((start, height), 5.0, theme.PAPER)
+    canvas.circle((start, height), 5.0, theme.SHIELD, width=2.0)
     if abs(end - start) > 14:
-        side = np.sign(end - start)
-        canvas.line([(start + 6 * side, y), (end - 8 * side, y)], theme.SHIELD, 2.0)
-        canvas.polygon([(end, y), (end - 10 * side, y - 6), (end - 10 * side, y + 6)], theme.SHIELD)
+        canvas.line([(start + 6 * side, height), (end - 8 * side, height)], theme.SHIELD, 2.0)
+        canvas.polygon([(end, height), (end - 10 * side, height - 6), (end - 10 * side, height + 6)], theme.SHIELD)
 
 
 def _draw_tracked_output(canvas: Canvas, tracked: TrackedOutput, y: float) -> None:
     low, high = tracked.low, tracked.high
-    numbers = [theme.value_label(value, max(abs(low), abs(high))) for value in (tracked.value, tracked.target)]
-    if low >= 0.0:
-        numbers = [number.removeprefix("+") for number in numbers]
+    numbers = [theme.value_label(value, max(abs(low), abs(high))).removeprefix("+") for value in tracked[2:4]]
     text = f"{numbers[0]} \N{RIGHTWARDS ARROW} {numbers[1]} {theme.unit_label(tracked.unit)}".strip()
-    bar = _draw_row(canvas, y, f"{tracked.name}, target", text, theme.SAFE)
-    zero, x, target = places_on(bar, np.array([low, high]), max(low, 0.0), tracked.value, tracked.target)
-    fill(canvas, bar, zero, x, theme.STEEL)
+    place, colors, values = (theme.PANEL.x, y), (theme.SAFE, theme.STEEL), (max(low, 0.0), *tracked[2:4])
+    bar, (target,) = draw_bar(canvas, place, f"{tracked.name}, target", text, colors, np.array([low, high]), values)
     canvas.line([(target, bar.y - 2), (target, bar.bottom + 2)], theme.SAFE, 3.0)
     canvas.polygon([(target, bar.y + 4), (target - 5, bar.y - 3), (target + 5, bar.y - 3)], theme.SAFE)
 
 
 def _draw_legend(canvas: Canvas, note: Annotation | None) -> None:
-    """Draws what the marks of the phase plane mean."""
-    rows = [theme.PANEL.bottom - 59 + 17 * i for i in range(4)]
-    left, right = theme.PANEL.x + 7, theme.PANEL.x + 150
-    canvas.circle((left, rows[0]), 4.0, theme.INK)
-    canvas.circle((left, rows[1]), 5.0, theme.ESTIMATE, width=1.5)
-    discs = [((left, rows[2]), theme.ERROR_FILL, theme.LATE)]
-    canvas.dashed([(right - 7, rows[0]), (right + 8, rows[0])], theme.DANGER, 1.5, dash=3.0)
-    states, marks = ["true state", "estimate", "error bound"], ["limits"]
+    """Names the marks of the phase plane."""
+    marks = [("true state", theme.INK, 0.0), ("estimate", theme.ESTIMATE, 1.5), ("error bound", theme.LATE, 1.5)]
     if note is not None:
-        discs.append(((right, rows[1]), theme.SAFE_FILL, theme.SAFE))
-        canvas.circle((right, rows[2]), 3.5, theme.SHIELD)
-        _draw_correction(canvas, right + 4.0, right - 12.0, rows[3])
-        marks += ["safe set", "shield acted", "overridden"]
-        if note.plan is not None:
-            draw_plan(canvas, np.array([(left + x, rows[3]) for x in (-8, 0, 8)]))
-            states += ["stored plan"]
-    for place, color, edge in discs:
-        canvas.circle(place, 6.5, color)
-        canvas.circle(place, 6.5, edge, width=1.5)
-    for x, names in ((left, states), (right, marks)):
-        for name, y in zip(names, rows, strict=False):
-            canvas.text(name, (x + 14, y), theme.INK)
+        marks += [("safe set", theme.SAFE, 2.0), ("shield acted", theme.SHIELD, 0.0)]
+        marks += [("stored plan", theme.PLAN, 0.0)] * (note.plan is not None)
+    for i, (name, color, width) in enumerate(marks):
+        x, y = theme.PANEL.x + 7 + 143 * (i // 3), theme.PANEL.bottom - 42 + 17 * (i % 3)
+        canvas.circle((x, y), 4.0 + 0.5 * width, color, width=width)
+        canvas.text(name, (x + 14, y), theme.INK)

@@ -9,7 +9,6 @@ from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, Annotation, ConvexSet, EpisodeRecord
-from ncs_gym.rendering.panel import draw_plan
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 # The axes reach this far, in units of half their range; a state farther out is drawn so many pixels inside the border.
@@ -35,17 +34,22 @@ def ends_of(plant: LinearPlant, index: int) -> np.ndarray:
     return np.where(np.isfinite(ends), ends, [-reach, reach])
 
 
+def limited_states(plant: LinearPlant) -> list[int]:
+    """Returns the indices of the states with limits of their own, but for past inputs."""
+    return [i for i in range(plant.n - inputs_under_way(plant)) if np.isfinite(plant.own_limits[:, i]).any()]
+
+
 class PhasePlane:
-    """Draws two coordinates of the state, or the only one, beside past inputs, above the time.
+    """Draws the last two states with limits, or the only state, beside past inputs, above the time.
 
     Args:
         plant: The plant, which gives limits, names and units.
-        pair: Indices of the horizontal and the vertical coordinate.
     """
 
-    def __init__(self, plant: LinearPlant, pair: tuple[int, int]) -> None:
-        self._is_timed = plant.n - inputs_under_way(plant) == 1
-        self._axes, chosen = (np.eye(2, plant.n, k=-1), [0]) if self._is_timed else (np.eye(plant.n)[list(pair)], pair)
+    def __init__(self, plant: LinearPlant) -> None:
+        own, limited = plant.n - inputs_under_way(plant), limited_states(plant)
+        chosen, self._is_timed = sorted([*set(range(own)).difference(limited), *limited][-2:]), own == 1
+        self._axes = np.eye(2, plant.n, k=-1) if self._is_timed else np.eye(plant.n)[chosen]
         time = [("time", "steps", np.array([-RECENT_STEPS, 0.0]), np.array([-np.inf, np.inf]))] * self._is_timed
         about = time + [
             (plant.state_names[i], plant.state_units[i], ends_of(plant, i), plant.own_limits[:, i]) for i in chosen
@@ -82,7 +86,11 @@ class PhasePlane:
         for point in path[np.array(episode.interventions)]:
             canvas.circle(point, 3.0, theme.SHIELD)
         plan = episode.planned_states
-        draw_plan(canvas, self.pixels_of(self._points(plan, np.arange(len(plan)))))
+        ahead = self.pixels_of(self._points(plan, np.arange(len(plan))))
+        if len(plan) > 1:
+            canvas.dashed(ahead, theme.PLAN, 1.5, dash=2.0)
+        for point in ahead[1:]:
+            canvas.circle(point, 2.5, theme.PLAN)
         inside = np.array([rect.x, rect.y]) + _BORDER, np.array([rect.right, rect.bottom]) - _BORDER
         marks = np.clip(self.pixels_of(np.array([truth, estimate])), *inside)
         canvas.circle(marks[1], 5.0, theme.ESTIMATE, width=1.5)
@@ -91,12 +99,6 @@ class PhasePlane:
             canvas.circle(marks[0], 9.0, theme.DANGER, width=2.0)
         canvas.clip(None)
         self._draw_axes(canvas)
-        notes = ["state outside the axes"] * bool((np.abs(truth - self._middle) > _AXIS_REACH * self._half).any())
-        if episode.missing_inputs:
-            notes.append(f"downlink broken {episode.missing_inputs}\N{MULTIPLICATION SIGN}: zero input")
-        for i, note in enumerate(notes):  # on the side where the true state is not
-            y = rect.y + 12 + 17 * i if marks[0, 1] > self._center[1] else rect.bottom - 12 - 17 * i
-            canvas.text(note, (self._center[0], y), theme.DANGER, align=0.5, bold=True, max_width=rect.w)
 
     def _points(self, states: object, time: object = 0) -> np.ndarray:
         """Returns where states, shape (k, n), at some times [steps] are in the plane, shape (k, 2)."""

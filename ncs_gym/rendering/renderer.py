@@ -11,7 +11,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.drawings import drawing_of
-from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, PacketRecord
+from ncs_gym.rendering.episode_record import EpisodeRecord, PacketRecord
 from ncs_gym.rendering.panel import draw_header, draw_panel
 from ncs_gym.rendering.phase_plane import PhasePlane
 from ncs_gym.tasks.base_task import Task
@@ -37,7 +37,7 @@ class Renderer:
     def __init__(self, plant: LinearPlant, task: Task, render_mode: str, fps: int) -> None:
         self._is_shown, self._fps, self.scale = render_mode == "human", fps, 1
         self.episode, self._drawing = EpisodeRecord(plant, task), drawing_of(plant)
-        self._plane = PhasePlane(plant, self._drawing.pair)
+        self._plane = PhasePlane(plant)
         self._canvas: Canvas | None = None
 
     def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
@@ -49,10 +49,6 @@ class Renderer:
         """Adds a step, with its info, the state of the task after it, and its sample; None where none is sent."""
         self.episode.add(info, task_state, sent)
         self._show()
-
-    def annotate(self, annotation: Annotation) -> None:
-        """Stores what a shield knows, for the picture of the next step or reset alone."""
-        self.episode.annotate(annotation)
 
     def render(self) -> np.ndarray | None:
         """Returns the present frame, shape (height, width, 3), uint8; in mode "human" shows it and returns None."""

@@ -59,7 +59,6 @@ SHIELD_FILL: Color = (236, 224, 248)
 PLAN: Color = (196, 0, 132)
 STEEL: Color = (88, 110, 134)
 BODYWORK: Color = (10, 80, 132)
-CARGO: Color = (180, 190, 200)
 CRATE: Color = (138, 153, 170)
 GLASS: Color = (204, 225, 240)
 

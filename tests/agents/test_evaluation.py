@@ -67,7 +67,7 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
             return self.env.reset(seed=seed, options=options)
 
     monkeypatch.setattr(gym, "make_vec", lambda *given, **settings: Noting(make_vec(*given, **settings)))
-    played = evaluate(CRUISE, throttle, 8, 100, level_matrix=certificate.M)
+    played = evaluate(CRUISE, throttle, 8, 100, safe_set=certificate.M)
     envs = make_vec(CRUISE.env, num_envs=8)
     plant = envs.unwrapped.plant
     _, info = envs.reset(seed=seeds[0])
@@ -83,7 +83,7 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
         assert record.episode_return == pytest.approx(total[e])
         assert record.violation_steps == (np.abs(states[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum() > 0
         assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum()
-        assert record.largest_level == pytest.approx(max(x @ certificate.M @ x for x in states[:, e]))
+        assert record.times_safe_set == pytest.approx(np.sqrt(max(x @ certificate.M @ x for x in states[:, e])))
         assert not record.guaranteed
     np.testing.assert_array_equal(played.trajectory.states, states[:, 0])
     np.testing.assert_allclose(played.trajectory.estimates, estimates[:, 0], rtol=0.0, atol=1e-12)
@@ -106,7 +106,7 @@ def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
     penalized = LoopConfig(
         env=CRUISE.env, shield=ShieldSettings(shield.certificate, penalty=1.0), violation_penalty=1.0
     )
-    assert free.episodes == evaluate(penalized, throttle, 3, 0).episodes or np.isnan(free.episodes[0].largest_level)
+    assert free.episodes == evaluate(penalized, throttle, 3, 0).episodes or np.isnan(free.episodes[0].times_safe_set)
     for one, other in zip(free.episodes, evaluate(penalized, throttle, 3, 0).episodes, strict=True):
         assert one.guaranteed
         assert one.violation_steps == 0
@@ -140,8 +140,8 @@ def test_levels_are_those_of_the_set_that_the_shield_keeps(certificate, loaded):
     loop = LoopConfig(env=CRUISE.env, shield=ShieldSettings(wide))
     kept = evaluate(loop, throttle, 5, 0, wide.polytope).episodes
     measured_by_the_ellipsoid = evaluate(loop, throttle, 5, 0, wide.M).episodes
-    assert all(record.guaranteed and record.largest_level <= 1.0 for record in kept)
-    assert max(record.largest_level for record in measured_by_the_ellipsoid) > 1.0
+    assert all(record.guaranteed and record.times_safe_set <= 1.0 for record in kept)
+    assert max(record.times_safe_set for record in measured_by_the_ellipsoid) > 1.0
 
 
 def test_arms_have_common_random_numbers(shield):

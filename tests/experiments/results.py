@@ -68,8 +68,6 @@ def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **cha
         "train_interventions": 20,
         "history": history(10, 20, 100, scale=1.0 + index),
         "episodes": episodes,
-        "trajectory": trajectory(np.zeros((11, 2))),
-        "files": {},
     }
     return RunResult(arm=arm, index=index, **(content | change))
 
@@ -77,9 +75,10 @@ def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **cha
 def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str, Any]:
     """The summary of a comparison without reference policies."""
     baseline = next(iter(results))
-    episodes = episodes_table(run for runs in results.values() for run in runs)
+    everything = [run for runs in results.values() for run in runs]
+    episodes = episodes_table(everything)
     return {
-        "arms": arm_summaries(episodes, "project"),
+        "arms": arm_summaries(everything, "project"),
         "references": {},
         "paired_differences": {"baseline": baseline, "arms": paired_differences(episodes, baseline)},
     } | provenance(arms=list(results), **settings)

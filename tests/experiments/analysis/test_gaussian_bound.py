@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.results import Episode
-from experiments.analysis.episodes import arm_summaries, arm_summary, episodes_table
+from experiments.analysis.episodes import arm_summaries, arm_summary
 from experiments.analysis.statistics import clopper_pearson, gaussian_sentences, gaussian_summary, rounded_up
 from experiments.commands.compare import findings_of, gaussian_noise_of
 from experiments.runs.arms import run_of_arm
@@ -30,8 +30,8 @@ def episode(level):
 
 
 def summary_of_episodes(episodes):
-    run = RunResult("shielded", 0, 0, 0, 0, [], episodes, None, {})
-    return arm_summary(episodes_table([run]), "project", fixed_policy=False)
+    run = RunResult("shielded", 0, 0, 0, 0, [], episodes)
+    return arm_summary([run], "project", fixed_policy=False)
 
 
 def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
@@ -66,7 +66,7 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     bounded = replace(run, loop=run.loop.with_kwargs(noise=None))
     assert run.key != bounded.key
     result = run.execute(lambda steps: None)
-    arms = arm_summaries(episodes_table([result, replace(result, arm="monitor")]), "project")
+    arms = arm_summaries([result, replace(result, arm="monitor")], "project")
     summary = gaussian_noise_of(*setup, arms)
     assert (
         summary["bound_violation_probability"]
@@ -76,12 +76,12 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     arm = summary["arms"]["shielded"]
     assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["bound_violation_probability"] <= 1.0
     assert list(summary["arms"]) == ["shielded"]
-    assert max(each.largest_level for each in bounded.execute(lambda steps: None).episodes) <= 1.0
+    assert max(each.times_safe_set for each in bounded.execute(lambda steps: None).episodes) <= 1.0
 
 
 def test_proof_is_not_said_to_have_held_under_gaussian_noise():
     arm = {"shielded": True, "eval_violation_rate_ci95": [0.0, 0.1], "guaranteed_episodes": 3, "eval_episodes": 4}
-    arm |= {"mode": "project", "largest_level": 1.2, "eval_violating_episodes": 0, "intervention_rate": 0.1}
+    arm |= {"mode": "project", "times_safe_set": 1.2, "eval_violating_episodes": 0, "intervention_rate": 0.1}
     arm["train_intervention_rate"] = 0.1
     summary = {"arms": {"shielded": arm}, "references": {}, "paired_differences": {"baseline": "", "arms": {}}}
     assert "the proof held in 3 of 4" in findings_of(summary)[0]

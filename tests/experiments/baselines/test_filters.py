@@ -45,9 +45,9 @@ def played(certificate, **filters):
 def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(certificate):
     trusted = played(certificate, filter=EstimateFilterSettings("trusting", certificate))
     shielded = played(certificate, shield=ShieldSettings(certificate))
-    assert sum(episode.largest_level > 1.0 for episode in trusted) >= 3
+    assert sum(episode.times_safe_set > 1.0 for episode in trusted) >= 3
     assert sum(episode.violation_steps for episode in trusted) >= 3
-    assert max(episode.largest_level for episode in shielded) <= 1.0
+    assert max(episode.times_safe_set for episode in shielded) <= 1.0
     assert sum(episode.violation_steps for episode in shielded) == 0
     overridden = [sum(each.interventions for each in episodes) for episodes in (trusted, shielded)]
     assert 0.8 * overridden[1] < overridden[0] <= overridden[1]

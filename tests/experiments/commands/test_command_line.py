@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import sys
@@ -51,14 +52,14 @@ def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
         assert set(arm) >= ARM_KEYS
         mine = [row for row in rows if row["arm"] == name]
         assert arm["eval_episodes"] == len(mine) == 20
-        assert arm["eval_violation_steps"] == sum(row["violation_steps"] for row in mine)
-        assert arm["eval_violating_episodes"] == sum(row["violation_steps"] > 0 for row in mine)
-        assert arm["eval_return_mean"] == pytest.approx(np.mean([row["episode_return"] for row in mine]))
+        assert arm["eval_violation_steps"] == sum(row["violating_steps"] for row in mine)
+        assert arm["eval_violating_episodes"] == sum(row["violating"] for row in mine)
+        assert arm["eval_return_mean"] == pytest.approx(np.mean([row["return"] for row in mine]))
         assert arm["train_steps"] == 2 * 4096
     shielded, unshielded = summary["arms"]["shielded"], summary["arms"]["unshielded"]
     assert shielded["train_violation_steps"] == shielded["eval_violation_steps"] == 0
     assert shielded["guaranteed_episodes"] == 20
-    assert shielded["largest_level"] <= 1.0
+    assert shielded["times_safe_set"] <= 1.0
     assert unshielded["train_violation_steps"] > 0
     assert summary["paired_differences"]["baseline"] == "unshielded"
     assert set(summary["paired_differences"]["arms"]) == {"shielded"}
@@ -75,9 +76,23 @@ def test_tables_say_where_they_come_from(smoke):
     assert Certificate.load(out / "certificate.json").checksum == summary["certificate"]
     assert set(summary["seeds"]) == {"0", "1"}
     points = pq.read_table(out / "training.parquet").to_pylist()
-    last = {row["arm"]: row["violation_steps"] for row in points if row["run"] == 0}
+    last = {row["arm"]: row["violating_steps"] for row in points if row["run"] == 0}
     assert last["shielded"] == 0
     assert last["unshielded"] > 0
+
+
+def test_columns_are_those_of_the_page_and_a_count_of_the_training_is_in_its_table_alone(smoke):
+    page = (Path(__file__).parents[3] / "docs" / "experiments.md").read_text()
+    documented = re.findall(r"^\| `(\w+)`", page, re.MULTILINE)
+    tables = [pq.read_table(smoke[0] / f"{name}.parquet") for name in ("episodes", "training")]
+    assert [name for table in tables for name in table.column_names] == documented
+    for table in tables:
+        assert set(table["environment"].to_pylist()) == {"ncs_gym/TruckTrailerCruise-v0"}
+        assert set(table["algorithm"].to_pylist()) == {"PPO"}
+    episodes = tables[0].to_pylist()
+    assert not [name for name in tables[0].column_names if "train" in name]
+    largest = max(row["times_safe_set"] for row in episodes if row["arm"] == "shielded")
+    assert f"came to {largest:.3f} times the safe set" in smoke[1].prose
 
 
 def test_smoke_run_prints_the_table_and_the_files(smoke):
@@ -282,6 +297,7 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_worke
     assert len(rows) == 4 * 3
     assert {"loss", "delay", "burst_length", "arm", "run", "violating"} <= set(rows[0])
     assert {(row["quantization_step"], row["burst_length"]) for row in rows} == {(None, 0.0), (None, 3.0)}
+    assert {row["arm"] for row in pq.read_table(out / "training.parquet").to_pylist()} == {"shielded"}
     assert [path.name for path in (out / "figures").iterdir()] == ["violations.png"]
     assert not (out / "report.html").exists()
     before = digests(out)

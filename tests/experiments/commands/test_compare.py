@@ -40,12 +40,11 @@ def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_oth
 
 def test_a_smoke_run_evaluates_the_pretrained_agent_unless_something_else_is_asked_for():
     short = shortened(CompareSettings(smoke=True))
-    assert short.arms == ("unshielded", "shielded")
-    assert {"pretrained", "pretrained+shielded"} <= set(short.baselines)
+    assert short.arms == ("unshielded", "shielded", "pretrained", "pretrained+shielded")  # the arms that are drawn
     own = shortened(CompareSettings(smoke=True, arms=("shielded",), baselines=("lqr",)))
     assert (own.arms, own.baselines) == (("shielded",), ("lqr",))
     without = shortened(CompareSettings(smoke=True, env="plants:plants/Own-v0"))
-    assert without.baselines == CompareSettings().baselines
+    assert (without.arms, without.baselines) == (("unshielded", "shielded"), CompareSettings().baselines)
     assert shortened(CompareSettings()) == CompareSettings()
 
 
@@ -119,7 +118,7 @@ def test_lookahead_is_an_arm_by_two_names_and_alone_takes_the_horizon(certificat
 def test_steps_that_live_from_a_plan_have_a_column_where_an_arm_looks_ahead():
     one = result([1.0] * 10, [0] * 10)
     one = replace(one, episodes=[replace(each, planned=i % 2) for i, each in enumerate(one.episodes)])
-    summary = arm_summary(episodes_table([one]), "lookahead", fixed_policy=True)
+    summary = arm_summary([one], "lookahead", fixed_policy=True)
     assert summary["plan_rate"] == 0.05
     arms = {"shielded": summary | {"mode": "project"}, "lookahead": summary}
     cells = cells_of(arms)
@@ -146,11 +145,11 @@ def result(returns, violations, interventions=0, index=0):
         Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
         for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
-    return RunResult("arm", index, 100, 4, 20, [], episodes, None, {})
+    return RunResult("arm", index, 100, 4, 20, [], episodes)
 
 
 def summary_of_runs(runs, fixed_policy=False):
-    return arm_summary(episodes_table(runs), None, fixed_policy=fixed_policy)
+    return arm_summary(runs, None, fixed_policy=fixed_policy)
 
 
 def test_summary_of_an_arm_adds_up():
@@ -197,7 +196,14 @@ def test_returns_of_episodes_that_end_early_are_no_covered_fraction():
 def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(trained, evaluated):
     shares = {"train_intervention_rate": trained, "intervention_rate": evaluated}
     counts = {"eval_violation_rate_ci95": [0.0, 0.1], "guaranteed_episodes": 4, "eval_episodes": 4}
-    arm = {"shielded": True, "mode": "project", "largest_level": 0.5, "eval_violating_episodes": 0, **counts, **shares}
+    arm = {
+        "shielded": True,
+        "mode": "project",
+        "times_safe_set": 0.707,
+        "eval_violating_episodes": 0,
+        **counts,
+        **shares,
+    }
     arm |= {"eval_steps": 200, "eval_return_mean": -5.0}
     others = {name: arm | {"shielded": False, "train_violation_steps": 0} for name in ("unshielded", "zero input")}
     others["zero input"]["eval_return_mean"] = -60.0
@@ -213,7 +219,7 @@ def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(train
     findings = findings_of(several | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
     assert not any("all that was proposed was safe" in line for line in findings)
     findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    assert any("came to 0.707 times the safe set" in line for line in findings) == (not nothing)  # x'Mx is 0.5
+    assert any("came to 0.707 times the safe set" in line for line in findings) == (not nothing)
     assert any("covers" in line for line in findings) == (trained > 0.0)
 
 
@@ -254,7 +260,7 @@ def test_policies_that_are_the_same_in_all_runs_are_paired_by_episodes():
 
 
 def test_no_violation_is_printed_with_its_upper_bound():
-    summary = arm_summary(episodes_table([result([1.0] * 10, [0] * 10)]), "monitor", fixed_policy=True)
+    summary = arm_summary([result([1.0] * 10, [0] * 10)], "monitor", fixed_policy=True)
     assert cells_of({"monitor": summary})["monitor"][0] == "0.0 [0.0, 30.8]"
     assert re.search(r"monitor +[\d,]+ +\(20\.0\)\n", summary_text({"monitor": summary}, {}))
 

@@ -9,15 +9,16 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 
 from agents.results import TrainingPoint
+from experiments.analysis.episodes import episodes_table
 from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS
+from experiments.plots import comparison_figures as comparison_module
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
+    ShownEpisode,
     comparison_figures,
-    episode_figure,
-    scatter_figure,
-    training_figure,
+    most_overridden,
 )
-from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
+from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, arm_styles, thousands
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
 
@@ -30,8 +31,24 @@ PROTANOPIA = np.array(
 )
 
 
+EPISODE = ShownEpisode(0, "as trained", 0, {"unshielded": trajectory(np.zeros((3, 2)))})
+
+
 def arms(*names, runs=2, **change):
     return {name: [run(name, index, **change) for index in range(runs)] for name in names}
+
+
+def scatter_figure(summary):
+    return comparison_module.scatter_figure(summary, arm_styles(summary))
+
+
+def training_figure(shown):
+    return comparison_module.training_figure(shown, arm_styles(shown))
+
+
+def episode_figure(plant, paths):
+    """A figure of an episode of arms, given what happened in it by their names."""
+    return comparison_module.episode_figure(plant, ShownEpisode(0, "as trained", 0, paths), arm_styles(paths))
 
 
 def lines(axis):
@@ -79,8 +96,7 @@ def test_arms_have_the_same_color_in_every_figure(plant):
     shown = arms("unshielded", "shielded:boundary")
     training = training_figure(shown).axes[0]
     scatter = scatter_figure(summary_of(shown)["arms"]).axes[0]
-    path = trajectory(np.zeros((3, 2)))
-    episode = episode_figure(random_plant(1, 2, 1), arms(*shown, trajectory=path)).axes[0]
+    episode = episode_figure(random_plant(1, 2, 1), dict.fromkeys(shown, trajectory(np.zeros((3, 2))))).axes[0]
     wanted = {ArmStyle.of(name).color.lower() for name in shown}
     assert set(by_color(training)) == wanted
     assert {to_hex(line.get_markeredgecolor()).lower() for line in scatter.get_lines()} >= wanted
@@ -149,22 +165,72 @@ def test_caption_of_a_training_names_the_arms_whose_return_contains_penalties_an
 @pytest.mark.parametrize(
     ("names", "pair"),
     [
-        (["penalized", "monitor", "unshielded", "shielded:switch", "shielded"], ["unshielded", "shielded:switch"]),
+        (["penalized", "monitor", "unshielded", "shielded:switch", "shielded"], ["unshielded", "shielded"]),
+        (["unshielded", "pretrained", "shielded:switch", "pretrained+shielded"], ["pretrained", "pretrained+shielded"]),
         (["monitor", "shielded+penalty"], ["monitor", "shielded+penalty"]),
         (["shielded"], ["shielded"]),
         (["penalized"], ["penalized"]),
     ],
 )
-def test_time_series_show_the_shielded_arm_and_an_unshielded_one(names, pair):
-    figure = episode_figure(random_plant(1, 2, 1), arms(*names, runs=1, trajectory=trajectory(np.zeros((3, 2)))))
-    assert f"of the first run, {' and '.join(pair)}, with" in figure.caption
+def test_time_series_show_the_episode_in_which_most_is_overridden_beside_an_unshielded_arm(names, pair):
+    shown = arms(*names)
+    busiest = run(names[-1], 1).episodes
+    shown[names[-1]][1].scenarios["attacked"] = [busiest[0], replace(busiest[1], interventions=7)]
+    table = episodes_table(result for runs in shown.values() for result in runs)
+    asked = []
+
+    def path_of(*which):
+        asked.append(which)
+        return trajectory(np.zeros((3, 2)), intervened=(1,))
+
+    found = most_overridden(table, names, path_of)
+    assert found[:3] == (1, "attacked", 1)
+    assert [*found.paths] == pair
+    assert asked == [(name, 1, "attacked", 1) for name in pair]
+    figure = comparison_module.episode_figure(random_plant(1, 2, 1), found, arm_styles(names))
+    said = f"episode 1 of run 1 (attacked), where the shield overrides most, {' and '.join(pair)}, with"
+    assert said in figure.caption
+    assert figure.axes[0].get_title() == "Episode 1 of run 1, attacked"
+
+
+def test_arms_that_are_drawn_together_have_a_color_each():
+    shown = ["unshielded", "shielded", "pretrained", "pretrained+shielded", "lqr", "lqr+shielded", "shielded+penalty"]
+    colors = [style.color for style in arm_styles(shown).values()]
+    assert len(set(colors)) == len(shown)
+    assert colors[:3] == [ArmStyle.of(name).color for name in shown[:3]]
+    assert len(arm_styles(ALL_ARMS)) == len(ALL_ARMS)  # more than there are colors
+
+
+def test_scatter_has_a_panel_for_every_scenario_that_was_asked_for():
+    shown = arms("unshielded", "shielded")
+    for runs in shown.values():
+        for result in runs:
+            result.scenarios["attacked"] = run(result.arm, violations=(3, 1)).episodes
+    figure = scatter_figure(summary_of(shown)["arms"])
+    assert [axis.get_title() for axis in figure.axes] == ["as trained", "attacked"]
+    means = [[line.get_xdata()[0] for line in axis.get_lines() if len(line.get_xdata()) == 1] for axis in figure.axes]
+    assert means == [[0.0, 0.0], [100.0, 100.0]]
+    assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
+
+
+def test_scatter_is_as_high_as_what_was_measured_whatever_an_interval_of_two_runs_says():
+    summary = summary_of(arms("unshielded"))["arms"]
+    low, high = scatter_figure(summary).axes[0].get_ylim()
+    assert summary["unshielded"]["eval_return_ci95"][0] < low < -3.0
+    assert -2.0 < high < summary["unshielded"]["eval_return_ci95"][1]
+
+
+def test_training_in_which_nothing_happened_has_no_figure(plant):
+    nothing = [replace(point, episode_return=np.nan, violation_steps=0, interventions=0) for point in history(64, 128)]
+    shown = arms("unshielded", "shielded", history=nothing)
+    assert [*comparison_figures(plant, summary_of(shown), shown, EPISODE)] == ["scatter", "episode"]
 
 
 @pytest.mark.parametrize(("n", "m"), [(2, 1), (4, 1), (4, 2)])
 def test_time_series_have_a_panel_for_states_inputs_and_events(n, m):
     plant = random_plant(1, n, m)
     path = trajectory(np.zeros((11, n)), m, intervened=(2, 3), arrivals=(0, 4, 5))
-    figure = episode_figure(plant, arms("shielded", runs=1, trajectory=path))
+    figure = episode_figure(plant, {"shielded": path})
     assert len(figure.axes) == 2 + m
     for axis in figure.axes[1:-1]:
         (dots,) = [line for line in axis.get_lines() if line.get_marker() == "."]
@@ -180,7 +246,7 @@ def test_violations_of_the_limit_are_marked_and_only_then_in_the_legend():
     plant = random_plant(1, 2, 1)
     for reach, marked in ((0.8, False), (1.5, True)):
         path = trajectory(np.linspace(0.0, reach, 11)[:, None] * np.ones(2))
-        figure = episode_figure(plant, arms("unshielded", trajectory=path))
+        figure = episode_figure(plant, {"unshielded": path})
         assert any(line.get_marker() == "x" for line in figure.axes[0].get_lines()) is marked
         assert ("violation" in texts(figure)) is marked
 
@@ -190,7 +256,7 @@ def test_violations_of_limits_that_states_do_not_show_are_marked_too():
     plant = random_plant(1, 2, 1)
     path = trajectory(np.zeros((11, 2)), violated=(2, 7))
     (crosses,) = [
-        line for line in episode_figure(plant, arms("unshielded", trajectory=path)).axes[0].get_lines()
+        line for line in episode_figure(plant, {"unshielded": path}).axes[0].get_lines()
         if line.get_marker() == "x"
     ]  # fmt: skip
     np.testing.assert_allclose(crosses.get_xdata(), plant.dt * np.array([3, 8]))
@@ -199,8 +265,8 @@ def test_violations_of_limits_that_states_do_not_show_are_marked_too():
 def test_an_episode_that_ended_early_stands_beside_a_longer_one():
     plant = random_plant(1, 4, 1)
     shown = {
-        "unshielded": [run("unshielded", trajectory=trajectory(np.zeros((5, 4)), arrivals=(0, 1)))],
-        "shielded": [run("shielded", trajectory=trajectory(np.zeros((11, 4)), arrivals=(0, 1, 7)))],
+        "unshielded": trajectory(np.zeros((5, 4)), arrivals=(0, 1)),
+        "shielded": trajectory(np.zeros((11, 4)), arrivals=(0, 1, 7)),
     }
     figure = episode_figure(plant, shown)
     assert figure.axes[-1].get_xlim() == (0.0, 1.0)
@@ -210,7 +276,7 @@ def test_an_episode_that_ended_early_stands_beside_a_longer_one():
 
 def test_a_monitor_only_would_override():
     plant = random_plant(1, 2, 1)
-    shown = arms("monitor", runs=1, trajectory=trajectory(np.zeros((11, 2)), intervened=(1,)))
+    shown = {"monitor": trajectory(np.zeros((11, 2)), intervened=(1,))}
     assert "would override, monitor (1)" in texts(episode_figure(plant, shown))
     assert "would have" in episode_figure(plant, shown).caption
 
@@ -266,7 +332,7 @@ def test_arms_that_coincide_have_markers_of_different_sizes():
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
     shown = arms(*ALL_ARMS[:5])
-    figures = comparison_figures(plant, summary_of(shown), shown)
+    figures = comparison_figures(plant, summary_of(shown), shown, EPISODE)
     assert set(figures) == {"training", "scatter", "episode"}
     assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
     assert len({caption for caption, _ in figures.values()}) == 3

@@ -2,13 +2,14 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import arm_summary, episodes_table
+from experiments.analysis.episodes import arm_summary
 from experiments.report.text_tables import scenario_text, summary_text
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
@@ -95,18 +96,18 @@ def test_scenarios_are_stored_beside_the_evaluation_as_trained(certificate, resu
 @pytest.mark.slow
 def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
     outside = {
-        name: [sum(each.largest_level > 1.0 for each in result.scenarios[scenario]) for scenario in ALL]
+        name: [sum(each.times_safe_set > 1.0 for each in result.scenarios[scenario]) for scenario in ALL]
         for name, result in results.items()
     }
     assert outside["lqr+shielded"] == [0, 0, 0]
     assert outside["lqr+trusting"][0] >= 6
-    assert outside["lqr+trusting"][0] > sum(each.largest_level > 1.0 for each in results["lqr+trusting"].episodes)
+    assert outside["lqr+trusting"][0] > sum(each.times_safe_set > 1.0 for each in results["lqr+trusting"].episodes)
     assert all(each.guaranteed for each in results["lqr+shielded"].scenarios["worst-case disturbance"])
 
 
 def test_random_policy_acts_alike_under_every_scenario(certificate):
     run = run_of(certificate, "random", ("as trained",))
-    first, again = (run.execute(lambda steps: None).trajectory.inputs for _ in range(2))
+    first, again = (run.trajectory(Path("models"), "as trained", 0).inputs for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 
@@ -125,7 +126,7 @@ def test_random_policy_acts_alike_under_every_scenario(certificate):
 )
 def test_small_returns_are_printed_with_two_significant_digits(results, mean, half, text):
     interval = None if half is None else [mean - half, mean + half]
-    summary = arm_summary(episodes_table([results["lqr"]]), None, fixed_policy=True)
+    summary = arm_summary([results["lqr"]], None, fixed_policy=True)
     summary |= {"eval_return_mean": mean, "eval_return_ci95": interval}
     printed = summary_text({"lqr": summary}, {})
     assert printed.endswith(f" {text}")
@@ -134,7 +135,7 @@ def test_small_returns_are_printed_with_two_significant_digits(results, mean, ha
 
 def test_summary_and_table_have_a_block_per_scenario(results):
     modes = {"lqr": None, "lqr+trusting": "trusting", "lqr+shielded": "project"}
-    arms = {name: arm_summary(episodes_table([results[name]]), mode, fixed_policy=True) for name, mode in modes.items()}
+    arms = {name: arm_summary([results[name]], mode, fixed_policy=True) for name, mode in modes.items()}
     json.dumps(arms, allow_nan=False)
     assert {name: arm["shielded"] for name, arm in arms.items()} == dict.fromkeys(modes, False) | {"lqr+shielded": True}
     pushed = arms["lqr+trusting"]["conditions"]["worst-case disturbance"]
