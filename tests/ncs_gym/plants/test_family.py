@@ -13,11 +13,11 @@ from scipy.linalg import expm
 from ncs_gym import Ellipsoid, LinearPlant, NCSEnv, Remainder, cart_pole, truck_trailer
 from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.uncertainty.family import Family
+from tests.plants import varying_cart_pole, varying_truck
 
 MASSES = {"mass": (3800.0, 4200.0)}
 POLE = {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}
-TRUCK = LinearPlant.family(truck_trailer, MASSES, monotone=True)
-POLES = LinearPlant.family(cart_pole, POLE, monotone=True)
+TRUCK, POLES = varying_truck(), varying_cart_pole()
 TRUCKS = [truck_trailer(mass=mass) for mass in (3800.0, 4000.0, 4300.0)]
 HULL = LinearPlant.family(TRUCKS)
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}

@@ -14,7 +14,7 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Linear
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from shields import SafeLoop, VectorSafetyShield
 from tests.certificates import certificate_of
-from tests.shields.attacks.cases import varying_cart_pole, varying_truck
+from tests.plants import varying_cart_pole, varying_truck
 from tests.verdicts import verified
 
 FAMILIES = {
