@@ -20,6 +20,7 @@ import yaml
 
 import ncs_gym
 from ncs_gym.installation import GENERIC_NAMES, install_command
+from tests.command import ncs, ncs_process
 
 ROOT = Path(__file__).resolve().parent.parent
 ORDER = ("ncs_gym", "shields", "agents", "experiments")
@@ -227,7 +228,7 @@ def test_no_init_file_below_tests():
 def test_command_is_declared_and_runs_as_a_module():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {"ncs": "experiments.__main__:main"}
-    run = subprocess.run([sys.executable, "-m", "experiments", "--help"], cwd=ROOT, capture_output=True, text=True)
+    run = ncs_process("--help", cwd=ROOT)
     assert run.returncode == 0
     assert "compare" in run.stdout
 
@@ -340,7 +341,7 @@ def test_what_to_install_is_said_for_a_clone_and_for_a_wheel(installed_copy):
 
 
 def test_version_is_one():
-    run = subprocess.run([sys.executable, "-m", "experiments", "--version"], cwd=ROOT, capture_output=True, text=True)
+    run = ncs("--version")
     assert run.stdout == f"ncs-gym {ncs_gym.__version__}\n", run.stderr
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == ncs_gym.__version__
     assert re.search(rf"^## \[{re.escape(ncs_gym.__version__)}\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
