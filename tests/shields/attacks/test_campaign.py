@@ -1,7 +1,7 @@
 """The campaign: one adversary against every claim, in every case and mode; and twins of it that it has to win.
 
-`make test` runs a part of some cases in every mode, `make test-slow` the whole of all, by the same function. All claims that a run
-makes are compared in it; whatever is false names its claim.
+`make test` runs a part of some cases in every mode, `make test-slow` the whole of all, by the same function. All claims
+that a run makes are compared in it; whatever is false names its claim.
 """
 
 from collections import Counter
