@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.random_plants import random_plant as random_plant
-from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
 
 
 def small(A: object, **changes: object) -> LinearPlant:
@@ -65,6 +65,18 @@ def counted_between(name: str, points: int) -> tuple[LinearPlant, ChannelContrac
     """The plant of a registered environment, whose box counts between samples, too, and its contract."""
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
     return replace(env.plant, between_samples=points), env.certificate_contract
+
+
+@cache
+def varying_truck() -> LinearPlant:
+    """The loaded truck, 4000 kg +- 5 %."""
+    return LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
+
+
+@cache
+def varying_cart_pole() -> LinearPlant:
+    """The cart-pole, mass and length of the pole +- 2 %."""
+    return LinearPlant.family(cart_pole, {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}, monotone=True)
 
 
 # Plants with contracts, whose certificates with polytopes are checked in: data/certificates.

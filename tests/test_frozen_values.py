@@ -25,7 +25,6 @@ from ncs_gym import (
     FunctionProcess,
     GilbertElliott,
     GymProcess,
-    LinearPlant,
     LinearProcess,
     NCSEnv,
     PacketLog,
@@ -47,11 +46,12 @@ from ncs_gym.validation import ReadOnlyArrays
 from shields import SafetyFilter
 from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
+from tests.plants import varying_truck
 
 DOWNLINK = {"downlink": Channel(delay=1), "downlink_contract": ChannelContract(2)}
 PLANT, ERRORS = pendulum(), certified_error_set(batch_reactor(), ChannelContract(3))
-FAMILY = LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
-CERTIFICATE = certificate_of(batch_reactor(), ChannelContract(2), "polytope")
+FAMILY = varying_truck()
+CERTIFICATE = certificate_of(batch_reactor(), ChannelContract(3, 0.001), "polytope")
 PAPER = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2, "fingerprint": "none"}
 VALUES = [
     PLANT,

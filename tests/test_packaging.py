@@ -20,6 +20,7 @@ import yaml
 
 import ncs_gym
 from ncs_gym.installation import GENERIC_NAMES, install_command
+from tests.command import ncs, ncs_process
 
 ROOT = Path(__file__).resolve().parent.parent
 ORDER = ("ncs_gym", "shields", "agents", "experiments")
@@ -158,13 +159,18 @@ def test_environment_and_shields_do_not_import_the_learners():
 
 
 def test_nothing_is_compiled_at_first_use():
-    """Neither imported by us, nor by what we import, nor pinned; nor is what draws, before anything is drawn."""
+    """Neither imported by us, nor by what we import, nor pinned; nor is what draws, before anything is drawn.
+
+    The published method is there without a further import.
+    """
     for path in MODULES:
         assert not imports_of(path, COMPILERS), path
     pinned = {line.partition("==")[0].lower() for line in (ROOT / "constraints.txt").read_text().splitlines()}
     assert not pinned & COMPILERS
     code = f"""
-import sys, gymnasium, numpy, ncs_gym, shields, shields.paper.algorithm, experiments.commands.attack
+import sys, gymnasium, numpy, ncs_gym, shields
+shields.paper.synthesize
+import experiments.commands.attack
 quiet = dict(sensor_bound=0.0, initial_bound=0.0)
 plant = ncs_gym.LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-6, **quiet)
 certificate = shields.synthesize(plant)
@@ -227,7 +233,7 @@ def test_no_init_file_below_tests():
 def test_command_is_declared_and_runs_as_a_module():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {"ncs": "experiments.__main__:main"}
-    run = subprocess.run([sys.executable, "-m", "experiments", "--help"], cwd=ROOT, capture_output=True, text=True)
+    run = ncs_process("--help", cwd=ROOT)
     assert run.returncode == 0
     assert "compare" in run.stdout
 
@@ -340,7 +346,7 @@ def test_what_to_install_is_said_for_a_clone_and_for_a_wheel(installed_copy):
 
 
 def test_version_is_one():
-    run = subprocess.run([sys.executable, "-m", "experiments", "--version"], cwd=ROOT, capture_output=True, text=True)
+    run = ncs("--version")
     assert run.stdout == f"ncs-gym {ncs_gym.__version__}\n", run.stderr
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == ncs_gym.__version__
     assert re.search(rf"^## \[{re.escape(ncs_gym.__version__)}\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)

@@ -34,18 +34,18 @@ def _here(jobs: int, counts: Any, log_folder: Path | None = None) -> Iterator[En
 
 
 @contextlib.contextmanager
-def no_worker_processes(*, evaluates_on_the_way: bool = False) -> Iterator[None]:
+def no_worker_processes() -> Iterator[None]:
     """Commands execute their training runs in this process.
 
     Evaluations on the way take most of a short training and change no result (tests/agents/test_training.py): they are
-    left out unless they are asked for.
+    left out.
     """
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch("experiments.backends.execution.local_workers", _here))
-        if not evaluates_on_the_way:
-            from agents import training
+    from agents import training
 
-            stack.enter_context(mock.patch.object(training, "EvaluationCallback", _no_evaluation))
+    with (
+        mock.patch("experiments.backends.execution.local_workers", _here),
+        mock.patch.object(training, "EvaluationCallback", _no_evaluation),
+    ):
         yield
 
 

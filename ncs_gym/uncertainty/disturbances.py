@@ -277,9 +277,10 @@ class AdversarialDisturbance(Disturbance):
         reach = np.asarray(bound.support(rows))
         movable = reach > 0.0 if np.any(reach > 0.0) else np.ones(len(reach), np.bool_)
         worst = np.argmax(np.where(movable, np.maximum(above, below) + reach, -np.inf), axis=-1)
-        extremes = np.stack([bound.extreme_point(row) for row in rows], axis=1)
+        needed, places = np.unique(worst, return_inverse=True)
+        extremes = np.stack([bound.extreme_point(row) for row in rows[needed]], axis=1)
         signs = np.where(np.take_along_axis(above >= below, worst[..., None], axis=-1)[..., 0], 1.0, -1.0)
-        return (1.0 - ROUNDING) * signs * extremes[:, worst]
+        return (1.0 - ROUNDING) * signs * extremes[:, places.reshape(worst.shape)]
 
     def check(self, plant):  # noqa: D102
         if self.M is not None and self.M.shape != (plant.n, plant.n):

@@ -128,7 +128,7 @@ def test_steps_that_were_proved_are_counted_where_the_contract_breaks():
         infos.append(info)
         return throttle(observations, info)
 
-    played = evaluate(loop, noting, 8, 0).episodes
+    played = evaluate(loop, noting, 4, 0).episodes
     before_the_last = sum(int(info["shield_guaranteed"][0]) for info in infos[1:])
     assert played[0].proved - before_the_last in (0, 1)
     assert 0 < sum(each.proved for each in played) < sum(each.steps for each in played)

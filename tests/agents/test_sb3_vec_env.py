@@ -1,12 +1,11 @@
 import json
-import os
-import subprocess
-import sys
+import runpy
 from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from stable_baselines3 import PPO
@@ -14,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from agents import SB3VecEnv
+from agents import LoopConfig, SB3VecEnv, train
 from ncs_gym import Channel, VectorNetworked, VectorRequestActions
 from shields import SafetyShield, VectorSafetyShield
 
@@ -316,19 +315,16 @@ def test_actions_are_those_that_were_handed_over_whatever_is_written_into_them_l
 
 
 def test_importing_sets_torch_to_one_thread_and_a_later_choice_stays():
-    code = """
-import torch
-torch.set_num_threads(3)
-from agents import LoopConfig, train
-loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
-print(torch.get_num_threads())
-torch.set_num_threads(2)
-train(loop, 64, 0, hyperparams={"n_envs": 4, "n_steps": 16, "n_epochs": 1})
-print(torch.get_num_threads())
-"""
-    environment = os.environ | {"OMP_NUM_THREADS": "4", "OMP_WAIT_POLICY": "passive"}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=600)
-    assert run.stdout.split() == ["1", "2"], run.stderr
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        runpy.run_module("agents.sb3_vec_env")
+        assert torch.get_num_threads() == 1
+        torch.set_num_threads(2)
+        train(LoopConfig(env=CRUISE), 64, 0, hyperparams={"n_envs": 4, "n_steps": 16, "n_epochs": 1})
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 class Laps(gym.Env):

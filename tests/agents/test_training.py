@@ -220,17 +220,17 @@ def logged_alike(model, steps, log_interval, **more):
 def test_logs_are_about_all_steps_since_the_last_one(kind):
     monitored = shielded("monitor")
     env = SB3VecEnv(monitored.vector(4)) if kind == "SB3VecEnv" else make_vec_env(monitored.single, n_envs=4, seed=0)
-    tiny = {"n_steps": 32, "batch_size": 128, "n_epochs": 1, "device": "cpu", "seed": 0}
+    tiny = {"n_steps": 16, "batch_size": 64, "n_epochs": 1, "device": "cpu", "seed": 0}
     model = PPO("MlpPolicy", env, **tiny)
-    callback = logged_alike(model, 128 * 12, 3)
+    callback = logged_alike(model, 64 * 12, 3)
     assert callback.violation_steps > 0
     first = callback.violation_steps, callback.history[-1].steps
     # Another callback where the model goes on, and the same one where it counts its steps anew.
-    goes_on = logged_alike(model, 128 * 6, 2, reset_num_timesteps=False)
-    assert [point.steps for point in goes_on.history][:2] == [first[1] + 128, first[1] + 256]
-    again = logged_alike(PPO("MlpPolicy", env, **tiny), 128 * 4, 1, callback=callback)
-    assert again.history[-1].steps == 128 * 4
-    assert again.violation_steps == again.history[-1].violation_steps < 128 * 4
+    goes_on = logged_alike(model, 64 * 6, 2, reset_num_timesteps=False)
+    assert [point.steps for point in goes_on.history][:2] == [first[1] + 64, first[1] + 128]
+    again = logged_alike(PPO("MlpPolicy", env, **tiny), 64 * 4, 1, callback=callback)
+    assert again.history[-1].steps == 64 * 4
+    assert again.violation_steps == again.history[-1].violation_steps < 64 * 4
 
 
 def test_logs_of_algorithms_without_rollouts_are_about_all_steps():

@@ -80,7 +80,7 @@ def plants_around_points():
         B = [[0.2 * k, 0.01], [0.0, 0.03], [0.1, 0.5]]
         return LinearPlant(A=A, B=B, dt=0.1, **limits, **bounds, **rests, **more)
 
-    for index in rng.integers(0, 99, 6).tolist():
+    for index in rng.integers(0, 99, 3).tolist():
         found[f"point {index}"] = of(index)
         found[f"family {index}"] = LinearPlant.family([of(index), of(index, 1.01)], at_rest=True)
     return found

@@ -106,6 +106,7 @@ def exceeds_limits(plant, values):
     return np.any(values[0] < plant.input_low) or np.any(values[1] > plant.input_high)
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("name", CASES)
 def test_the_numbers_are_those_of_the_worst_start_error_and_disturbances(name):
     plant, certificate, found = registered(name)

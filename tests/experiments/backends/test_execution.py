@@ -32,7 +32,8 @@ def stored(folder):
     return sorted(path.stem for path in (folder / "runs").glob("*.json"))
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.cases(1)
+@pytest.mark.parametrize("jobs", [2, 1])
 def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, certificate, tmp_path):
     runs = [training_run(certificate, arm="random", policy_kind="random", index=index) for index in range(3)]
     results = results_of(runs, tmp_path, BackendSettings(jobs=jobs))

@@ -16,7 +16,7 @@ from tests.workers import no_worker_processes
 
 def _made(name: str, command: tuple, made_once: Callable) -> tuple[Path, Run]:
     def make(folder: Path) -> None:
-        with no_worker_processes(evaluates_on_the_way=True):
+        with no_worker_processes():
             run = ncs(*command, "--out", folder / "out")
         (folder / "run.json").write_text(json.dumps(run))
 

@@ -395,7 +395,7 @@ def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(mo
 
 
 def test_help_of_a_comparison_shows_its_settings_on_two_screens():
-    run = ncs_process("compare", "--help", COLUMNS="80")
+    run = ncs("compare", "--help", COLUMNS="80")
     assert run.returncode == 0
     for flag in ("--env", "--channel", "--hyperparams", "--ray-address"):
         assert flag in run.stdout

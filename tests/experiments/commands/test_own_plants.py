@@ -16,7 +16,7 @@ import pytest
 from agents.hyperparams import complete_hyperparams
 from ncs_gym import truck_trailer
 from shields import Certificate
-from tests.command import assert_one_sentence, environment, ncs, succeeded
+from tests.command import assert_one_sentence, environment, ncs, succeeded, without_pictures
 from tests.plants import random_plant
 from tests.verdicts import verified
 
@@ -70,9 +70,10 @@ def folder(tmp_path, monkeypatch):
 ENV = ("--env", "own_plants:Plants/Truck-v0")
 
 
-def test_baselines_that_do_not_know_what_an_own_task_asks_for_are_left_out_or_refused(folder):
+def test_baselines_that_do_not_know_what_an_own_task_asks_for_are_left_out_or_refused(folder, without_workers):
     env = ("compare", "--env", "own_task:Plants/Far-v0", "--seeds", "1", "--episodes", "2")
-    run = succeeded(*env, "--arms", "random", cwd=folder)
+    with without_pictures():
+        run = succeeded(*env, "--arms", "random", cwd=folder)
     rows = [line.split("  ")[0].strip() for line in run.stdout.splitlines()]
     assert {"random", "K x_hat", "zero input", "untrained"} <= set(rows)
     assert "lqr" not in run.stdout

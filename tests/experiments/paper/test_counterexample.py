@@ -1,4 +1,5 @@
 from fractions import Fraction
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,12 +12,17 @@ CASE = PaperExample()
 BOX = Box(CASE.disturbance_half_widths)
 
 
+@cache
+def worst(disturbances):
+    return worst_step(CASE.closed_loop, CASE.M, disturbances, Ball(CASE.epsilon))
+
+
 def exact(vector):
     return [Fraction(float(v)) for v in vector]
 
 
 def test_counterexample_is_one_in_exact_arithmetic_with_a_disturbance_of_the_printed_box():
-    step = worst_step(CASE.closed_loop, CASE.M, BOX, Ball(CASE.epsilon))
+    step = worst(BOX)
     x, d, e = exact(step.state), exact(step.disturbance), exact(step.error)
     M = [exact(row) for row in CASE.M]
     closed = [exact(row) for row in CASE.closed_loop]
@@ -48,7 +54,7 @@ def test_step_with_a_point_outside_its_set_is_not_confirmed(monkeypatch):
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("disturbances", [BOX, Ball(5e-4)])
 def test_worst_step_beats_random_search(disturbances):
-    found = worst_step(CASE.closed_loop, CASE.M, disturbances, Ball(CASE.epsilon))
+    found = worst(disturbances)
     rng = np.random.default_rng(1)
     root = np.linalg.inv(np.linalg.cholesky(CASE.M).T)
     best = 0.0

@@ -313,6 +313,7 @@ def test_replay_in_an_environment_has_the_ages_of_the_record(record):
     assert len(replayed) <= len(trace)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     "answered",
     [

@@ -13,15 +13,21 @@ from scipy.linalg import expm
 from ncs_gym import Ellipsoid, LinearPlant, NCSEnv, Remainder, cart_pole, truck_trailer
 from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.uncertainty.family import Family
+from tests.plants import varying_cart_pole, varying_truck
 
 MASSES = {"mass": (3800.0, 4200.0)}
 POLE = {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}
-TRUCK = LinearPlant.family(truck_trailer, MASSES, monotone=True)
-POLES = LinearPlant.family(cart_pole, POLE, monotone=True)
+TRUCK, POLES = varying_truck(), varying_cart_pole()
 TRUCKS = [truck_trailer(mass=mass) for mass in (3800.0, 4000.0, 4300.0)]
 HULL = LinearPlant.family(TRUCKS)
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 SMALL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 2.0], "u_max": 3.0, "dt": 0.1} | QUIET
+
+
+@pytest.fixture
+def few_points(monkeypatch):
+    """Entries are looked at in few points, where it is not about them."""
+    monkeypatch.setattr("ncs_gym.plants.family.grid_size", lambda parameters: 9)
 
 
 def exact(matrix):
@@ -104,7 +110,7 @@ def test_members_inside_the_hull_leave_out_less_than_its_vertices():
     assert largest_gauge(HULL, beyond, (2.0, 2.0, 4.0)) > 1
 
 
-def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
+def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end(few_points):
     def of(gain, **more):
         limits = {"state_limits": ([-1.0, -2.0], [0.5, 2.0]), "input_limits": (-1.0, 3.0)}
         model = (SMALL["A"], [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1)
@@ -241,7 +247,7 @@ def tank(k, delay=0, level=None, **more):
 
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("kind", ["function", "plants"])
-def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay):
+def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay, few_points):
     def of(k):
         return tank(k, delay, offset=[0.0])
 
@@ -273,7 +279,7 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
         np.testing.assert_allclose(plant.from_deviation(info["state"])[0], 0.4 / k, atol=2e-3)
 
 
-def test_members_are_at_rest_where_somebody_says_so():
+def test_members_are_at_rest_where_somebody_says_so(few_points):
     def at_two(k):
         return tank(k, level=2.0)
 
@@ -292,7 +298,7 @@ def test_members_are_at_rest_where_somebody_says_so():
 
 
 @pytest.mark.parametrize("more", [{}, {"input_delay": 2}, {"du_max": 0.5}, {"input_delay": 1, "du_max": 0.4}])
-def test_members_may_rest_with_other_inputs(more):
+def test_members_may_rest_with_other_inputs(more, few_points):
     def cart(mass):
         model = ([[0.0, 1.0], [0.0, -0.5 / mass]], [[0.0], [1.0 / mass]], [[1.0, 0.0]], [[0.0]])
         limits = {"state_limits": ([0.0, -2.0], [2.0, 2.0]), "input_limits": (-2.0, 2.0)}
@@ -308,7 +314,7 @@ def test_members_may_rest_with_other_inputs(more):
     np.testing.assert_allclose(moves, [0.05 * 0.3 * 0.00495, 0.05 * 0.3 * 0.0976], rtol=0.1)
 
 
-def test_rounding_of_operating_points_is_no_step():
+def test_rounding_of_operating_points_is_no_step(few_points):
     def pushed(k):
         decay = np.exp(-0.5 * k)
         model = {"A": [[decay, 0.0], [0.0, 1.0]], "B": [[0.5 * (1.0 - decay) / k], [0.1]], "dt": 0.5}
@@ -376,7 +382,7 @@ def test_what_members_share_is_compared_inside_the_ranges(changed, name):
         env.reset(options={"parameters": {"angle": 0.0}})
 
 
-def test_two_ended_disturbances_move_each_member():
+def test_two_ended_disturbances_move_each_member(few_points):
     def pushed(k):
         return tank(k, disturbance_bound=([[1.0]], [-0.01], [0.03]))
 
@@ -388,7 +394,7 @@ def test_two_ended_disturbances_move_each_member():
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
 @pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
-def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low):
+def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low, few_points):
     def of(a):
         model = {"A": [[a]], "B": [[0.5]], "dt": 1.0, "box": [1.0], "u_max": 0.9, "sensor_bound": 0.01}
         return LinearPlant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))

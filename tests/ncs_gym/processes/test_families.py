@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from ncs_gym import Channel, FamilyProcess, LinearPlant, LinearProcess, NCSEnv, NCSVectorEnv, RandomChannel
 from ncs_gym import truck_trailer as truck
 from ncs_gym.processes.process import own_process
+from tests.plants import varying_truck
 
 QUIET = {"gamma": 0.0, "process_noise_cov": np.zeros((2, 2))}
 
@@ -19,7 +20,7 @@ def quiet_truck(mass=4000.0, stiffness=4500.0):
 
 RANGES = {"mass": (3800.0, 4200.0), "stiffness": (4300.0, 4700.0)}
 FAMILY = LinearPlant.family(quiet_truck, RANGES, monotone=True)
-NOISY = LinearPlant.family(truck, {"mass": (3800.0, 4200.0)}, monotone=True)
+NOISY = varying_truck()
 TRUCKS = LinearPlant.family([truck(mass) for mass in (3800.0, 4000.0, 4200.0)])
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 

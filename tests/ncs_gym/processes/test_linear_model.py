@@ -18,6 +18,7 @@ from ncs_gym import (
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import surrounding_shape
 from shields import SafetyShield
+from tests.certificates import certificate_of
 
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05
@@ -180,7 +181,8 @@ def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
     """What is left of a step of the tank, with the input that acts, is the declared disturbance."""
     plant = linear_model(tank, **TANK | past)
     channel = Channel(loss=0.3, max_consecutive_losses=2)
-    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=FunctionProcess(tank), channel=channel))
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=FunctionProcess(tank), channel=channel)
+    env = SafetyShield(env, certificate_of(plant, env.unwrapped.certificate_contract, "polytope"))
     rng, off, actions = np.random.default_rng(0), [], []
     _, info = env.reset(seed=0, options={"state": np.zeros(plant.n)})
     for step in range(150):

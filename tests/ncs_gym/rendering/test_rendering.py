@@ -26,7 +26,7 @@ from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.phase_plane import PhasePlane, ends_of
-from shields import SafetyShield, VectorSafetyShield, synthesize
+from shields import SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -171,7 +171,7 @@ def test_past_inputs_are_not_drawn(monkeypatch, states):
     limits = {"state_limits": (0.2, 2.0), "operating_state": np.ones(states), "input_limits": (0.0, 1.0)}
     own = {"A": 0.8 * np.eye(states), "B": np.full((states, 1), 0.4), "dt": 20.0, "gamma": 1e-4, "operating_input": 0.5}
     plant = LinearPlant(**own, **limits, input_delay=1, du_max=0.6, input_names=("valve",))
-    env = SafetyShield(make("ncs_gym/LinearNCS-v0", plant=plant), synthesize(plant))
+    env = SafetyShield(make("ncs_gym/LinearNCS-v0", plant=plant), certificate_of(plant, None, "polytope"))
     written, draw = [], Canvas.text
 
     def text(canvas, words, *place, **style):

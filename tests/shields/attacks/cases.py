@@ -25,7 +25,7 @@ from ncs_gym import (
 from ncs_gym.network.contract import contract_of
 from shields import Certificate
 from tests.certificates import certificate_of
-from tests.plants import random_plant, servo
+from tests.plants import random_plant, servo, varying_cart_pole, varying_truck
 
 CHANNELS = {
     "perfect": Channel(),
@@ -139,18 +139,6 @@ def registered(name: str, **settings: Any) -> Case:
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
     age, step = env.contract.max_age, env.contract.quantization_step
     return unstable(env.plant, age, step, process=env.process, safe_set="polytope", **settings)
-
-
-@cache
-def varying_truck() -> LinearPlant:
-    """The loaded truck, 4000 kg +- 5 %."""
-    return LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
-
-
-@cache
-def varying_cart_pole() -> LinearPlant:
-    """The cart-pole, mass and length of the pole +- 2 %."""
-    return LinearPlant.family(cart_pole, {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}, monotone=True)
 
 
 CASES = {

@@ -1,7 +1,7 @@
 """The campaign: one adversary against every claim, in every case and mode; and twins of it that it has to win.
 
-`make test` runs a part of every case and mode, `make test-slow` the whole, by the same function. All claims that a run
-makes are compared in it; whatever is false names its claim.
+`make test` runs a part of some cases in every mode, `make test-slow` the whole of all, by the same function. All claims
+that a run makes are compared in it; whatever is false names its claim.
 """
 
 from collections import Counter
@@ -74,7 +74,7 @@ def campaign() -> list:
     return rows
 
 
-@pytest.mark.cases(40)
+@pytest.mark.cases(24)
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     first = [*CASES].index(name) + MODES.index(mode)
@@ -98,7 +98,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
-@pytest.mark.cases(8)
+@pytest.mark.cases(5)
 @pytest.mark.parametrize(("count", "steps"), [(30, 50), pytest.param(200, 500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
@@ -115,10 +115,10 @@ def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, c
             assert is_positive_semidefinite(subtract(rational(certified), rational(running)))
 
 
-@pytest.mark.cases(8)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("name", "size"),
-    [("cart-pole, position and angle", 100), ("batch reactor", 60)]
+    [("batch reactor", 60), ("cart-pole, position and angle", 100)]
     + [pytest.param(name, 150, marks=pytest.mark.slow) for name in CASES if case(name).contract],
 )
 def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract_is_kept(name, size):
@@ -128,6 +128,7 @@ def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract
     assert min(outcome.counts["lost"], outcome.counts["certified again"]) > 0
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
@@ -272,7 +273,7 @@ def twins() -> list:
     ]
 
 
-@pytest.mark.cases(20)
+@pytest.mark.cases(14)
 @pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
 def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
     claims, _, anyway, _ = TWINS[defect]

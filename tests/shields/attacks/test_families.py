@@ -4,6 +4,7 @@ The campaign attacks the same families in every mode (cases.py); here members ar
 """
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Linear
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from shields import SafeLoop, VectorSafetyShield
 from tests.certificates import certificate_of
-from tests.shields.attacks.cases import varying_cart_pole, varying_truck
+from tests.plants import varying_cart_pole, varying_truck
 from tests.verdicts import verified
 
 FAMILIES = {
@@ -189,11 +190,17 @@ def tank(k):
     return LinearPlant.from_statespace(model, **settings, **rests, **bounds)
 
 
+@cache
+def varying_tank():
+    return LinearPlant.family(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+
+
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("every", [1, 10])
 @pytest.mark.parametrize("outward", [-1.0, 1.0])
 @pytest.mark.parametrize("k", [0.19, 0.2, 0.21])
 def test_a_tank_that_rests_elsewhere_keeps_its_levels(k, outward, every):
-    plant = LinearPlant.family(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    plant = varying_tank()
     loop = SafeLoop(certificate_of(plant, None, "polytope"), plant, Channel(delay=1), on_unproved="ignore")
     level, arrived, reached = 2.0, [], 0.0
     loop.start(plant.to_deviation([level + 0.02 * outward]))

@@ -1,6 +1,4 @@
 import pickle
-import subprocess
-import sys
 from dataclasses import replace
 
 import gymnasium as gym
@@ -61,11 +59,6 @@ def test_no_shield_takes_a_certificate_of_the_paper(paper):
         SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
     with pytest.raises(ValueError, match="takes a Certificate and a LinearPlant"):
         verify(paper, SMALL)
-
-
-def test_published_method_is_there_without_a_further_import():
-    program = "import shields; print(shields.paper.synthesize.__name__)"
-    assert subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
 
 
 @pytest.mark.slow

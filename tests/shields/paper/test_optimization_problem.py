@@ -32,6 +32,7 @@ def reduced(plant, bounds):
     return problem.value if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else None
 
 
+@pytest.mark.cases(4)
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @pytest.mark.parametrize(("kappa", "rho"), POINTS)
 def test_op_as_printed_agrees_with_a_program_without_its_auxiliary_variables(kappa, rho):

@@ -141,7 +141,7 @@ def false_claims(trace: Trace, mode: str, kind: str, first: int = 0) -> list[str
     return wrong
 
 
-@pytest.mark.cases(12)
+@pytest.mark.cases(8)
 @pytest.mark.parametrize("kind", ["ellipsoid", "polytope"])
 @pytest.mark.parametrize("c", [0, 1, 2, 3])
 @pytest.mark.parametrize("mode", [*KEEPING, "monitor"])
@@ -175,7 +175,7 @@ def test_a_first_way_that_leaves_the_box_is_over_before_anything_is_proved(c):
             assert all(flags[c + 1 :])
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("c", [0, 1, 2])
 @pytest.mark.parametrize("mode", KEEPING)
 def test_the_way_to_where_an_unknown_state_is_found_is_nobodys(mode, c):

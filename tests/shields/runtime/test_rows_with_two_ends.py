@@ -51,6 +51,7 @@ def test_inputs_that_pass_keep_every_extreme_point_between_both_ends(m):
     assert 5 < passed < 55
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("m", PLANTS)
 def test_closest_inputs_between_uneven_ends_are_those_of_a_solver(m):
     plant, rng, found, infeasible = PLANTS[m], np.random.default_rng(m), 0, 0

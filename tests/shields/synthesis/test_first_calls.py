@@ -18,7 +18,7 @@ from tests.verdicts import verified
 CALLS = json.loads((Path(__file__).parents[2] / "data" / "first_calls.json").read_text())
 # Which are refused, and why.
 REFUSED = {"zone_22": r"those that bind: 20 <= air <= 24 .*radii shrink to"}
-QUICK = ("motor_speed_ctms", "cstr_mathworks", "buck_geyer", "pitch_nrel5")
+QUICK = ("cstr_mathworks", "buck_geyer")
 
 
 def plant_of_call(name: str) -> LinearPlant:

@@ -141,6 +141,7 @@ def test_limits_that_bind_are_named():
     assert told.value.__suppress_context__  # one error with one percentage
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("speed_only", [[[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]]])
 def test_less_age_is_not_named_where_a_state_is_not_seen(speed_only):
     chain = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]

@@ -140,7 +140,7 @@ def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
 
 def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps():
     plant = plants.servo(1.0, box=None, state_limits=([-0.1, -4.0], [0.3, 4.0]))
-    found = requirements(plant, ages=[0, 2, 4])
+    found = requirements(plant, ages=[0, 4])
     for age in found.ages:
         kept = synthesize(plant, contract=ChannelContract(age)).provenance["polytope_share_of_box"]
         assert share_of(found.certificate(age))[1] == pytest.approx(kept, abs=0.02)
