@@ -316,6 +316,7 @@ class LinearPlant(LimitValues, HardBounds):
         as_bound(given.bound, self.n, "remainder")
         model = {name: getattr(self, name) for name in ("A", "B")}
         model |= {"box": np.vstack([self.box.T, self.box_ends]), "u_max": self.input_ends, "dt": self.dt}
+        model["mixed_limits"] = np.vstack([self.mixed_rows.T, self.mixed_ends]).T
         return given.of_model(model)
 
     def _check_between_samples(self) -> None:

@@ -48,11 +48,12 @@ DIGITS = 9
 
 # Arguments of `LinearPlant` for the point that deviations are counted from, and for where states and inputs may be.
 _POINT = "operating_state", "operating_input"
-_OF_FRAME = "state_limits", "input_limits", "output_limits", "box_ends", "input_ends", *_POINT
+_ROWS = "output_limits", "mixed_limits", "mixed_rows", "mixed_ends"
+_OF_FRAME = "state_limits", "input_limits", "box_ends", "input_ends", *_ROWS, *_POINT
 
 
 class _Region(NamedTuple):
-    """Where the remainder is bounded: low <= (x, u) <= high in deviations, shape (n + m,) each."""
+    """Where the remainder is bounded, as far as other limits allow: low <= (x, u) <= high in deviations, (n + m,)."""
 
     low: np.ndarray
     high: np.ndarray
@@ -241,12 +242,20 @@ def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
 
 
 def _sampled(moving: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator) -> _Steps:
-    """Returns steps from random points of the region; half of them have coordinates on its boundary."""
+    """Returns steps from random points of the region; half of them have coordinates on its boundary.
+
+    A point that limits of several coordinates forbid is pulled towards zero onto their boundary.
+    """
     low, high = (side[:, None] for side in region)
     points = rng.uniform(-1.0, 1.0, (len(low), count))
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
     inside = np.clip(0.5 * (low + high) + 0.5 * (high - low) * points, low, high)
     points = np.where(at_end, np.where(points < 0.0, low, high), inside)
+    of_sums = np.count_nonzero(frame.box, axis=1) > 1
+    states_alone = np.hstack([frame.box[of_sums], np.zeros((of_sums.sum(), frame.m))])
+    values = np.concatenate([states_alone, frame.mixed_rows]) @ points
+    ends = np.concatenate([frame.box_ends[:, of_sums], frame.mixed_ends], axis=1)[:, :, None]
+    points = points / np.maximum(values / ends, 1.0).max(axis=(0, 1), initial=1.0)
     states, inputs = points[: frame.n], points[frame.n :]
     return _Steps(states, inputs, _moved(moving, frame, states, inputs, rng))
 
