@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
@@ -360,8 +361,8 @@ def _residual_of_equilibrium(
         return missing
     remedy = "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
     rest = np.eye(len(A)) - A
-    if np.linalg.cond(rest) < 1e9:
-        equilibrium = np.linalg.solve(rest, B @ applied + offset).tolist()
+    if exact.rank(rest) == len(A):
+        equilibrium = exact.product(exact.inverse(rest), B @ applied + offset).tolist()
         remedy = f"with this input the equilibrium is {shown(equilibrium)}, or {remedy}"
     raise ValueError(
         f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
@@ -548,12 +549,13 @@ def _around_middle_of_disturbance(
     ends = as_row_ends(fields.get("box_ends"), len(rows))
     inputs = as_input_ends(fields["input_ends"], m)
     reach = 0.5 * (inputs[1] - inputs[0])
-    balance = np.hstack([np.eye(n) - A, -B * reach])
-    found = np.linalg.lstsq(balance, E @ middle)[0]
+    widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
+    balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
+    found = np.linalg.lstsq(balance, E @ middle / widths)[0]
     directions = null_space(balance)
-    sizes = np.vstack([np.hstack([rows, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
+    sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
     found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
-    x, u = found[:n], reach * found[n:]
+    x, u = widths * found[:n], reach * found[n:]
 
     def missing_at(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))

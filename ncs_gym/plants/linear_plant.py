@@ -346,7 +346,7 @@ class LinearPlant(LimitValues, HardBounds):
                 "between_samples is for an operating point that rests without a constant disturbance: how much of "
                 f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
             )
-        if np.linalg.matrix_rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
+        if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
             raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
 
     @classmethod
@@ -430,7 +430,7 @@ class LinearPlant(LimitValues, HardBounds):
         Ac, Bc = self.continuous_model[:, : self.n], self.continuous_model[:, self.n :]
         A, B = statespace.zero_order_hold(Ac, Bc, dt)
         of_constant = [statespace.zero_order_hold(Ac, np.eye(self.n), step)[1] for step in (dt, self.dt)]
-        if np.linalg.cond(of_constant[1]) > LARGEST_CONDITION:
+        if np.linalg.cond(of_constant[1] * self.half_widths / self.half_widths[:, None]) > LARGEST_CONDITION:
             raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
         G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
         ball = Ellipsoid(self.gamma * np.eye(self.n))

@@ -321,6 +321,8 @@ def fitted_matrices(
         widths: Half-widths of the box, shape (n,).
     """
     regressors = np.concatenate([states, inputs]).T
+    units = np.maximum(np.abs(regressors).max(axis=0), np.finfo(float).tiny)
+    regressors = regressors / units
     targets = (moved / widths[:, None]).T
     weights, best, smallest = np.ones(len(targets)), None, np.inf
     for _ in range(ROUNDS):
@@ -333,7 +335,7 @@ def fitted_matrices(
         weights /= weights.sum()
     if best is None:
         raise ValueError("the sampled steps are not finite: no linear model fits them")
-    fitted = np.round(best * widths, DIGITS).T
+    fitted = (np.round(best, DIGITS) * widths / units[:, None]).T
     return fitted[:, : len(states)], fitted[:, len(states) :]
 
 

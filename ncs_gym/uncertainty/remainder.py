@@ -16,7 +16,7 @@ from ncs_gym.validation import as_flag, require_short_text, shown
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits (and both in common ones).
+    """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits (both in common ones).
 
     The remainder that a plant keeps knows the model, the box and the limits of that plant, and no plant of others takes
     it over. Whether its bound is proved has to be said again with `dataclasses.replace`. Of a family, the plant that

@@ -176,7 +176,7 @@ def design_problem(
         Infeasible: If the plant has no error set, its safe box is unbounded, or far too wide for times between samples.
     """
     limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
-    free = plant.n - int(np.linalg.matrix_rank(limits.box_rows))
+    free = plant.n - exact.rank(limits.box_rows)
     if free:
         without = [name for name, column in zip(plant.state_names, limits.box_rows.T, strict=True) if not column.any()]
         among = f" (of {', '.join(without)})" if without else ""

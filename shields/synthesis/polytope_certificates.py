@@ -16,8 +16,8 @@ from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.certificate_fields import (
-    DIGITS,
     fields_of_problem,
+    gain_in_digits,
     proofs_of,
     provenance_of,
     shape_in_digits,
@@ -134,7 +134,7 @@ def _certified_polytope(
         Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
     """
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
-    K, proofs = exact.rounded(K, DIGITS, axis=1), proofs_of(errors)
+    K, proofs = gain_in_digits(K, plant), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
     polytope = invariant_polytope(feedback, plant, progress, margins)
     faces = polytope.F
@@ -191,7 +191,7 @@ def around_resting_point(
         Infeasible: If none is found.
     """
     progress("resting point")
-    tried = _different(fallbacks_around(plant, contract, progress, fixed))
+    tried = _different(fallbacks_around(plant, contract, progress, fixed), plant)
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
         larger = []
@@ -257,9 +257,9 @@ def fallbacks_around(
     return [feedback(K, rest), *tried]
 
 
-def _different(fallbacks: Sequence[Feedback]) -> list[Feedback]:
+def _different(fallbacks: Sequence[Feedback], plant: LinearPlant) -> list[Feedback]:
     """Returns fallbacks in their order, of those that are the same in a certificate's digits the first."""
-    keys = [(exact.rounded(each.K, DIGITS, axis=1).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
+    keys = [(gain_in_digits(each.K, plant).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
     return [each for number, each in enumerate(fallbacks) if keys[number] not in keys[:number]]
 
 
