@@ -63,9 +63,7 @@ class HardBounds(ReadOnlyArrays):
         bounds = [each.shape_matrix for each in (self.disturbance_bound, self.initial_bound) if each is not None]
         noise = [np.diag(each) for each in (self.process_noise_cov, self.initial_cov, *bounds)]
         reach = np.sqrt(self.gamma + np.sum(noise, axis=0))
-        for _ in range(self.n):
-            reach = exact.product(np.abs(np.hstack([self.A, self.B])), np.concatenate([reach, self.largest_input]))
-        return read_only(reach)
+        return read_only(reach_in_steps(self.A, self.B, self.largest_input, reach))
 
     @cached_property
     def _box_shape(self) -> np.ndarray:
@@ -201,6 +199,13 @@ def _plus_uniform(
 ) -> np.ndarray:
     """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
     return samples if bound is None or not np.any(bound.shape_matrix) else samples + bound.sample(rng, count)
+
+
+def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""
+    for _ in range(len(A)):
+        reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
+    return reach
 
 
 def inflated(shape: np.ndarray) -> np.ndarray:

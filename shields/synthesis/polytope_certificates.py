@@ -80,14 +80,19 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
     try:
         polytope = invariant_polytope(feedback_of(certificate), plant, progress)
         return _verified_polytope(replace(certificate, polytope=polytope), plant, progress)
-    except Infeasible as none:
-        reason = str(none)
-    except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
-        reason = f"its numbers are out of reach of float64 ({error}): {MORE_DIGITS}"
+    except _NOT_CERTIFIED as failure:
+        reason = _reason_of(failure)
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
         raise SynthesisInterrupted(message, certificate) from interrupt
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
+
+
+def _reason_of(failure: Exception) -> str:
+    """Returns why there is no polytope; what a library says of numbers stands in parentheses."""
+    if isinstance(failure, Infeasible):
+        return str(failure)
+    return f"its numbers are out of reach of float64 ({failure}): {MORE_DIGITS}"
 
 
 def certify_polytope(
@@ -199,7 +204,7 @@ def around_resting_point(
             try:
                 return _certified_polytope(plant, each.K, contract, progress, each.rest, (margin,))
             except _NOT_CERTIFIED as failure:
-                reasons.append(str(failure))
+                reasons.append(_reason_of(failure))
                 if isinstance(failure, Infeasible) and is_too_large(failure):
                     larger.append(each)
             if clock.is_over:
