@@ -17,11 +17,11 @@ from shields.synthesis.invariant_set_program import InvariantSetProgram, max_sla
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
-_ALTERNATIONS = 40
-# An alternation that gains less than this in log det has converged.
-_SMALLEST_GAIN = 1e-4
-# Relative step of the pattern search over the multipliers; it is divided by 3 until it is below the smallest.
-_FIRST_STEP, _SMALLEST_STEP = 0.3, 0.03
+ALTERNATIONS = 40
+# An alternation that gains less than this in log det, 1 % of volume, is the last one.
+_SMALLEST_GAIN = 0.02
+# Relative step of the pattern search over the multipliers.
+_STEP = 0.3
 
 
 def largest_set(
@@ -29,7 +29,7 @@ def largest_set(
     slack: float,
     report: ProgressCallback,
     start: CandidateDesign | None = None,
-    alternations: int = _ALTERNATIONS,
+    alternations: int = ALTERNATIONS,
 ) -> CandidateDesign | None:
     """Returns the design of largest volume that alternation finds; None if no initial design is found.
 
@@ -45,23 +45,18 @@ def largest_set(
     best = best or initial_design(problem, program, report)
     if best is None:
         return None
-    step = _FIRST_STEP
     for turn in range(alternations):
         if -best.log_det < VOLUME_TOLERANCE:
             break
-        better = _alternate(problem, program, best, step)
+        better = _alternate(problem, program, best)
         report(f"alternation {turn + 1} of at most {alternations}", better)
-        if better.log_det - best.log_det < _SMALLEST_GAIN:
-            step /= 3.0
-            if step < _SMALLEST_STEP:
-                break
-        best = better
+        gained, best = better.log_det - best.log_det, better
+        if gained < _SMALLEST_GAIN:
+            break
     return best
 
 
-def _alternate(
-    problem: DesignProblem, program: InvariantSetProgram, best: CandidateDesign, step: float
-) -> CandidateDesign:
+def _alternate(problem: DesignProblem, program: InvariantSetProgram, best: CandidateDesign) -> CandidateDesign:
     """Returns the best design with X linearized at the best L so far, over several multipliers; never a worse one.
 
     The multipliers are the design's own, those that suit its set and gain best, and a pattern around them.
@@ -72,11 +67,16 @@ def _alternate(
         best = _larger(best, program.solve(multipliers, inputs, linearize_at))
     lx, le, _ = best.multipliers
     error_fraction = le / (1.0 - lx)
-    for factor, shift in ((1.0 + step, 0.0), (1.0 / (1.0 + step), 0.0), (1.0, step), (1.0, -step)):
+    for factor, shift in ((1.0 + _STEP, 0.0), (1.0 / (1.0 + _STEP), 0.0), (1.0, _STEP), (1.0, -_STEP)):
         shifted_lx = 1.0 - np.clip((1.0 - lx) * factor, 1e-4, 0.99)
         shifted_fraction = np.clip(error_fraction * (1.0 + shift), 1e-3, 0.99)
         best = _larger(best, program.solve(multiplier_triple(shifted_lx, shifted_fraction), best.inputs, best.L))
     return best
+
+
+def tightened(problem: DesignProblem, design: CandidateDesign, slack: float) -> CandidateDesign | None:
+    """Returns the largest set next to a design, with its multipliers, for a larger slack; None if there is none."""
+    return InvariantSetProgram(problem, slack).solve(design.multipliers, design.inputs, design.L)
 
 
 def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> CandidateDesign:

@@ -11,12 +11,12 @@ import pytest
 from benchmarks.published import contract_of_plant, plant_of
 from ncs_gym import ChannelContract, ErrorSetError, LinearPlant, certified_error_set
 from shields import Infeasible, synthesize
-from shields.synthesis.certification import LONGEST_REFUSAL
-from shields.synthesis.diagnosis import Clock
 from tests.certificates import feasible_age_not_sought
 from tests.plants import servo, with_radii
 from tests.verdicts import verified
 
+# A refusal takes so long at most [s of the processor].
+LONGEST_REFUSAL = 60.0
 QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
 PENDULUM = {
     "A": [[1.1, 0.1], [0.1, 1.0]], "B": [[0.0], [0.1]], "dt": 0.1, "box": [0.3, 1.0], "u_max": 5.0,
@@ -164,14 +164,6 @@ def test_error_sets_that_no_age_has_are_told_from_those_of_less_age():
         certified_error_set(
             LinearPlant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5}), ChannelContract(400)
         )
-
-
-def test_clock_that_has_run_out_ends_a_search():
-    clock = Clock(time.thread_time() + 1e3)
-    clock.check("a line of progress")
-    assert not clock.is_over
-    with pytest.raises(TimeoutError):
-        Clock(time.thread_time() - 1.0).check()
 
 
 @pytest.mark.slow
