@@ -18,10 +18,10 @@ from shields.synthesis.multipliers import best_input_multipliers, best_multiplie
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
 ALTERNATIONS = 40
-# An alternation that gains less than this in log det, 1 % of volume, is the last one.
+# An alternation that gains less than this in log det, 1 % of volume, is the last one with its step.
 _SMALLEST_GAIN = 0.02
-# Relative step of the pattern search over the multipliers.
-_STEP = 0.3
+# Relative steps of the pattern search over the multipliers.
+_STEPS = (0.3, 0.1, 0.033)
 
 
 def largest_set(
@@ -45,18 +45,21 @@ def largest_set(
     best = best or initial_design(problem, program, report)
     if best is None:
         return None
+    steps = list(_STEPS)
     for turn in range(alternations):
-        if -best.log_det < VOLUME_TOLERANCE:
+        if -best.log_det < VOLUME_TOLERANCE or not steps:
             break
-        better = _alternate(problem, program, best)
+        better = _alternate(problem, program, best, steps[0])
         report(f"alternation {turn + 1} of at most {alternations}", better)
-        gained, best = better.log_det - best.log_det, better
-        if gained < _SMALLEST_GAIN:
-            break
+        if better.log_det - best.log_det < _SMALLEST_GAIN:
+            steps.pop(0)
+        best = better
     return best
 
 
-def _alternate(problem: DesignProblem, program: InvariantSetProgram, best: CandidateDesign) -> CandidateDesign:
+def _alternate(
+    problem: DesignProblem, program: InvariantSetProgram, best: CandidateDesign, step: float
+) -> CandidateDesign:
     """Returns the best design with X linearized at the best L so far, over several multipliers; never a worse one.
 
     The multipliers are the design's own, those that suit its set and gain best, and a pattern around them.
@@ -67,7 +70,7 @@ def _alternate(problem: DesignProblem, program: InvariantSetProgram, best: Candi
         best = _larger(best, program.solve(multipliers, inputs, linearize_at))
     lx, le, _ = best.multipliers
     error_fraction = le / (1.0 - lx)
-    for factor, shift in ((1.0 + _STEP, 0.0), (1.0 / (1.0 + _STEP), 0.0), (1.0, _STEP), (1.0, -_STEP)):
+    for factor, shift in ((1.0 + step, 0.0), (1.0 / (1.0 + step), 0.0), (1.0, step), (1.0, -step)):
         shifted_lx = 1.0 - np.clip((1.0 - lx) * factor, 1e-4, 0.99)
         shifted_fraction = np.clip(error_fraction * (1.0 + shift), 1e-3, 0.99)
         best = _larger(best, program.solve(multiplier_triple(shifted_lx, shifted_fraction), best.inputs, best.L))
