@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import replace
 
@@ -132,6 +133,15 @@ def test_what_refusals_of_more_plants_name_has_a_certificate(name):
     told = refusal(plant, contract)
     assert told.details
     require_hints_that_certify(plant, contract, told)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bap_gepoc", "heli_tondel", "port_crane", "propofol", "tvc_rocket"])
+def test_published_plant_is_refused_in_time_if_it_is(name):
+    began = time.thread_time()
+    with contextlib.suppress(Infeasible):
+        synthesize(plant_of(name), contract=contract_of_plant(name))
+    assert time.thread_time() - began < LONGEST_REFUSAL
 
 
 def test_limits_that_bind_are_named():
