@@ -8,7 +8,7 @@ that is a row again. What a linear program shows to hold already is not added. A
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -83,12 +83,7 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
     return Faces(rows / half[:, None], low / half, high / half)
 
 
-def invariant_polytope(
-    feedback: Feedback,
-    plant: LinearPlant,
-    progress: Callable[[str], object],
-    margins: Sequence[float] = MARGINS,
-) -> Polytope:
+def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
     Where it would have too many rows, it is one that is nearly as large and has fewer.
@@ -97,13 +92,12 @@ def invariant_polytope(
         feedback: The fallback.
         plant: Its plant.
         progress: Called with a line of text now and then.
-        margins: Those of `MARGINS` that are tried, each where the one before makes too many rows.
 
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows, `MOST_FOLLOWED` of them followed; the message says why.
     """
     too_large: Infeasible | None = None
-    for margin in margins:
+    for margin in MARGINS:
         implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
         try:
             return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
