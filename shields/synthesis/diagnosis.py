@@ -151,10 +151,10 @@ def with_age_that_helps(
 
 
 def _may_be_helped(infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> bool:
-    """Returns whether less age may help."""
+    """Returns whether less age may help: not against too many rows of a polytope, where a gain bears all."""
     if infeasible.binding == "E1":
         return contract is not None and error_sets_by_age(plant, replace(contract, max_age=0)) is not None
-    return infeasible.binding != "S" and infeasible.details.get(_SHARE) != 0.0
+    return infeasible.binding not in ("S", "P") and infeasible.details.get(_SHARE) != 0.0
 
 
 def _largest_age(
