@@ -16,7 +16,6 @@ from shields.synthesis.ellipsoid_certificates import certify, largest_ellipsoid,
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
-    fallbacks_around,
     polytope_share,
     with_polytope,
 )
@@ -186,8 +185,7 @@ def nearby_certificate(
             if ellipsoid.certificate is not None or carried is not None or not polytope:
                 return ellipsoid.certificate or carried
             known = [] if ellipsoid.K is None else [ellipsoid.K]
-        around = fallbacks_around(plant, contract, progress, known=known)[:1]
-        found = [carried, *(certify_polytope(plant, each.K, contract, progress, each.rest) for each in around)]
+        found = around_resting_point(plant, contract, progress, known=known)
     except Infeasible:
         return carried
-    return max((each for each in found if each is not None), key=polytope_share, default=None)
+    return found if carried is None else max(found, carried, key=polytope_share)

@@ -154,10 +154,10 @@ def with_age_that_helps(
 
 
 def _may_be_helped(infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> bool:
-    """Returns whether less age may help."""
+    """Returns whether less age may help: not against too many rows of a polytope, where a gain bears all."""
     if infeasible.binding == "E1":
         return contract is not None and _has_error_sets(plant, replace(contract, max_age=0))
-    return infeasible.binding != "S" and infeasible.details.get(_SHARE) != 0.0
+    return infeasible.binding not in ("S", "P") and infeasible.details.get(_SHARE) != 0.0
 
 
 def _has_error_sets(plant: LinearPlant, contract: ChannelContract) -> bool:

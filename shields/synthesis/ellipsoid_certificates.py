@@ -121,7 +121,7 @@ def largest_ellipsoid(
             continue
         report("exact verification", design)
         certificate = certificate_of(plant, problem, with_best_gain(problem, design), errors, slack)
-        K = certificate.K
+        K = certificate.K if K is None else K
         try:
             box_rows = _tightened_box(certificate, plant, tightened_boxes)
         except Infeasible as leaves:

@@ -102,7 +102,7 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
         try:
             return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
         except Infeasible as infeasible:
-            if not is_too_large(infeasible):  # with a smaller margin it is a matter of rows
+            if not _is_too_large(infeasible):  # with a smaller margin it is a matter of rows
                 raise (too_large or infeasible) from None
             too_large = infeasible
             progress(f"polytope: {infeasible}")
@@ -110,7 +110,7 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
     raise too_large
 
 
-def is_too_large(infeasible: Infeasible) -> bool:
+def _is_too_large(infeasible: Infeasible) -> bool:
     """Returns whether there may be a polytope, but not within the limits of rows."""
     return _TOO_LARGE in infeasible.details
 

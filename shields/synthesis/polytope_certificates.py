@@ -29,7 +29,6 @@ from shields.synthesis.invariant_polytope import (
     Feedback,
     feedback_of,
     invariant_polytope,
-    is_too_large,
     points_of_box,
     share_in_polytope,
     share_of_last_input,
@@ -53,6 +52,8 @@ from shields.verification import verify
 _INSIDE = 1.0 - 1e-9
 # Points of the box by which resting points are compared.
 _POINTS_OF_REST_LOG2 = 12
+# For so many gains a polytope is sought.
+_MOST_SOUGHT = 4
 # What an equilibrium lacks is computed with an error of at most this, relative to its terms.
 _OF_REST = 1e-14
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
@@ -153,8 +154,8 @@ def around_resting_point(
     """Returns a verified certificate of a polytope alone, around a resting point.
 
     The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
-    fixed one; where the share of the box is known, a better resting point then. The search ends with the first gain
-    whose polytope has too many rows: those of others have, too, and take long.
+    fixed one; where the share of the box is known, a better resting point then. One polytope is sought for each of the
+    `_MOST_SOUGHT` first gains.
 
     Args:
         plant: The plant.
@@ -168,13 +169,11 @@ def around_resting_point(
     """
     progress("resting point")
     reasons: list[str] = []
-    for each in _different(fallbacks_around(plant, contract, progress, fixed, known), plant):
+    for each in _different(fallbacks_around(plant, contract, progress, fixed, known), plant)[:_MOST_SOUGHT]:
         try:
             return _certified_polytope(plant, each.K, contract, progress, each.rest)
         except _NOT_CERTIFIED as failure:
             reasons.append(_reason_of(failure))
-            if isinstance(failure, Infeasible) and is_too_large(failure):
-                break
     raise Infeasible(reasons[0] if reasons else "no gain was found", "P", 0.0)
 
 
