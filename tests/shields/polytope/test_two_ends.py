@@ -439,3 +439,18 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
     said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
     with pytest.raises(Infeasible, match=said):
         synthesize(ANGLE, contract=CONTRACT)
+
+
+def test_state_that_only_follows_needs_no_limit():
+    """It decays by itself: whatever a regulator does, it may be as large as it likes."""
+    plant = LinearPlant(
+        A=[[1.02, 0.0], [0.05, 0.9]],
+        B=[[0.1], [0.0]],
+        dt=0.1,
+        box=[1.0, np.inf],
+        u_max=1.0,
+        disturbance_bound=[2e-3, 1e-3],
+        sensor_bound=2e-3,
+        initial_bound=0.01,
+    )
+    assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
