@@ -14,6 +14,8 @@ from ncs_gym.estimation.error_bound import unseen_state
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.estimation.error_sets import ErrorSetError
 from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
+from ncs_gym.plants.hard_bounds import FREE_REACH
+from ncs_gym.plants.past_inputs import is_row_of_past_input
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
@@ -165,7 +167,7 @@ def with_age_that_helps(
     progress("no certificate: searching for a max_age that has one")
     below = contract or ChannelContract(_OLDEST_NAMED + 1)
     age = _largest_age(plant, below, certifies, clock, polytope=polytope)
-    text, details = f"{infeasible}{_limits_exceeded(plant)}", dict(infeasible.details)
+    text, details = f"{infeasible}{_limits_exceeded(plant)}{_limits_out_of_reach(plant)}", dict(infeasible.details)
     if age is not None:
         details["max_age"] = age
         text += f"; there is a certificate for max_age = {age}"
@@ -223,6 +225,19 @@ def _limits_exceeded(plant: LinearPlant) -> str:
         for what, shape in alone.items()
         for j, size in enumerate(np.ravel(shape.support(plant.box)).tolist())
         if size >= 1.0 and j in two_ends
+    )
+
+
+def _limits_out_of_reach(plant: LinearPlant) -> str:
+    """Returns which limits nothing comes near, and which mislead the search, as the rest of a sentence."""
+    alone = (np.count_nonzero(plant.box, axis=1) == 1) & ~is_row_of_past_input(plant)
+    out_of_reach = np.abs(plant.box) @ (FREE_REACH * plant.reach_from_rest) < 1.0
+    names = [row_limit(plant, j) for j in np.flatnonzero(alone & out_of_reach).tolist()]
+    if not names:
+        return ""
+    return (
+        f"; inputs and disturbances take no state to a hundredth of {', '.join(names)} in {plant.n} steps: leave out "
+        "limits that stand for none"
     )
 
 

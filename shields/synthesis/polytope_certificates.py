@@ -16,8 +16,8 @@ from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.certificate_fields import (
-    DIGITS,
     fields_of_problem,
+    gain_in_digits,
     proofs_of,
     provenance_of,
     shape_in_digits,
@@ -80,14 +80,19 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
     try:
         polytope = invariant_polytope(feedback_of(certificate), plant, progress)
         return _verified_polytope(replace(certificate, polytope=polytope), plant, progress)
-    except Infeasible as none:
-        reason = str(none)
-    except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
-        reason = f"its numbers are out of reach of float64 ({error}): {MORE_DIGITS}"
+    except _NOT_CERTIFIED as failure:
+        reason = _reason_of(failure)
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
         raise SynthesisInterrupted(message, certificate) from interrupt
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
+
+
+def _reason_of(failure: Exception) -> str:
+    """Returns why there is no polytope; what a library says of numbers stands in parentheses."""
+    if isinstance(failure, Infeasible):
+        return str(failure)
+    return f"its numbers are out of reach of float64 ({failure}): {MORE_DIGITS}"
 
 
 def certify_polytope(
@@ -134,7 +139,7 @@ def _certified_polytope(
         Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
     """
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
-    K, proofs = exact.rounded(K, DIGITS, axis=1), proofs_of(errors)
+    K, proofs = gain_in_digits(K, plant), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
     polytope = invariant_polytope(feedback, plant, progress, margins)
     faces = polytope.F
@@ -191,7 +196,7 @@ def around_resting_point(
         Infeasible: If none is found.
     """
     progress("resting point")
-    tried = _different(fallbacks_around(plant, contract, progress, fixed))
+    tried = _different(fallbacks_around(plant, contract, progress, fixed), plant)
     reasons: list[str] = []
     for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
         larger = []
@@ -199,7 +204,7 @@ def around_resting_point(
             try:
                 return _certified_polytope(plant, each.K, contract, progress, each.rest, (margin,))
             except _NOT_CERTIFIED as failure:
-                reasons.append(str(failure))
+                reasons.append(_reason_of(failure))
                 if isinstance(failure, Infeasible) and is_too_large(failure):
                     larger.append(each)
             if clock.is_over:
@@ -257,9 +262,9 @@ def fallbacks_around(
     return [feedback(K, rest), *tried]
 
 
-def _different(fallbacks: Sequence[Feedback]) -> list[Feedback]:
+def _different(fallbacks: Sequence[Feedback], plant: LinearPlant) -> list[Feedback]:
     """Returns fallbacks in their order, of those that are the same in a certificate's digits the first."""
-    keys = [(exact.rounded(each.K, DIGITS, axis=1).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
+    keys = [(gain_in_digits(each.K, plant).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
     return [each for number, each in enumerate(fallbacks) if keys[number] not in keys[:number]]
 
 
