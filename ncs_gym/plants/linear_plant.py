@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.bounds import Bounds, Gaussian, Sum
 from ncs_gym.plants import between_samples, limits, plant_file, statespace
 from ncs_gym.plants.assumptions import assumptions_of, warn_of_no_noise
 from ncs_gym.plants.description import described
@@ -23,19 +24,14 @@ from ncs_gym.plants.family import bound_of_family, plant_of_middle
 from ncs_gym.plants.hard_bounds import HardBounds
 from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import inputs_under_way, storing, with_past_inputs
-from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.uncertainty.declared_bound import as_bound, declared_set
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.family import Family
 from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.truncated_gaussian import (
-    SMALLEST_DELTA,
-    SMALLEST_KEPT,
-)
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     SMALLEST_NUMBER,
     as_count,
-    as_covariance,
     as_matrix,
     as_names,
     as_number,
@@ -282,22 +278,27 @@ class LinearPlant(LimitValues, HardBounds):
         object.__setattr__(self, name, value)
 
     def _check_declared(self) -> tuple[bool, bool, bool]:
-        """Checks what is declared of disturbances, sensor noise and first estimate; returns for which anything is."""
-        self._set("gamma", as_number(self.gamma, "gamma", low=0.0))
-        self._set("delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
+        """Keeps what is declared as `bounds`; returns for which of the three anything is."""
+        gamma = as_number(self.gamma, "gamma", low=0.0)
         declared = (
             ("process_noise_cov", "disturbance_bound", self.n),
             ("measurement_noise_cov", "sensor_bound", self.p),
             ("initial_cov", "initial_bound", self.n),
         )
-        is_given = [any(getattr(self, name) is not None for name in names) for *names, _ in declared]
-        for covariance, bound, size in declared:
-            value = getattr(self, covariance)
-            self._set(covariance, np.zeros((size, size)) if value is None else as_covariance(value, size, covariance))
-            if (value := getattr(self, bound)) is not None:
-                self._set(bound, as_bound(value, size, bound))
+        given = [tuple(getattr(self, name) for name in names) for *names, _ in declared]
+        sums = []
+        for (noise, bounded), (covariance, bound, size) in zip(given, declared, strict=True):
+            part = Gaussian(np.zeros((size, size)) if noise is None else noise, self.delta).sized(size)
+            rest = () if bounded is None else (declared_set(bounded, size, bound),)
+            sums.append(Sum((part, *rest)))
+            self._set(covariance, part.covariance)
+            self._set(bound, rest[0].ellipsoid() if rest else None)
+        self._set("bounds", Bounds(Sum((Ellipsoid(gamma * np.eye(self.n)), sums[0])), *sums[1:]))
+        self._set("gamma", gamma)
+        self._set("delta", self.bounds.sensor.gaussian.delta)
         if self.remainder is not None:
             self._set("remainder", self._own_remainder(self.remainder))
+        is_given = [any(each is not None for each in pair) for pair in given]
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     def _own_remainder(self, given: Any) -> Remainder:
