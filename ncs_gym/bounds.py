@@ -15,7 +15,7 @@ import numpy as np
 from ncs_gym import exact
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, TruncatedGaussian, truncation_energy
-from ncs_gym.validation import as_covariance, as_matrix, as_number, as_setting, shown
+from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_number, as_setting, shown
 
 # Sizes are squared, and must not become zero or infinite by that.
 SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
@@ -171,6 +171,18 @@ class Sum(UncertainSet):
         others = tuple(each for each in self.parts if not isinstance(each, Gaussian))
         return Sum(others) if others else None
 
+    def as_one(self, weight: np.ndarray) -> Any:
+        """Returns the only part, or else the ellipsoid of the smallest tr(W P), which must be about zero.
+
+        Raises:
+            ValueError: If one of several parts has two different ends.
+        """
+        if len(self.parts) == 1:
+            return self.parts[0]
+        if pushes_of(self):
+            raise ValueError("a set with two different ends is not added to others: give the sum as Through(E, Box)")
+        return self.ellipsoid(weight)
+
     def sized(self, size: int) -> Any:  # noqa: D102
         sized = tuple(each.sized(size) for each in self.parts)
         return self if sized == self.parts else Sum(sized)
@@ -184,6 +196,16 @@ class Sum(UncertainSet):
 
     def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
         return np.sum([each.sample(rng, count) for each in self.parts], axis=0)
+
+
+def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns E, shape (n, q), and w, shape (q,), of each part of a set whose middle is E w, w not zero."""
+    if isinstance(own, Sum):
+        return [each for part in own.parts for each in pushes_of(part)]
+    E, inside = (own.E, own.set) if isinstance(own, Through) else (None, own)
+    if inside is None or not np.any(inside.middle):
+        return []
+    return [(np.eye(inside.size) if E is None else E, inside.middle)]
 
 
 KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Box, Ball, Ellipsoid, Gaussian, Through, Sum)}
@@ -214,7 +236,7 @@ def as_set(value: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class Bounds(ReadOnlyArrays):
     """What bounds the uncertainties of a plant: half-widths, a number or a vector, or sets; 0 says that there is none.
 
     Attributes:
