@@ -10,7 +10,6 @@ import pytest
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Infeasible, synthesize
-from shields.synthesis.certification import LONGEST_REFUSAL
 from tests.verdicts import verified
 
 # Each has its source, what is invented of it, its model, what `LinearPlant.from_statespace` is given, and the age that
@@ -19,6 +18,8 @@ CALLS = json.loads((Path(__file__).parents[2] / "data" / "first_calls.json").rea
 # Which are refused, and why.
 REFUSED = {"zone_22": r"those that bind: 20 <= air <= 24 .*radii shrink to"}
 QUICK = ("cstr_mathworks", "buck_geyer")
+# A first call takes so long at most [s of the processor].
+LONGEST = 60.0
 
 
 def plant_of_call(name: str) -> LinearPlant:
@@ -36,7 +37,7 @@ def test_first_call_is_accepted_or_refused_with_what_helps(name):
             synthesize(plant, contract=contract)
     else:
         found = synthesize(plant, contract=contract)
-    assert time.thread_time() - began < LONGEST_REFUSAL
+    assert time.thread_time() - began < LONGEST
     if name not in REFUSED:
         assert verified(found, plant).valid
 
