@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -39,7 +40,8 @@ File = tyro.conf.Positional[Path]
 
 def record(file: File) -> None:
     """Writes the numbers of all plants to a file."""
-    np.savez_compressed(file, **{key: each for plant in numbers() for key, each in plant.items()})
+    arrays: dict[str, Any] = {key: each for plant in numbers() for key, each in plant.items()}
+    np.savez_compressed(file, **arrays)
 
 
 def compare(file: File) -> None:
@@ -77,7 +79,8 @@ def plants() -> Iterator[tuple[str, LinearPlant]]:
     """Yields registered, published and random plants with their names."""
     warnings.simplefilter("ignore", UserWarning)
     for name in registered():
-        yield name, gym.make(name).unwrapped.plant
+        env: Any = gym.make(name).unwrapped
+        yield name, env.plant
     yield from ((name, plant_of(name)) for name in published())
     for seed in range(RANDOM):
         n, m, p = 1 + seed % 5, 1 + seed % 2, None if seed % 3 else 1

@@ -134,9 +134,9 @@ def with_limits_as_published(kind: Kind) -> Kind:
         construct(self, **old_arguments.fields_of(arguments))
 
     of_fields = dict(inspect.signature(construct).parameters)
-    first = {name: of_fields[name] for name in ("self", "A", "B", "dt")}
+    first = {"self": of_fields["self"]} | {name: of_fields[name].replace(default=None) for name in ("A", "B", "dt")}
     of_limits = {name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in _LIMITS}
-    others = {name: each for name, each in of_fields.items() if name not in of_limits}
+    others = {name: each for name, each in of_fields.items() if name not in first | of_limits}
     __init__.__signature__ = inspect.Signature([*(first | of_limits | others).values()])  # pyright: ignore
     constructor.__init__ = __init__
     return kind
@@ -146,6 +146,9 @@ def with_limits_as_published(kind: Kind) -> Kind:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(LimitValues, HardBounds):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
+
+    `LinearPlant(model, limits, bounds, labels)` makes one of a `Model`, `Limits` and `Bounds`; labels are names with
+    units, {"states": {"angle": "rad"}, "inputs": {"voltage": "V"}}. The arguments below are the older way.
 
     All of it is in deviations from an operating point, (0, 0) unless given, except the limits of the constructor, which
     are absolute. A and B are a model of deviations, as linearization gives; of a model in absolute coordinates,
@@ -251,10 +254,14 @@ class LinearPlant(LimitValues, HardBounds):
         # The fields say what is kept; the constructor takes whatever `__post_init__` can turn into that.
         def __init__(
             self,
+            model: Model | None = None,
+            limits: Limits | None = None,
+            bounds: Bounds | None = None,
+            labels: Mapping[str, Any] | None = None,
             *,
-            A: ArrayLike,
-            B: ArrayLike,
-            dt: float,
+            A: ArrayLike | None = None,
+            B: ArrayLike | None = None,
+            dt: float | None = None,
             state_limits: tuple[ArrayLike, ArrayLike] | None = None,
             input_limits: tuple[ArrayLike, ArrayLike] | None = None,
             output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
