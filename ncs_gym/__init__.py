@@ -1,5 +1,6 @@
 """Imperfect networks around any Gymnasium environment, and plants behind them; importing registers the ids."""
 
+from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
 from ncs_gym.envs.request_actions import RequestActions, VectorRequestActions
@@ -9,6 +10,8 @@ from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError, ce
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.installation import warn_of_overwritten_packages
+from ncs_gym.limits import ChosenLimitsWarning, Limits
+from ncs_gym.model import Model
 from ncs_gym.network.actuator import Actuator, Command, Echo
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
@@ -21,8 +24,8 @@ from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
-from ncs_gym.plants.limits import ChosenLimitsWarning, MovedOperatingPointWarning
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FamilyProcess, FunctionProcess, GymProcess, LinearProcess, Process, linear_model
@@ -54,7 +57,10 @@ __all__ = [
     "Actuator",
     "AdversarialDisturbance",
     "Annotation",
+    "Ball",
     "BallDisturbance",
+    "Bounds",
+    "Box",
     "BoxDisturbance",
     "BrokenContractWarning",
     "Channel",
@@ -71,10 +77,13 @@ __all__ = [
     "Family",
     "FamilyProcess",
     "FunctionProcess",
+    "Gaussian",
     "GilbertElliott",
     "GymProcess",
+    "Limits",
     "LinearPlant",
     "LinearProcess",
+    "Model",
     "MovedOperatingPointWarning",
     "NCSEnv",
     "NCSVectorEnv",
@@ -92,7 +101,9 @@ __all__ = [
     "SinusoidDisturbance",
     "SpeedTracking",
     "SphereDisturbance",
+    "Sum",
     "Task",
+    "Through",
     "TraceChannel",
     "UnstablePlantError",
     "UnusedPacketsWarning",

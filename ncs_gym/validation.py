@@ -53,8 +53,8 @@ class ReadOnlyArrays:
 
     def _make_arrays_read_only(self) -> None:
         for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, name, read_only(value))
+            if isinstance(value, np.ndarray) or type(value) is tuple:
+                object.__setattr__(self, name, frozen_inside(value))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -147,6 +147,13 @@ def read_only(array: np.ndarray) -> np.ndarray:
     frozen = array.copy()
     frozen.setflags(write=False)
     return frozen
+
+
+def frozen_inside(value: Any) -> Any:
+    """Returns read-only copies of arrays, also of those in lists and tuples, which become tuples."""
+    if isinstance(value, np.ndarray):
+        return read_only(value)
+    return tuple(map(frozen_inside, value)) if type(value) in (list, tuple) else value
 
 
 def frozen(array: np.ndarray) -> np.ndarray:

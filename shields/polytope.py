@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.limits import as_row_ends, listed_ends
 from ncs_gym.plants.between_samples import MOST_POINTS
-from ncs_gym.plants.limits import as_row_ends, listed_ends
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     ReadOnlyArrays,

@@ -16,16 +16,22 @@ import ncs_gym
 import shields
 from ncs_gym import (
     AdversarialDisturbance,
+    Ball,
     BallDisturbance,
+    Bounds,
+    Box,
     BoxDisturbance,
     Channel,
     ChannelContract,
     Ellipsoid,
     FamilyProcess,
     FunctionProcess,
+    Gaussian,
     GilbertElliott,
     GymProcess,
+    Limits,
     LinearProcess,
+    Model,
     NCSEnv,
     PacketLog,
     Regulation,
@@ -33,11 +39,14 @@ from ncs_gym import (
     SinusoidDisturbance,
     SpeedTracking,
     SphereDisturbance,
+    Sum,
+    Through,
     TraceChannel,
     batch_reactor,
     certified_error_set,
     truck_trailer,
 )
+from ncs_gym.plants.old_arguments import _OldLimits
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
@@ -92,8 +101,16 @@ VALUES = [
     CERTIFICATE.updates,
     PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),
     SafetyFilter(CERTIFICATE, batch_reactor()),
+    Model(np.eye(2), np.ones((2, 1)), None, 0.1, at=(np.ones(2), np.ones(1))),
+    Limits((-np.ones(2), np.ones(2)), np.ones(1), [(np.ones(2), np.ones(1), -1.0, 1.0)], np.ones(1)),
+    Bounds(Box(np.zeros(2), np.ones(2)), 0.1, np.ones(2)),
+    Box(np.zeros(2), np.ones(2)),
+    Ball(1.0),
+    Gaussian(np.eye(2), 0.1),
+    Through(np.eye(2), np.ones(2)),
+    Sum((Box(np.zeros(2), np.ones(2)), Ball(1.0))),
 ]
-PASSING = {Annotation}  # made anew for every frame
+PASSING = {Annotation, _OldLimits}  # made anew for every frame, or for every plant of old arguments
 
 
 def arrays_in(value):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.plants.limits import in_units_of_range
+from ncs_gym.limits import in_units_of_range
 from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.bounds import Bounds, Sum
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
 from ncs_gym.validation import ReadOnlyArrays, read_only
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
@@ -38,13 +39,7 @@ class HardBounds(ReadOnlyArrays):
     p: int
     largest_input: np.ndarray
     gamma: float
-    delta: float
-    process_noise_cov: np.ndarray
-    measurement_noise_cov: np.ndarray
-    initial_cov: np.ndarray
-    disturbance_bound: Ellipsoid | None
-    sensor_bound: Ellipsoid | None
-    initial_bound: Ellipsoid | None
+    bounds: Bounds
     remainder: Remainder | None
 
     @property
@@ -60,9 +55,10 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def reach_from_rest(self) -> np.ndarray:
         """How far inputs take each state in n steps at most, from about as far as noise does in one, shape (n,)."""
-        bounds = [each.shape_matrix for each in (self.disturbance_bound, self.initial_bound) if each is not None]
-        noise = [np.diag(each) for each in (self.process_noise_cov, self.initial_cov, *bounds)]
-        reach = np.sqrt(self.gamma + np.sum(noise, axis=0))
+        sums = self.bounds.disturbance, self.bounds.first_error
+        bounded = [each.ellipsoid().shape_matrix for part in sums for each in part.parts if each is not part.gaussian]
+        noise = [np.diag(each) for each in (*(part.gaussian.covariance for part in sums), *bounded)]
+        reach = np.sqrt(np.sum(noise, axis=0))
         return read_only(reach_in_steps(self.A, self.B, self.largest_input, reach))
 
     @cached_property
@@ -83,17 +79,17 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def process_noise(self) -> TruncatedGaussian:
         """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
-        return TruncatedGaussian(self.process_noise_cov, truncation_energy(self.delta, self.n))
+        return self.bounds.disturbance.gaussian.noise
 
     @cached_property
     def sensor_noise(self) -> TruncatedGaussian:
         """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
-        return TruncatedGaussian(self.measurement_noise_cov, truncation_energy(self.delta, self.p))
+        return self.bounds.sensor.gaussian.noise
 
     @cached_property
     def initial_noise(self) -> TruncatedGaussian:
         """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
-        return TruncatedGaussian(self.initial_cov, truncation_energy(self.delta, self.n))
+        return self.bounds.first_error.gaussian.noise
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
@@ -121,14 +117,13 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
-        ball = Ellipsoid(self.gamma * np.eye(self.n))
-        others = self.process_noise.bound, self.disturbance_bound, self.remainder_bound
-        return ellipsoid_around_sum(self.relative_weight, ball, *others)
+        W = self.relative_weight
+        return ellipsoid_around_sum(W, self.bounds.disturbance.ellipsoid(W), self.remainder_bound)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
+        return self.bounds.sensor.ellipsoid()
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -148,8 +143,8 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def nominal_initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
-        ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
-        return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
+        ball, bounded = Ellipsoid(self.initial_radius_squared * np.eye(self.n)), self.bounds.first_error.bounded
+        return ellipsoid_around_sum(self.relative_weight, ball, bounded and bounded.ellipsoid(self.relative_weight))
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -169,36 +164,38 @@ class HardBounds(ReadOnlyArrays):
         Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
         noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
         """
-        Q = self.process_noise_cov + self.gamma * np.eye(self.n)
-        R, P0 = self.measurement_noise_cov, self.initial_cov
-        if self.disturbance_bound is not None:
-            Q = Q + self.disturbance_bound.shape_matrix
-        if self.remainder is not None:
-            Q = Q + self.remainder.bound.shape_matrix
-        if self.sensor_bound is not None:
-            R = R + self.sensor_bound.shape_matrix / (self.p + 2)
-        if self.initial_bound is not None:
-            P0 = P0 + self.initial_bound.shape_matrix / (self.n + 2)
+
+        def summed(source: Sum, divisor: float) -> np.ndarray:
+            bounded = [each.ellipsoid().shape_matrix / divisor for each in source.parts if each is not source.gaussian]
+            return np.sum([source.gaussian.covariance, *bounded], axis=0)
+
+        Q, R = summed(self.bounds.disturbance, 1.0), summed(self.bounds.sensor, self.p + 2)
+        P0 = summed(self.bounds.first_error, self.n + 2)
+        Q = Q if self.remainder is None else Q + self.remainder.bound.shape_matrix
         return read_only(Q), read_only(R), read_only(P0)
 
     def sample_sensor_noise(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
         """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
-        return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
+        return _drawn(self.bounds.sensor, rng, count, truncated=truncated)
 
     def sample_initial_error(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
         """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
-        return _plus_uniform(self.initial_noise.sample(rng, count, truncated=truncated), self.initial_bound, rng, count)
+        return _drawn(self.bounds.first_error, rng, count, truncated=truncated)
 
 
-def _plus_uniform(
-    samples: np.ndarray, bound: Ellipsoid | None, rng: np.random.Generator, count: int | None
-) -> np.ndarray:
-    """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
-    return samples if bound is None or not np.any(bound.shape_matrix) else samples + bound.sample(rng, count)
+def _drawn(source: Sum, rng: np.random.Generator, count: int | None, *, truncated: bool) -> np.ndarray:
+    """Returns noise, truncated or not, shape (n,) or (count, n), plus uniform points of the bounds that are no points.
+
+    Of a set other than an ellipsoid the points are those of the ellipsoid around it.
+    """
+    samples = source.gaussian.noise.sample(rng, count, truncated=truncated)
+    for bound in (each.ellipsoid() for each in source.parts if each is not source.gaussian):
+        samples = samples + bound.sample(rng, count) if bound.shape_matrix.any() else samples
+    return samples
 
 
 def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:

@@ -16,27 +16,24 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.plants import between_samples, limits, plant_file, statespace
+from ncs_gym.bounds import Bounds, Gaussian, Sum
+from ncs_gym.limits import Limits, Rows, as_points
+from ncs_gym.model import Model
+from ncs_gym.plants import between_samples, old_arguments, plant_file, statespace
 from ncs_gym.plants.assumptions import assumptions_of, warn_of_no_noise
 from ncs_gym.plants.description import described
 from ncs_gym.plants.family import bound_of_family, plant_of_middle
-from ncs_gym.plants.hard_bounds import HardBounds
+from ncs_gym.plants.hard_bounds import HardBounds, weight_of
 from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import inputs_under_way, storing, with_past_inputs
-from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.plants.resting_point import at_rest
+from ncs_gym.uncertainty.declared_bound import as_bound, declared_set
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.family import Family
 from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.truncated_gaussian import (
-    SMALLEST_DELTA,
-    SMALLEST_KEPT,
-)
 from ncs_gym.validation import (
     FILLED_IN_LATER,
-    SMALLEST_NUMBER,
     as_count,
-    as_covariance,
-    as_matrix,
     as_names,
     as_number,
     as_setting,
@@ -61,9 +58,43 @@ _LIMITS = (
     *("state_limits", "input_limits", "output_limits", "mixed_limits", "input_delay", "du_max", "box", "u_max"),
     *("offset", "input_ends", "box_ends", "mixed_rows", "mixed_ends"),
 )
+_VALUES = "model", "limits", "bounds", "labels"
 
 
 Kind = TypeVar("Kind", bound=type)
+
+
+def _of_values(model: Model, limits: Limits, bounds: Bounds, labels: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Returns the fields of `LinearPlant` for the values that make one.
+
+    Raises:
+        ValueError: If one is no such value, or they do not fit each other.
+    """
+    for name, value, kind in (("model", model, Model), ("limits", limits, Limits), ("bounds", bounds, Bounds)):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name} must be a {kind.__name__}, got {shown(value)}")
+    (n, _), sized = model.B.shape, bounds.sized(len(model.A), len(model.H))
+    within, sums = limits.within(model), (sized.disturbance, sized.sensor, sized.first_error)
+    if len(deltas := {each.gaussian.delta for each in sums if each.gaussian}) > 1:
+        raise ValueError(f"all Gaussians of a plant must have the same delta, got {shown(sorted(deltas))}")
+    weights = weight_of(within.box.rows, np.zeros(n)), np.eye(len(model.H)), weight_of(within.box.rows, np.zeros(n))
+    covariances = tuple(each.gaussian and each.gaussian.covariance for each in sums)
+    declared = [None if each.bounded is None else each.bounded.as_one(W) for each, W in zip(sums, weights, strict=True)]
+    named = {} if labels is None else labels
+    if not isinstance(named, Mapping) or not {*named} <= {"states", "inputs"}:
+        raise ValueError(f"labels must have names with their units, by states and inputs, got {shown(labels)}")
+    texts = {key: [*each] for of, names in named.items() for key, each in _texts(of, names)}
+    fields = dict(zip(("process_noise_cov", "measurement_noise_cov", "initial_cov"), covariances, strict=True))
+    fields |= old_arguments.fields_of_model(model) | at_rest(model, within, declared[0], model.step_offset)
+    fields |= {"sensor_bound": declared[1], "initial_bound": declared[2], "between_samples": limits.between_samples}
+    rates = {"input_delay": model.delays or None, "du_max": limits.rate}
+    return fields | texts | rates | ({"delta": deltas.pop()} if deltas else {})
+
+
+def _texts(of: str, names: Any) -> list[tuple[str, Any]]:
+    if not isinstance(names, Mapping):
+        raise ValueError(f"labels of {of} must be a dictionary of names with their units, got {shown(names)}")
+    return [(f"{of[:-1]}_names", names), (f"{of[:-1]}_units", names.values())]
 
 
 def with_limits_as_published(kind: Kind) -> Kind:
@@ -75,7 +106,15 @@ def with_limits_as_published(kind: Kind) -> Kind:
     construct: Callable[..., None] = constructor.__init__
 
     @functools.wraps(construct)
-    def __init__(self: Any, **arguments: Any) -> None:
+    def __init__(self: Any, *values: Any, **arguments: Any) -> None:
+        values_given = dict(zip(_VALUES, values, strict=False)) | {
+            name: arguments.pop(name) for name in _VALUES if name in arguments
+        }
+        if values_given and (arguments or len(values) > len(_VALUES)):
+            others = ", ".join(arguments) or shown(values[len(_VALUES) :])
+            raise ValueError(f"LinearPlant takes a model, limits, bounds and labels: {others} belongs to one of them")
+        if values_given:
+            arguments = _of_values(**values_given)
         if "C" in arguments:
             raise ValueError(
                 "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
@@ -91,13 +130,13 @@ def with_limits_as_published(kind: Kind) -> Kind:
             if box is not None and box.ndim == 1 and are_kept:  # new half-widths, and ends of the rows before
                 arguments["box_ends"] = None
         else:
-            limits.require_given_once(arguments)
-        construct(self, **limits.fields_of(arguments))
+            old_arguments.require_given_once(arguments)
+        construct(self, **old_arguments.fields_of(arguments))
 
     of_fields = dict(inspect.signature(construct).parameters)
-    first = {name: of_fields[name] for name in ("self", "A", "B", "dt")}
+    first = {"self": of_fields["self"]} | {name: of_fields[name].replace(default=None) for name in ("A", "B", "dt")}
     of_limits = {name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None) for name in _LIMITS}
-    others = {name: each for name, each in of_fields.items() if name not in of_limits}
+    others = {name: each for name, each in of_fields.items() if name not in first | of_limits}
     __init__.__signature__ = inspect.Signature([*(first | of_limits | others).values()])  # pyright: ignore
     constructor.__init__ = __init__
     return kind
@@ -107,6 +146,9 @@ def with_limits_as_published(kind: Kind) -> Kind:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(LimitValues, HardBounds):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
+
+    `LinearPlant(model, limits, bounds, labels)` makes one of a `Model`, `Limits` and `Bounds`; labels are names with
+    units, {"states": {"angle": "rad"}, "inputs": {"voltage": "V"}}. The arguments below are the older way.
 
     All of it is in deviations from an operating point, (0, 0) unless given, except the limits of the constructor, which
     are absolute. A and B are a model of deviations, as linearization gives; of a model in absolute coordinates,
@@ -212,10 +254,14 @@ class LinearPlant(LimitValues, HardBounds):
         # The fields say what is kept; the constructor takes whatever `__post_init__` can turn into that.
         def __init__(
             self,
+            model: Model | None = None,
+            limits: Limits | None = None,
+            bounds: Bounds | None = None,
+            labels: Mapping[str, Any] | None = None,
             *,
-            A: ArrayLike,
-            B: ArrayLike,
-            dt: float,
+            A: ArrayLike | None = None,
+            B: ArrayLike | None = None,
+            dt: float | None = None,
             state_limits: tuple[ArrayLike, ArrayLike] | None = None,
             input_limits: tuple[ArrayLike, ArrayLike] | None = None,
             output_limits: Sequence[tuple[ArrayLike, float, float]] | None = None,
@@ -251,25 +297,9 @@ class LinearPlant(LimitValues, HardBounds):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        A = as_matrix(self.A, (None, None), "A")
-        n = A.shape[0]
-        self._set("A", as_matrix(A, (n, n), "A"))
-        self._set("B", as_matrix(self.B, (n, None), "B"))
-        self._set("box", limits.as_box_rows(self.box, n))
-        self._set("H", np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H"))
-        if (np.abs(self.H).max(axis=1) < SMALLEST_NUMBER).any():
-            raise ValueError(f"every row of H must measure something, got {shown(self.H.tolist())}")
-        self._set("box_ends", limits.as_row_ends(self.box_ends, len(self.box)))
-        self._set("input_ends", limits.as_input_ends(self.input_ends, self.m))
-        self._set("mixed_rows", limits.as_mixed_rows(self.mixed_rows, n + self.m))
-        self._set("mixed_ends", limits.as_row_ends(self.mixed_ends, len(self.mixed_rows), "mixed_ends"))
-        self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
         is_given = self._check_declared()
-        self._set("step_offset", limits.as_operating_point(self.step_offset, n, "step_offset"))
         self._check_between_samples()
-        for name, size, letter in (("state", n, "x"), ("input", self.m, "u")):
-            center = f"operating_{name}"
-            self._set(center, limits.as_operating_point(getattr(self, center), size, center))
+        for name, size, letter in (("state", self.n, "x"), ("input", self.m, "u")):
             names = tuple(f"{letter}{i + 1}" for i in range(size))
             self._set(f"{name}_names", as_names(getattr(self, f"{name}_names"), names, f"{name}_names"))
             self._set(f"{name}_units", as_units(getattr(self, f"{name}_units"), size, f"{name}_units"))
@@ -282,22 +312,27 @@ class LinearPlant(LimitValues, HardBounds):
         object.__setattr__(self, name, value)
 
     def _check_declared(self) -> tuple[bool, bool, bool]:
-        """Checks what is declared of disturbances, sensor noise and first estimate; returns for which anything is."""
-        self._set("gamma", as_number(self.gamma, "gamma", low=0.0))
-        self._set("delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
+        """Keeps what is declared as `bounds`; returns for which of the three anything is."""
+        gamma = as_number(self.gamma, "gamma", low=0.0)
         declared = (
             ("process_noise_cov", "disturbance_bound", self.n),
             ("measurement_noise_cov", "sensor_bound", self.p),
             ("initial_cov", "initial_bound", self.n),
         )
-        is_given = [any(getattr(self, name) is not None for name in names) for *names, _ in declared]
-        for covariance, bound, size in declared:
-            value = getattr(self, covariance)
-            self._set(covariance, np.zeros((size, size)) if value is None else as_covariance(value, size, covariance))
-            if (value := getattr(self, bound)) is not None:
-                self._set(bound, as_bound(value, size, bound))
+        given = [tuple(getattr(self, name) for name in names) for *names, _ in declared]
+        sums = []
+        for (noise, bounded), (covariance, bound, size) in zip(given, declared, strict=True):
+            part = Gaussian(np.zeros((size, size)) if noise is None else noise, self.delta).sized(size)
+            rest = () if bounded is None else (declared_set(bounded, size, bound),)
+            sums.append(Sum((part, *rest)))
+            self._set(covariance, part.covariance)
+            self._set(bound, rest[0].ellipsoid() if rest else None)
+        self._set("bounds", Bounds(Sum((Ellipsoid(gamma * np.eye(self.n)), sums[0])), *sums[1:]))
+        self._set("gamma", gamma)
+        self._set("delta", self.bounds.sensor.gaussian.delta)
         if self.remainder is not None:
             self._set("remainder", self._own_remainder(self.remainder))
+        is_given = [any(each is not None for each in pair) for pair in given]
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     def _own_remainder(self, given: Any) -> Remainder:
@@ -316,8 +351,6 @@ class LinearPlant(LimitValues, HardBounds):
     def _check_between_samples(self) -> None:
         """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
         if self.continuous_model is not None:
-            shape = (self.n, self.n + self.m)
-            self._set("continuous_model", as_matrix(self.continuous_model, shape, "continuous_model"))
             widths = np.concatenate([self.half_widths, self.input_half])
             between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt, widths)
         if self.between_samples is None:
@@ -361,7 +394,9 @@ class LinearPlant(LimitValues, HardBounds):
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
-        return cls(**statespace.sampled_arguments(sys, dt, settings))
+        if twice := sorted({"A", "B", "H", "continuous_model"} & set(settings)):
+            raise ValueError(f"{' and '.join(twice)} come from the state-space model: give the model alone")
+        return cls(**old_arguments.fields_of_model(Model.of(sys, dt)) | settings)
 
     @classmethod
     def family(
@@ -456,12 +491,12 @@ class LinearPlant(LimitValues, HardBounds):
         """
         if per not in ("step", "second"):
             raise ValueError(f"per must be 'step' or 'second', got {shown(per)}")
-        change = limits.as_input_limits(du_max, self.m, "du_max") * (self.dt if per == "second" else 1.0)
+        change = old_arguments.as_input_limits(du_max, self.m, "du_max") * (self.dt if per == "second" else 1.0)
         if (change >= 2.0 * self.input_half).all():
             raise ValueError(f"du_max = {shown(du_max)} limits nothing: inputs change by no more than their range")
         plant = self if inputs_under_way(self) else storing(self, 1, delay=0)
         rows = np.concatenate([np.zeros((self.m, plant.n - self.m)), -np.eye(self.m), np.eye(self.m)], axis=1)
-        rates = limits.Rows(rows / change[:, None], *np.array([[-1.0], [1.0]]) * np.ones(self.m))
+        rates = Rows(rows / change[:, None], *np.array([[-1.0], [1.0]]) * np.ones(self.m))
         return replace(
             plant,
             mixed_rows=np.concatenate([plant.mixed_rows, rates.rows]),
@@ -657,12 +692,12 @@ class LinearPlant(LimitValues, HardBounds):
             ValueError: If `of` is none of these, or the values are no finite vectors of its size.
         """
         center = self._operating_value(of)
-        return limits.as_points(value, len(center), f"the {of}") - center
+        return as_points(value, len(center), f"the {of}") - center
 
     def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
         center = self._operating_value(of)
-        return limits.as_points(value, len(center), f"the {of}") + center
+        return as_points(value, len(center), f"the {of}") + center
 
     def _operating_value(self, of: str) -> np.ndarray:
         values = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from ncs_gym.validation import as_matrix, as_number, as_numbers, shown
+from ncs_gym.validation import shown
 
 # Durations of steps that differ by less than this are the same.
 SAME_STEP = 1e-9
@@ -62,48 +62,7 @@ def noise_in_proportion(
     }
 
 
-def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> dict[str, Any]:
-    """Returns the arguments of `LinearPlant` for a state-space model: `settings`, and its matrices in discrete time.
-
-    Args:
-        sys: The model, as `LinearPlant.from_statespace` takes it.
-        dt: Duration of a step [s]; None for that of the model.
-        settings: Other arguments.
-
-    Raises:
-        ValueError: If it is no such model, D is not zero, dt is missing or another than the model's, or a setting is
-            given by the model.
-    """
-    twice = sorted({"A", "B", "H"} & set(settings))
-    if twice:
-        raise ValueError(f"{' and '.join(twice)} come from the state-space model: give the model alone")
-    *matrices, own = _matrices(sys)
-    A = as_matrix(matrices[0], (None, None), "A of the model")
-    A = as_matrix(A, (len(A), len(A)), "A of the model")
-    B = as_matrix(matrices[1], (len(A), None), "B of the model")
-    H = as_matrix(matrices[2], (None, len(A)), "C of the model")
-    D = as_numbers(0.0 if matrices[3] is None else matrices[3])
-    if D is None or D.any():
-        raise ValueError(
-            "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is known, "
-            f"from what is measured and give D = 0, got {shown(matrices[3] if D is None else D.tolist())}"
-        )
-    is_continuous = own is not True and own == 0
-    if dt is None:
-        if is_continuous or own is True:
-            raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
-        dt = own
-    dt = as_number(dt, "dt", low=0.0, low_open=True)
-    if "continuous_model" in settings:
-        raise ValueError("continuous_model is that of sys, if it is one in continuous time: leave it out")
-    if is_continuous:
-        return sampled_model(A, B, dt) | {"H": H} | settings
-    if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
-        raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
-    return {"A": A, "B": B, "H": H, "dt": dt} | settings
-
-
-def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
+def matrices_of(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
     """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
     if isinstance(sys, (tuple, list)) and len(sys) in (4, 5):
         A, B, C, D, own = (*sys, 0)[:5]

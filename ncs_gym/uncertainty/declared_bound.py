@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym import exact
+from ncs_gym.bounds import Ball, Through, as_set
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_matrix, as_setting, shown
+from ncs_gym.validation import as_setting
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -16,43 +16,29 @@ if TYPE_CHECKING:
     # What `as_bound` turns into an ellipsoid.
     Bound = ArrayLike | Ellipsoid | tuple[ArrayLike, ArrayLike]
 
-# Sizes are squared, and must not become zero or infinite by that.
-SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
-
 
 def as_bound(value: Any, size: int, name: str) -> Ellipsoid:
-    """Returns the ellipsoid that a bound in plain terms stands for.
+    """Returns the ellipsoid around `declared_set`."""
+    return declared_set(value, size, name).ellipsoid()
 
-    | value | what is bounded | shape of the ellipsoid |
-    |---|---|---|
-    | r, a number | a ball, |z| <= r | r^2 I |
-    | h, shape (size,) | a box, |z_i| <= h_i | q diag(h^2), the smallest around it, q the number of nonzero h_i |
-    | an `Ellipsoid` | itself | its own |
-    | (E, w), E of shape (size, q), w a number or shape (q,) | z = E s with |s_i| <= w_i | q E diag(w^2) E' |
 
-    Args:
-        value: One of these, in the units of z; zero is a bound too.
-        size: Number of entries of z.
-        name: What the error message calls it.
+def declared_set(value: Any, size: int, name: str) -> Any:
+    """Returns the set of `ncs_gym.bounds` that an argument of `LinearPlant` stands for, of vectors z of this size.
+
+    A number r is a ball |z| <= r, a vector of shape (size,) half-widths of a box, an `Ellipsoid` itself, and a pair
+    (E, w), E of shape (size, q), w a number or shape (q,), stands for z = E s with |s_i| <= w_i.
 
     Raises:
         ValueError: If it is none of these, negative, not finite, or of another size.
     """
-    if isinstance(value, Ellipsoid):
-        if value.dim != size:
-            raise ValueError(f"{name} must be an ellipsoid of dimension {size}, got one of dimension {value.dim}")
-        return value
-    if _is_pair(value):
-        E = as_matrix(value[0], (size, None), f"{name}: E of d = E w")
-        return _around_box(E, _as_sizes(value[1], E.shape[1], f"{name}: w of d = E w"), name)
-    sizes = as_setting(value)
-    if sizes is None or sizes.ndim > 1:
-        raise ValueError(
-            f"{name} must be a number, half-widths of shape ({size},), an Ellipsoid(shape), or a pair (E, w) for "
-            f"d = E w (a covariance has an argument of its own), got {shown(value)}"
-        )
-    widths = _as_sizes(value, size, name)
-    return Ellipsoid(np.diag(np.square(widths))) if sizes.ndim == 0 else _around_box(np.eye(size), widths, name)
+    try:
+        pair = tuple(value) if isinstance(value, tuple | list) and len(value) == 2 else ()
+        if pair and (E := as_setting(pair[0])) is not None and E.ndim == 2:
+            return Through(*pair).sized(size)
+        number: Any = as_setting(value)
+        return (as_set(value) if number is None or number.ndim else Ball(number)).sized(size)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def sample_box(bound: Ellipsoid, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
@@ -84,32 +70,3 @@ def diagonal_inside(bound: Ellipsoid) -> np.ndarray:
     scale = np.sqrt(variances[kept])
     smallest = np.linalg.eigvalsh(bound.shape_matrix[np.ix_(kept, kept)] / np.outer(scale, scale))[0]
     return max(float(smallest), 0.0) * np.diag(variances)
-
-
-def _is_pair(value: Any) -> bool:
-    """Returns whether a value is a pair (E, w): two entries, the first of which is a matrix."""
-    if not isinstance(value, (tuple, list)) or len(value) != 2:
-        return False
-    first = as_setting(value[0])
-    return first is not None and first.ndim == 2
-
-
-def _as_sizes(value: Any, size: int, name: str) -> np.ndarray:
-    """Returns radii or half-widths, shape (size,)."""
-    sizes = as_setting(value)
-    if (
-        sizes is None
-        or sizes.shape not in ((), (size,))
-        or not ((sizes == 0.0) | (sizes >= SMALLEST_SIZE) & (sizes <= LARGEST_SIZE)).all()
-    ):
-        allowed = f"0 or between {SMALLEST_SIZE:g} and {LARGEST_SIZE:g}"
-        raise ValueError(f"{name} must be a number or shape ({size},), each {allowed}, got {shown(value)}")
-    return np.broadcast_to(sizes, (size,))
-
-
-def _around_box(E: np.ndarray, widths: np.ndarray, name: str) -> Ellipsoid:
-    """Returns q E diag(w^2) E' around {E s : |s_i| <= w_i}, q the number of nonzero w_i."""
-    scaled = E * widths
-    if ((E != 0.0) & (widths != 0.0) & (np.abs(scaled) < SMALLEST_SIZE)).any():
-        raise ValueError(f"{name}: the entries of E diag(w) must be 0 or at least {SMALLEST_SIZE:g} in size")
-    return Ellipsoid(np.count_nonzero(widths) * exact.product(scaled, scaled.T))

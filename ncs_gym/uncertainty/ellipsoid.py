@@ -1,7 +1,8 @@
-"""Ellipsoids given by their shape, and points of their sums."""
+"""Sets of what is uncertain, ellipsoids given by their shape, and points of their sums."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -28,8 +29,52 @@ NEWTON_STEPS, NEWTON_PRECISION = 40, 1e-15
 HARD_CASE = 1e-9
 
 
+class UncertainSet(ReadOnlyArrays, ABC):
+    """A set of vectors z, shape (n,).
+
+    Attributes:
+        size: n; None while a number stands for as many entries as there are (see `sized`).
+        middle: Shape (n,): zero but for boxes with two different ends.
+    """
+
+    size: int | None = None
+    middle: Any = 0.0
+
+    def sized(self, size: int) -> Any:
+        """Returns the set of vectors with so many entries; raises ValueError if it has another number of them."""
+        if self.size not in (None, size):
+            raise ValueError(f"a set in dimension {size} is needed, got one in dimension {self.size}")
+        return self
+
+    @abstractmethod
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:
+        """Returns an ellipsoid around the set as seen from its middle; of sums that of the smallest tr(W P)."""
+
+    def support(self, direction: np.ndarray) -> Any:
+        """Returns max of a'z as seen from the middle, for a direction a (n,), or for each of shape (..., n)."""
+        return self.ellipsoid().support(direction)
+
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns a point, shape (n,), or `count` of them, (count, n): uniform, or what a truncated Gaussian draws."""
+        return self.ellipsoid().sample(rng, count)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The set as JSON values, every number exact, which `as_set` reads."""
+        from ncs_gym.bounds import document_of
+
+        return document_of(self)
+
+    def __add__(self, other: Any) -> Any:
+        from ncs_gym.bounds import Sum
+
+        return Sum((self, other))
+
+    __radd__ = __add__
+
+
 @dataclass(frozen=True, eq=False)
-class Ellipsoid(ReadOnlyArrays):
+class Ellipsoid(UncertainSet):
     """The centered ellipsoid {z : a'z <= sqrt(a'Pa) for all a} with shape P.
 
     For an invertible shape this is {z : z' P^-1 z <= 1}; a singular shape is a flat ellipsoid
@@ -46,7 +91,11 @@ class Ellipsoid(ReadOnlyArrays):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape_matrix", as_covariance(self.shape_matrix, None, "shape_matrix"))
+        object.__setattr__(self, "size", len(self.shape_matrix))
         self._make_arrays_read_only()
+
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        return self
 
     @property
     def dim(self) -> int:

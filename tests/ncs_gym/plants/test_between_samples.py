@@ -182,7 +182,7 @@ def held(**more):
     return LinearPlant.from_statespace(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("make", [pushed, held])
 def test_constant_disturbance_is_refused_beside_between_samples_at_every_entrance(make):
     plant = make()
@@ -210,7 +210,7 @@ def test_constant_disturbance_is_refused_beside_between_samples_at_every_entranc
     assert make(between_samples=1).fingerprint == LinearPlant.read(document).fingerprint == plant.fingerprint
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 def test_constant_disturbances_that_cancel_at_the_samples_do_not_within_a_step():
     cancel = {"disturbance_bound": ([[0.0], [0.6]], [-1.0], [0.0])}
     both = ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])

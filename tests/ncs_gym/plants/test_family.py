@@ -392,7 +392,7 @@ def test_two_ended_disturbances_move_each_member(few_points):
     assert 0.02 <= width <= 0.02 + 5e-8  # what the members' rest lacks of an equilibrium by rounding is inside
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.limits.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
 def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low, few_points):
     def of(a):

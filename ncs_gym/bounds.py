@@ -1,0 +1,271 @@
+"""What is uncertain about a plant: sets, all of which answer the same questions, and the three of them that bound it.
+
+A number or a vector stands for half-widths per entry. Ellipsoids around sets are the same on every machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import exact
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, ellipsoid_around_sum
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, TruncatedGaussian, truncation_energy
+from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_number, as_setting, shown
+
+# Sizes are squared, and must not become zero or infinite by that.
+SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
+
+
+@dataclass(frozen=True, eq=False)
+class Box(UncertainSet):
+    """{z : low <= z <= high}, with ends of shape (n,), or numbers for every entry.
+
+    Raises:
+        ValueError: If they are no such ends, or low > high anywhere.
+    """
+
+    low: Any
+    high: Any
+
+    def __post_init__(self) -> None:
+        ends: list[Any] = [as_setting(self.low), as_setting(self.high)]
+        if any(end is None or end.ndim > 1 or not end.size for end in ends) or len({*map(np.shape, ends)} - {()}) > 1:
+            raise ValueError(
+                f"a box needs two ends, numbers or vectors of one size, got {shown(self.low)} and {shown(self.high)}"
+            )
+        for name, end in zip(("low", "high"), np.array(np.broadcast_arrays(*ends)), strict=True):
+            object.__setattr__(self, name, end)
+        object.__setattr__(self, "middle", 0.5 * (self.high + self.low))
+        object.__setattr__(self, "size", self.half.size if self.half.ndim else None)
+        self._make_arrays_read_only()
+        if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
+            allowed = f"0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
+            raise ValueError(f"half-widths of a box must be {allowed}, got {shown(self.half.tolist())}")
+
+    @cached_property
+    def half(self) -> np.ndarray:
+        """Half-widths, shape (n,), or a number."""
+        return 0.5 * (self.high - self.low)
+
+    def sized(self, size: int) -> Any:  # noqa: D102
+        if self.size is not None:
+            return super().sized(size)
+        return Box(np.full(size, self.low), np.full(size, self.high))
+
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        return self.through(np.eye(self.size or 1))
+
+    def through(self, E: np.ndarray) -> Ellipsoid:
+        """Returns the smallest ellipsoid around {E z}, q E diag(h^2) E' with q the number of half-widths h > 0."""
+        half = np.broadcast_to(self.half, E.shape[1])
+        scaled = E * half
+        if ((E != 0.0) & (half != 0.0) & (np.abs(scaled) < SMALLEST_SIZE)).any():
+            raise ValueError(f"the entries of E diag(half-widths) must be 0 or at least {SMALLEST_SIZE:g} in size")
+        return Ellipsoid(np.count_nonzero(half) * exact.product(scaled, scaled.T))
+
+    def support(self, direction: np.ndarray) -> Any:  # noqa: D102
+        return np.abs(direction) @ np.atleast_1d(self.half)
+
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
+        size = len(np.atleast_1d(self.half))
+        return rng.uniform(self.low, self.high, size if count is None else (count, size))
+
+
+@dataclass(frozen=True, eq=False)
+class Ball(UncertainSet):
+    """{z : |z| <= radius}, of as many entries as there are."""
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "radius", as_number(self.radius, "the radius of a ball", low=0.0))
+        Box(-self.radius, self.radius)
+
+    def sized(self, size: int) -> Any:  # noqa: D102
+        return Ellipsoid(np.square(self.radius) * np.eye(size))
+
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        return self.sized(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussian(UncertainSet):
+    """N(0, covariance), truncated so that its bound holds the fraction 1 - delta of it, delta in [1e-12, 0.999]."""
+
+    covariance: Any
+    delta: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", as_covariance(self.covariance, None, "the covariance of a Gaussian"))
+        object.__setattr__(self, "delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
+        object.__setattr__(self, "size", len(self.covariance))
+        self._make_arrays_read_only()
+
+    @cached_property
+    def noise(self) -> TruncatedGaussian:
+        """What is drawn from, truncated or not."""
+        return TruncatedGaussian(self.covariance, truncation_energy(self.delta, len(self.covariance)))
+
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        return self.noise.bound
+
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
+        return self.noise.sample(rng, count)
+
+
+@dataclass(frozen=True, eq=False)
+class Through(UncertainSet):
+    """{E w : w in a set}, E of shape (n, q); half-widths of w are a set, too."""
+
+    E: Any
+    set: Any
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "E", as_matrix(self.E, (None, None), "E of a set through E"))
+        object.__setattr__(self, "set", as_set(self.set).sized(self.E.shape[1]))
+        object.__setattr__(self, "size", len(self.E))
+        object.__setattr__(self, "middle", self.E @ np.broadcast_to(self.set.middle, self.E.shape[1]))
+        self._make_arrays_read_only()
+        self.ellipsoid()
+
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        if isinstance(self.set, Box):
+            return self.set.through(self.E)
+        return Ellipsoid(exact.product(self.E, self.set.ellipsoid().shape_matrix, self.E.T))
+
+    def support(self, direction: np.ndarray) -> Any:  # noqa: D102
+        return self.set.support(direction @ self.E)
+
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
+        return self.set.sample(rng, count) @ self.E.T
+
+
+@dataclass(frozen=True, eq=False)
+class Sum(UncertainSet):
+    """All sums of one vector from each of several sets, of which one may be a Gaussian; `a + b` is one, too."""
+
+    parts: tuple[Any, ...]
+
+    def __post_init__(self) -> None:
+        given = [as_set(each) for each in self.parts]
+        parts = [part for each in given for part in (each.parts if isinstance(each, Sum) else [each])]
+        if sum(isinstance(each, Gaussian) for each in parts) > 1:
+            raise ValueError("a sum may have one Gaussian: add the covariances")
+        object.__setattr__(self, "parts", tuple(parts))
+        object.__setattr__(self, "size", next((each.size for each in parts if each.size), None))
+        object.__setattr__(self, "middle", sum(each.middle for each in self.sized(self.size or 1).parts))
+
+    @property
+    def gaussian(self) -> Any:
+        """The part that is a Gaussian; None if there is none."""
+        return next((each for each in self.parts if isinstance(each, Gaussian)), None)
+
+    @property
+    def bounded(self) -> Sum | None:
+        """The sum of the other parts."""
+        others = tuple(each for each in self.parts if not isinstance(each, Gaussian))
+        return Sum(others) if others else None
+
+    def as_one(self, weight: np.ndarray) -> Any:
+        """Returns the only part, or else the ellipsoid of the smallest tr(W P), which must be about zero.
+
+        Raises:
+            ValueError: If one of several parts has two different ends.
+        """
+        if len(self.parts) == 1:
+            return self.parts[0]
+        if pushes_of(self):
+            raise ValueError("a set with two different ends is not added to others: give the sum as Through(E, Box)")
+        return self.ellipsoid(weight)
+
+    def sized(self, size: int) -> Any:  # noqa: D102
+        sized = tuple(each.sized(size) for each in self.parts)
+        return self if sized == self.parts else Sum(sized)
+
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        around = [each.ellipsoid(weight) for each in self.parts]
+        return ellipsoid_around_sum(np.eye(around[0].dim) if weight is None else weight, *around)
+
+    def support(self, direction: np.ndarray) -> Any:  # noqa: D102
+        return sum(each.support(direction) for each in self.parts)
+
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
+        return np.sum([each.sample(rng, count) for each in self.parts], axis=0)
+
+
+def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Returns E, shape (n, q), and w, shape (q,), of each part of a set whose middle is E w, w not zero."""
+    if isinstance(own, Sum):
+        return [each for part in own.parts for each in pushes_of(part)]
+    E, inside = (own.E, own.set) if isinstance(own, Through) else (None, own)
+    if inside is None or not np.any(inside.middle):
+        return []
+    return [(np.eye(inside.size) if E is None else E, inside.middle)]
+
+
+KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Box, Ball, Ellipsoid, Gaussian, Through, Sum)}
+
+
+def document_of(value: Any) -> Any:
+    """Returns a set, or what one is made of, as JSON values."""
+    if type(value) in KINDS.values():
+        return {type(value).__name__: {each.name: document_of(getattr(value, each.name)) for each in fields(value)}}
+    return [*map(document_of, value)] if isinstance(value, tuple) else np.asarray(value).tolist()
+
+
+def as_set(value: Any) -> Any:
+    """Returns the set that is given, that of a document, or the box of half-widths, a number or shape (n,).
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+    if isinstance(value, UncertainSet | Ellipsoid):
+        return value
+    name, content = next(iter(value.items()), ("", 0)) if isinstance(value, Mapping) and len(value) == 1 else ("", 0)
+    if name in KINDS and isinstance(content, Mapping) and {*content} == {each.name for each in fields(KINDS[name])}:
+        return KINDS[name](**content)
+    half = as_setting(value)
+    if half is None or half.ndim > 1:
+        raise ValueError(f"a set must be a number, a vector of half-widths or a {', '.join(KINDS)}, got {shown(value)}")
+    return Box(-half, half)
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds(ReadOnlyArrays):
+    """What bounds the uncertainties of a plant: half-widths, a number or a vector, or sets; 0 says that there is none.
+
+    Attributes:
+        disturbance: Of d in x+ = A x + B u + d.
+        sensor: Of v in y = H x + v.
+        first_error: Of the error of the first estimate.
+    """
+
+    disturbance: Any
+    sensor: Any
+    first_error: Any
+
+    def __post_init__(self) -> None:
+        self._put(lambda value, _: as_set(value), (0, 0))
+
+    def sized(self, n: int, p: int) -> Bounds:
+        """Returns the bounds of a plant with n states and p outputs, each of which is a sum of sets.
+
+        Raises:
+            ValueError: If one is a set in another dimension.
+        """
+        bounds = Bounds(self.disturbance, self.sensor, self.first_error)
+        bounds._put(lambda each, size: Sum((each,)).sized(size), (n, p))
+        return bounds
+
+    def _put(self, made: Any, sizes: tuple[int, int]) -> None:
+        n, p = sizes
+        for name, size in (("disturbance", n), ("sensor", p), ("first_error", n)):
+            try:
+                object.__setattr__(self, name, made(getattr(self, name), size))
+            except ValueError as error:
+                raise ValueError(f"Bounds({name}=...): {error}") from error

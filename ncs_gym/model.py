@@ -1,0 +1,174 @@
+"""The model of a plant: its equations, those in continuous time that they come from, and the point they are about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+
+from ncs_gym import exact
+from ncs_gym.limits import as_point
+from ncs_gym.plants.statespace import SAME_STEP, matrices_of, zero_order_hold
+from ncs_gym.validation import (
+    SMALLEST_NUMBER,
+    ReadOnlyArrays,
+    as_count,
+    as_matrix,
+    as_number,
+    as_numbers,
+    as_vector,
+    frozen_inside,
+    shown,
+)
+
+LONGEST_INPUT_DELAY = 100
+# The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
+EQUILIBRIUM_PRECISION = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Model(ReadOnlyArrays):
+    """x+ = A x + B u (+ offset), y = H x.
+
+    Attributes:
+        A: Shape (n, n).
+        B: Shape (n, m).
+        H: Output matrix, shape (p, n); None for the identity.
+        dt: Duration of a step [s].
+        at: State and input that deviations are counted from, shapes (n,) and (m,); None for zero. A and B are a model
+            of deviations from it, as linearization gives.
+        offset: c of a model in absolute coordinates, x+ = A x + B u + c, shape (n,): then `at` has to be an
+            equilibrium.
+        continuous: [Ac, Bc] of x' = Ac x + Bc u that A and B were sampled from, shape (n, n + m); None if unknown.
+        delays: Steps after which an input takes effect (`with_delays`).
+        state, input: `at`, with zeros for what is not given.
+        is_given: Which of the two is.
+        lacking: What `at` lacks of an equilibrium by rounding, shape (n,).
+        step_offset: Sizes of the constant that `at` rests under, shape (n,).
+
+    Raises:
+        ValueError: If a matrix has a wrong shape or is not finite, or `at` is no equilibrium.
+    """
+
+    A: Any
+    B: Any
+    H: Any
+    dt: float
+    at: Any = None
+    offset: Any = None
+    continuous: Any = None
+    delays: int = 0
+    state: np.ndarray = field(init=False)
+    input: np.ndarray = field(init=False)
+    is_given: tuple[bool, bool] = field(init=False)
+    lacking: np.ndarray = field(init=False)
+    step_offset: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        A = as_matrix(self.A, (None, None), "A")
+        n = len(A)
+        A, B = as_matrix(A, (n, n), "A"), as_matrix(self.B, (n, None), "B")
+        H = np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H")
+        if (np.abs(H).max(axis=1) < SMALLEST_NUMBER).any():
+            raise ValueError(f"every row of H must measure something, got {shown(H.tolist())}")
+        m, at = B.shape[1], (None, None) if self.at is None else self.at
+        if not isinstance(at, tuple | list) or len(at) != 2:
+            raise ValueError(f"at must be a pair of a state and an input, got {shown(at)}")
+        named = zip(("state", "input"), at, (n, m), strict=True)
+        x, u = (np.zeros(size) if of is None else as_point(of, size, f"the {name} of at") for name, of, size in named)
+        made = {
+            "at": frozen_inside(self.at),
+            "A": A,
+            "B": B,
+            "H": H,
+            "dt": as_number(self.dt, "dt", low=0.0, low_open=True),
+            "state": x,
+            "input": u,
+        }
+        made |= {"lacking": np.zeros(n), "step_offset": np.zeros(n), "is_given": tuple(each is not None for each in at)}
+        if self.offset is not None:
+            made["offset"] = offset = as_vector(self.offset, n, "offset")
+            made |= {"lacking": _residual(A, B, offset, x, u), "step_offset": np.abs(offset)}
+        if self.continuous is not None:
+            made["continuous"] = as_matrix(self.continuous, (n, n + m), "continuous_model")
+        made["delays"] = as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY)
+        for name, value in made.items():
+            object.__setattr__(self, name, value)
+        self._make_arrays_read_only()
+
+    @classmethod
+    def sampled(cls, A: Any, B: Any, C: Any, dt: float, at: Any = None) -> Self:
+        """Returns the exact zero-order hold of x' = A x + B u, y = C x; C is the identity if None."""
+        A = as_matrix(A, (None, None), "A")
+        A = as_matrix(A, (len(A), len(A)), "A")
+        B = as_matrix(B, (len(A), None), "B")
+        dt = as_number(dt, "dt", low=0.0, low_open=True)
+        return cls(*zero_order_hold(A, B, dt), C, dt, at, continuous=np.concatenate([A, B], axis=1))
+
+    @classmethod
+    def of(cls, system: Any, dt: float | None = None, at: Any = None) -> Self:
+        """Returns the model of a state-space model, whose C becomes H.
+
+        Args:
+            system: Of python-control or scipy.signal, or a tuple (A, B, C, D) in continuous or (A, B, C, D, dt) in
+                discrete time. A model in continuous time is sampled exactly, by zero-order hold.
+            dt: Duration of a step [s], needed unless the model has one.
+            at: As of `Model`.
+
+        Raises:
+            ValueError: If it is no such model, D is not zero, or dt is missing or another than the model's.
+        """
+        *matrices, own = matrices_of(system)
+        A = as_matrix(matrices[0], (None, None), "A of the model")
+        A = as_matrix(A, (len(A), len(A)), "A of the model")
+        B = as_matrix(matrices[1], (len(A), None), "B of the model")
+        H = as_matrix(matrices[2], (None, len(A)), "C of the model")
+        D = as_numbers(0.0 if matrices[3] is None else matrices[3])
+        if D is None or D.any():
+            raise ValueError(
+                "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is "
+                f"known, from what is measured and give D = 0, got {shown(matrices[3] if D is None else D.tolist())}"
+            )
+        is_continuous = own is not True and own == 0
+        if dt is None:
+            if is_continuous or own is True:
+                raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
+            dt = own
+        dt = as_number(dt, "dt", low=0.0, low_open=True)
+        if is_continuous:
+            return cls.sampled(A, B, H, dt, at)
+        if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
+            raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
+        return cls(A, B, H, dt, at)
+
+    def held(self, E: Any) -> np.ndarray:
+        """Returns what w' = E w held constant over a step does to the state, shape (n, q), for E of shape (n, q).
+
+        Raises:
+            ValueError: If the model was not sampled from one in continuous time.
+        """
+        if self.continuous is None:
+            raise ValueError("only a model that was sampled from one in continuous time says what is held over a step")
+        n = len(self.A)
+        return zero_order_hold(self.continuous[:, :n], as_matrix(E, (n, None), "E"), self.dt)[1]
+
+    def with_delays(self, steps: int) -> Self:
+        """Returns the model whose inputs take effect so many steps later; those under way become further states."""
+        return replace(self, delays=steps)
+
+
+def _residual(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarray, applied: np.ndarray) -> np.ndarray:
+    """Returns A x0 + B u0 + c - x0, rounded once, shape (n,); raises ValueError if it is more than rounding."""
+    eye = np.eye(len(A))
+    missing = exact.product(np.hstack([A, B, eye, -eye]), np.concatenate([state, applied, offset, state]))
+    terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)
+    if (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
+        return missing
+    remedy = "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
+    if exact.rank(rest := eye - A) == len(A):
+        equilibrium = exact.product(exact.inverse(rest), B @ applied + offset).tolist()
+        remedy = f"with this input the equilibrium is {shown(equilibrium)}, or {remedy}"
+    raise ValueError(
+        f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
+    )

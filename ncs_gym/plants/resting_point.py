@@ -1,0 +1,131 @@
+"""Where deviations are counted from: the point of a model, moved to where the middle of its disturbance rests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import exact
+from ncs_gym.bounds import pushes_of
+from ncs_gym.limits import Within
+from ncs_gym.model import EQUILIBRIUM_PRECISION, Model
+from ncs_gym.plants.hard_bounds import weight_of
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.validation import shown, warn_caller
+
+# What is found of such a point is rounded to this, in units of the limits.
+POINT_PRECISION = 1e-11
+
+
+class MovedOperatingPointWarning(UserWarning):
+    """A disturbance with two different ends moves the point that deviations are counted from."""
+
+
+def at_rest(model: Model, within: Within, disturbance: Any, step_offset: np.ndarray) -> dict[str, Any]:
+    """Returns the fields of `LinearPlant` about limits, operating point and declared disturbances.
+
+    Where the middle of a disturbance, E w, is not zero, deviations are counted from (x, u) with x = A x + B u + E w, of
+    such points that nearest to the model's in units of the limits. What a point lacks of an equilibrium by rounding is
+    added to the bound.
+
+    Args:
+        model: The model.
+        within: Limits in deviations from its point.
+        disturbance: A set without Gaussian, in the dimension of the state; None if nothing is declared.
+        step_offset: Sizes of the constant that the point rests under, shape (n,).
+
+    Raises:
+        ValueError: If no such point lies within the limits.
+    """
+    (box, inputs, mixed), lacking = within, np.abs(model.lacking)
+    state, applied, ends = model.state, model.input, np.stack(within.box[1:])
+    mixed_ends, bound = np.stack(mixed[1:]), disturbance
+    pushes = pushes_of(disturbance)
+    if pushes:
+        E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
+        x, u, missing = _resting(model, within, E, middle)
+        ends, inputs = ends - exact.product(box.rows, x), inputs - u[None]
+        mixed_ends = mixed_ends - exact.product(mixed.rows, np.concatenate([x, u]))
+        state, applied, lacking = state + x, applied + u, np.abs(missing) + lacking
+        if not all(((each[0] < 0.0) & (each[1] > 0.0)).all() for each in (ends, inputs, mixed_ends)):
+            raise ValueError(
+                f"disturbance_bound: the middle of this disturbance moves the operating point to "
+                f"{shown(state.tolist())} with input {shown(applied.tolist())}, which is not strictly within the limits"
+            )
+        shown_point = [[float(f"{each:.6g}") for each in around] for around in (state, applied)]
+        warn_caller(
+            "deviations are counted from the state {} and the input {}, where the middle of the disturbance rests "
+            "(plant.operating_state)".format(*map(shown, shown_point)),
+            MovedOperatingPointWarning,
+        )
+        step_offset = np.abs(step_offset) + exact.product(np.abs(E), np.abs(middle))
+    if lacking.any() or pushes:
+        declared = Ellipsoid(np.zeros((len(state),) * 2)) if bound is None else bound.ellipsoid()
+        bound = _with_residual(declared, lacking, box.rows)
+    return {
+        "disturbance_bound": bound,
+        "box": box.rows,
+        "box_ends": ends,
+        "input_ends": inputs,
+        "mixed_rows": mixed.rows,
+        "mixed_ends": mixed_ends,
+        "operating_state": state,
+        "operating_input": applied,
+        "step_offset": step_offset,
+    }
+
+
+def _resting(
+    model: Model, within: Within, E: np.ndarray, middle: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns x, u, in deviations from the model's point, and A x + B u + E w - x there, which is rounding.
+
+    Raises:
+        ValueError: If no state stays where it is under the middle of the disturbance.
+    """
+    from scipy.linalg import null_space  # takes long to import
+
+    (n, m), A, B, rows = model.B.shape, model.A, model.B, within.box.rows
+    reach = 0.5 * (within.inputs[1] - within.inputs[0])
+    widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
+    balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
+    found = np.linalg.lstsq(balance, E @ middle / widths)[0]
+    directions = null_space(balance)
+    sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
+    found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
+    x, u = widths * found[:n], reach * found[n:]
+
+    def missing_at(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))
+
+    terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(middle) + np.abs(x)
+    if not (np.abs(missing_at(x, u)) <= EQUILIBRIUM_PRECISION * terms).all():
+        raise ValueError(
+            "disturbance_bound: no state stays where it is under the middle of this disturbance, "
+            f"{shown((E @ middle).tolist())} per step, whatever the input: give symmetric ends around zero"
+        )
+    x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
+    return x, u, missing_at(x, u)
+
+
+def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
+    """Returns values, shape (k,), rounded to about `POINT_PRECISION` of limits; `per_limit`, (k,), is 1 over these.
+
+    What LAPACK finds differs between processors in the last bits, and a point is part of what identifies a plant. Steps
+    are powers of two, so that rounding itself is exact.
+    """
+    sizes = np.where(per_limit > 0.0, 1.0 / np.where(per_limit > 0.0, per_limit, 1.0), np.maximum(np.abs(values), 1e-9))
+    steps = np.exp2(np.round(np.log2(POINT_PRECISION * sizes)))
+    return np.rint(values / steps) * steps
+
+
+def _with_residual(bound: Ellipsoid, missing: np.ndarray, rows: np.ndarray) -> Ellipsoid:
+    """Returns a bound of d with what a point lacks of an equilibrium, doubled; rows, (k, n), give the units."""
+    n = len(missing)
+    if not missing.any():
+        return bound
+    gram = exact.product(rows.T, rows)
+    lacking = np.diag(n * np.square(2.0 * np.abs(missing)))
+    return Ellipsoid(outer_sum(bound.shape_matrix, lacking, gram + np.eye(n) * np.trace(gram) / n))

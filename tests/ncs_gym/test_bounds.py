@@ -1,0 +1,98 @@
+"""The sets that bound what is uncertain: all answer the same questions, and each owns what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid
+from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through, as_set
+
+E = np.array([[1.0, 0.5], [0.0, 2.0], [0.3, 0.0]])
+SETS = {
+    "half-widths": as_set([0.1, 2.0, 0.0]),
+    "number": as_set(0.3),
+    "box": Box([-0.1, 0.0, 1.0], [0.3, 0.0, 2.0]),
+    "ball": Ball(0.4),
+    "ellipsoid": Ellipsoid(np.diag([1.0, 4.0, 0.25])),
+    "gaussian": Gaussian(np.diag([1.0, 2.0, 0.5]), 0.1),
+    "through": Through(E, [0.1, 0.2]),
+    "through a box": Through(E, Box([-0.1, 0.0], [0.3, 0.2])),
+    "through a ball": Through(E, Ball(2.0)),
+    "sum": Box([-0.1, 0.0, 1.0], [0.3, 0.0, 2.0]) + Ball(0.1) + Gaussian(1e-4 * np.eye(3), 0.05),
+    "sum that begins with an ellipsoid": Ellipsoid(np.eye(3)) + Box(-1.0, 2.0),
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_samples_are_within_the_support_that_is_within_the_ellipsoid(name):
+    rng, own = np.random.default_rng(0), SETS[name].sized(3)
+    directions = rng.standard_normal((20, 3))
+    around, supports = own.ellipsoid(np.diag([1.0, 2.0, 3.0])), own.support(directions)
+    reached = ((own.sample(rng, 4000) - own.middle) @ directions.T).max(axis=0)
+    assert (reached <= supports * (1.0 + 1e-12)).all()
+    assert (reached > 0.5 * supports).any()
+    assert (supports <= around.support(directions) * (1.0 + 1e-12)).all()
+    assert own.sample(rng).shape == (3,)
+    assert own.sized(3) is own
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_file_of_a_set_has_every_number_of_it(name):
+    read = as_set(json.loads(json.dumps(SETS[name].document)))
+    assert type(read) is type(SETS[name])
+    assert read.size == SETS[name].size
+    np.testing.assert_array_equal(read.sized(3).middle, SETS[name].sized(3).middle)
+    shapes = [each.sized(3).ellipsoid().shape_matrix for each in (read, SETS[name])]
+    np.testing.assert_array_equal(*shapes)
+
+
+def test_a_number_is_a_half_width_per_entry_and_a_ball_says_so():
+    np.testing.assert_array_equal(as_set(0.5).sized(2).ellipsoid().shape_matrix, 0.5 * np.eye(2))
+    np.testing.assert_array_equal(Ball(0.5).sized(2).ellipsoid().shape_matrix, 0.25 * np.eye(2))
+
+
+def test_supports_of_a_sum_add_up_and_its_middles_too():
+    one, other = Box([-1.0, 0.0], [3.0, 4.0]), Through([[1.0], [1.0]], Box(0.0, 2.0))
+    both = one + other
+    np.testing.assert_array_equal(both.middle, [2.0, 3.0])
+    assert both.support(np.array([1.0, -2.0])) == one.support(np.array([1.0, -2.0])) + 1.0
+
+
+def test_arrays_of_sets_cannot_be_written_to():
+    for own in (Box([0.0], [1.0]).low, Through(E, 0.1).E, Gaussian(np.eye(2), 0.1).covariance):
+        with pytest.raises(ValueError, match="read-only"):
+            own[0] = 2.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Box([0.0, 1.0], [1.0]), "vectors of one size"),
+        (lambda: Box(1.0, 0.0), "half-widths of a box must be 0 or from"),
+        (lambda: Box([0.0], [np.inf]), "half-widths of a box must be 0 or from"),
+        (lambda: Ball(-1.0), "the radius of a ball must be a number >= 0"),
+        (lambda: Gaussian([[1.0, 2.0], [2.0, 1.0]], 0.1), "positive semidefinite"),
+        (lambda: Gaussian([[1.0]], 0.0), "delta must be"),
+        (lambda: Through(E, [0.1, 0.2, 0.3]), "dimension 2 is needed, got one in dimension 3"),
+        (lambda: Through([[1e-30]], 1e-30), "must be 0 or at least"),
+        (lambda: Sum((Gaussian([[1.0]], 0.1), Gaussian([[1.0]], 0.1))), "one Gaussian"),
+        (lambda: Box([0.0], [1.0]) + Box([0.0, 0.0], [1.0, 1.0]), "dimension 1 is needed, got one in dimension 2"),
+        (lambda: as_set([[1.0, 1.0], [1.0, 2.0]]), "a set must be a number, a vector of half-widths or a"),
+        (lambda: as_set({"Box": {"low": 0.0}}), "a set must be a number"),
+        (lambda: as_set(None), "a set must be a number"),
+        (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
+        (
+            lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sized(3, 1),
+            r"Bounds\(first_error=...\): a set in dimension 3 is needed",
+        ),
+    ],
+)
+def test_what_is_no_set_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_bounds_have_no_defaults():
+    with pytest.raises(TypeError, match="first_error"):
+        Bounds(0.1, 0.1)
