@@ -122,7 +122,5 @@ def limited(seed: int) -> LinearPlant:
     return replace(plant, B=0.5 * plant.B, step_offset=None) if seed % 11 == 1 else plant
 
 
-COMMANDS = (record, compare)
-
 if __name__ == "__main__":
-    run(__doc__, COMMANDS)
+    run(__doc__, (record, compare))

@@ -32,7 +32,7 @@ MODULES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*
 LAYERS = {
     "ncs_gym": (
         {"exact", "installation", "reading", "validation"},
-        {"uncertainty", "plants"},
+        {"uncertainty", "plants", "model", "limits", "bounds"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
         {"envs"},

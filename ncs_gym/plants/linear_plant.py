@@ -34,6 +34,7 @@ from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     as_count,
+    as_covariance,
     as_names,
     as_number,
     as_setting,
@@ -322,7 +323,8 @@ class LinearPlant(LimitValues, HardBounds):
         given = [tuple(getattr(self, name) for name in names) for *names, _ in declared]
         sums = []
         for (noise, bounded), (covariance, bound, size) in zip(given, declared, strict=True):
-            part = Gaussian(np.zeros((size, size)) if noise is None else noise, self.delta).sized(size)
+            known = np.zeros((size, size)) if noise is None else as_covariance(noise, size, covariance)
+            part = Gaussian(known, self.delta)
             rest = () if bounded is None else (declared_set(bounded, size, bound),)
             sums.append(Sum((part, *rest)))
             self._set(covariance, part.covariance)

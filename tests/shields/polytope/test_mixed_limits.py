@@ -211,8 +211,8 @@ def test_plant_with_such_limits_has_none_that_are_only_symmetric():
 REFUSED = {
     "no list": (5.0, "mixed_limits must be a list of"),
     "three of four": ([([0.0, 0.0], [1.0, 1.0], 1.0)], "mixed_limits must be a list of"),
-    "a row too short": ([([0.0], [1.0, 1.0], -1.0, 1.0)], "state row of a limit in mixed_limits"),
-    "no input": ([([1.0, 0.0], [0.0, 0.0], -1.0, 9.0)], "must be about an input"),
+    "a row too short": ([([0.0], [1.0, 1.0], -1.0, 1.0)], "c_x of a row of limits must have shape"),
+    "no input": ([([1.0, 0.0], [0.0, 0.0], -1.0, 9.0)], "with c_u None or not 0"),
     "operating point beyond": ([([0.0, 0.0], [1.0, 1.0], -1.0, 1.0)], "operating point"),
     "ends the wrong way": ([([0.0, 0.0], [1.0, 1.0], 9.0, 1.0)], "low < high"),
     "not finite": ([([0.0, np.nan], [1.0, 1.0], -1.0, 1.0)], "finite"),
