@@ -21,7 +21,7 @@ from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
-from ncs_gym.plants.limits import MovedOperatingPointWarning
+from ncs_gym.plants.limits import ChosenLimitsWarning, MovedOperatingPointWarning
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
@@ -59,6 +59,7 @@ __all__ = [
     "BrokenContractWarning",
     "Channel",
     "ChannelContract",
+    "ChosenLimitsWarning",
     "ClippedObservationWarning",
     "Command",
     "Disturbance",

@@ -24,6 +24,9 @@ LARGEST_COUNT = 2**31 - 1
 MOST_EXPANDED = 10_000_000
 # Messages quote no more of a value than this many letters, and names and phrases of plants have no more.
 MAX_QUOTED_LENGTH, LONGEST_TEXT = 200, 1000
+# What a covariance may lack of a symmetric, positive semidefinite one, in units of its deviations: a few roundings of
+# float32 in each of some ten entries. What an eigenvalue lacks by rounding of float64 alone is no reason to change it.
+COVARIANCE_ROUNDING, EIGENVALUE_ROUNDING = 1e-6, 1e-12
 # Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
 FILLED_IN_LATER: Any = None
 
@@ -281,28 +284,27 @@ def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
 def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
     """Returns `value` as a symmetric positive semidefinite (size, size) matrix (None: of any size).
 
+    What it lacks of one may be rounding, in units of its own deviations: such a matrix is given a little more variance.
+
     Raises:
         ValueError: If it has another shape, is not finite, not symmetric or has a negative
             eigenvalue beyond rounding.
     """
     matrix = as_matrix(value, (size, size), name)
     matrix = as_matrix(matrix, (len(matrix), len(matrix)), name)
-    scale = np.abs(matrix).max()
-    if (np.abs(matrix - matrix.T) > 1e-12 * scale).any():
+    variances = np.diag(matrix)
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    units = np.outer(deviations, deviations)
+    if (np.abs(matrix - matrix.T) > COVARIANCE_ROUNDING * units).any():
         raise ValueError(f"{name} must be symmetric, got {shown(matrix.tolist())}")
     matrix = 0.5 * (matrix + matrix.T)
-    smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if smallest < -1e-12 * scale or not _has_covariances(matrix):
-        raise ValueError(f"{name} must be positive semidefinite, its smallest eigenvalue is {smallest:.3g}")
-    return matrix
-
-
-def _has_covariances(matrix: np.ndarray) -> bool:
-    """Returns whether no covariance is larger than the variances allow, each in its own units, but for rounding."""
-    variances = np.diag(matrix)
-    with np.errstate(invalid="ignore"):
-        deviations = np.sqrt(variances)
-        return bool((np.abs(matrix) <= (1.0 + 1e-6) * np.outer(deviations, deviations)).all())
+    kept = variances > 0.0
+    correlations = matrix[np.ix_(kept, kept)] / units[np.ix_(kept, kept)]
+    smallest = float(np.linalg.eigvalsh(correlations)[0]) if kept.any() else 0.0
+    if smallest < -COVARIANCE_ROUNDING or matrix[~kept].any():
+        least = float(np.linalg.eigvalsh(matrix)[0])
+        raise ValueError(f"{name} must be positive semidefinite, its smallest eigenvalue is {least:.3g}")
+    return matrix + COVARIANCE_ROUNDING * np.diag(variances) if smallest < -EIGENVALUE_ROUNDING else matrix
 
 
 def as_number(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.plants.between_samples import MOST_POINTS
 from ncs_gym.plants.limits import as_row_ends, listed_ends
 from ncs_gym.validation import (
@@ -98,9 +99,10 @@ class Polytope(ReadOnlyArrays):
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
         rows, reached = self.rows[bounded], self.rows[bounded] @ self.center
         sizes = np.maximum(self.high[bounded] - reached, reached - self.low[bounded])
-        if not len(rows) or np.linalg.matrix_rank(rows / np.abs(rows).max(axis=0)) < self.dim:
+        if not len(rows) or exact.rank(rows) < self.dim:
             return np.full(self.dim, np.inf)
-        return np.abs(np.linalg.pinv(rows / sizes[:, None])).sum(axis=1)
+        units = 1.0 / np.abs(rows / sizes[:, None]).max(axis=0)
+        return units * np.abs(np.linalg.pinv(rows * units / sizes[:, None])).sum(axis=1)
 
     @property
     def dim(self) -> int:

@@ -27,6 +27,7 @@ def synthesize(settings: SynthesizeSettings) -> None:
                 plant,
                 contract=contract,
                 safe_set=settings.safe_set,
+                time_limit=settings.time_limit,
                 progress=show,
             )
     except SynthesisInterrupted as interrupt:

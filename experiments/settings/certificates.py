@@ -25,6 +25,8 @@ class SynthesizeSettings:
             keeps in the safe box, which leaves the policy more room. By default the polytope.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
             own; 1 for the sampling instants alone (docs/shield.md).
+        time_limit: Seconds of the processor's time after which the best certificate so far is verified and saved, and
+            says so; None for no limit: then the search ends by counted work, on every machine alike.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
@@ -37,6 +39,7 @@ class SynthesizeSettings:
     plant: Path | None = None
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     between_samples: int | None = None
+    time_limit: float | None = 60.0
     out: Path = Path("certificate.json")
     max_age: int | None = None
     quantization_step: float | None = None

@@ -63,8 +63,13 @@ def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid
     """
     if initial_set is None:
         box = plant.symmetric_box
-        is_bounded = exact.rank(box) == plant.n
-        shape = START_FRACTION**2 * (np.linalg.inv(weight_of(box)) if is_bounded else np.linalg.pinv(box.T @ box))
+        is_bounded, widths = exact.rank(box) == plant.n, plant.half_widths
+        gram = (box * widths).T @ (box * widths)
+        shape = START_FRACTION**2 * (
+            np.linalg.inv(weight_of(box, plant.reach_from_rest))
+            if is_bounded
+            else np.linalg.pinv(gram) * np.outer(widths, widths)
+        )
         past = plant.n - inputs_under_way(plant)
         shape[past:], shape[:, past:] = 0.0, 0.0
         return Ellipsoid(shape)

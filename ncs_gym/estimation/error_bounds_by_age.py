@@ -52,11 +52,12 @@ def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSet
 
 def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
     """Returns the sets, a little larger, in numbers that hardly depend on the processor; they are to be checked."""
+    units = 10.0 ** np.floor(0.5 * np.log10(np.maximum(np.diag(sets.noise), 1e-300)))  # of the outputs
     return replace(
         sets,
         shapes=np.stack([rounded_up(shape, DIGITS) for shape in sets.shapes]),
         rates=np.round(sets.rates, DIGITS),
-        gains=np.stack([exact.rounded(gain, DIGITS, axis=1) for gain in sets.gains]),
+        gains=np.stack([exact.rounded(gain * units, DIGITS, axis=1) / units for gain in sets.gains]),
     )
 
 

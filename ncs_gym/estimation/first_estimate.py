@@ -63,7 +63,8 @@ def _are_apart(x: np.ndarray, X: np.ndarray, z: np.ndarray, Z: np.ndarray) -> bo
     """Returns whether x + E(X) and z + E(Z) have surely no point in common; of what is NaN that is not sure."""
     if not np.isfinite(Z).all():
         return False
-    direction = np.linalg.lstsq(X + Z, x - z, rcond=None)[0]
+    scale = np.sqrt(np.maximum(np.diag(X + Z), np.finfo(float).tiny))
+    direction = np.linalg.lstsq((X + Z) / np.outer(scale, scale), (x - z) / scale, rcond=None)[0] / scale
     widths = np.sqrt(np.array([max(float(direction @ shape @ direction), 0.0) for shape in (X, Z)]))
     return bool(direction @ (x - z) > (1.0 + ROUNDING) * widths.sum())
 

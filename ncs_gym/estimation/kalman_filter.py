@@ -199,6 +199,8 @@ def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndar
 def _sensor_covariance(plant: LinearPlant, quantization_step: float) -> np.ndarray:
     """Returns R, shape (p, p): the plant's for this purpose plus q^2/12 of a quantizer, invertible."""
     R = plant.kalman_covariances[1] + quantization_step**2 / 12.0 * np.eye(plant.p)
-    if np.linalg.eigvalsh(R)[0] <= 0.0:  # perfect sensors: keep the innovation covariance invertible
+    scale = np.sqrt(np.diag(R))
+    # Of perfect sensors the innovation covariance stays invertible.
+    if not scale.all() or np.linalg.eigvalsh(R / np.outer(scale, scale))[0] <= 0.0:
         R = R + FLAT_INFLATION * np.diag((np.abs(plant.H) @ plant.half_widths) ** 2)
     return R

@@ -142,7 +142,8 @@ class SetMembership:
         try:
             return np.linalg.solve(innovation, spread.T).T
         except np.linalg.LinAlgError:  # singular in float64, after long outages
-            return (np.linalg.pinv(innovation) @ spread.T).T
+            scale = np.sqrt(np.diag(innovation))
+            return ((np.linalg.pinv(innovation / np.outer(scale, scale)) / np.outer(scale, scale)) @ spread.T).T
 
     def rounded_up(self, shape: np.ndarray) -> np.ndarray:
         """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.

@@ -23,6 +23,8 @@ FLAT_INFLATION = 1e-12
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
+# A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
+FREE_REACH = 100.0
 
 
 class HardBounds(ReadOnlyArrays):
@@ -53,7 +55,15 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def weight(self) -> np.ndarray:
         """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
-        return read_only(weight_of(self.box))
+        return read_only(weight_of(self.box, self.reach_from_rest))
+
+    @cached_property
+    def reach_from_rest(self) -> np.ndarray:
+        """How far inputs take each state in n steps at most, from about as far as noise does in one, shape (n,)."""
+        bounds = [each.shape_matrix for each in (self.disturbance_bound, self.initial_bound) if each is not None]
+        noise = [np.diag(each) for each in (self.process_noise_cov, self.initial_cov, *bounds)]
+        reach = np.sqrt(self.gamma + np.sum(noise, axis=0))
+        return read_only(reach_in_steps(self.A, self.B, self.largest_input, reach))
 
     @cached_property
     def _box_shape(self) -> np.ndarray:
@@ -191,13 +201,25 @@ def _plus_uniform(
     return samples if bound is None or not np.any(bound.shape_matrix) else samples + bound.sample(rng, count)
 
 
+def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""
+    for _ in range(len(A)):
+        reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
+    return reach
+
+
 def inflated(shape: np.ndarray) -> np.ndarray:
     """Returns a slightly larger bound, also in directions in which it is flat: room for the rounding of its entries."""
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
-def weight_of(rows: np.ndarray) -> np.ndarray:
-    """Returns positive definite W, shape (n, n), of rows c_j, (k, n): C'C, regularized."""
+def weight_of(rows: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Returns positive definite W, shape (n, n), of rows c_j, (k, n): C'C, regularized.
+
+    Args:
+        rows: Of the box.
+        reach: `reach_from_rest` of the states, shape (n,): it counts for those in no row; 0 stands for 1.
+    """
     gram = exact.product(rows.T, rows)
-    squares = np.diag(gram)
-    return gram + 1e-6 * np.diag(squares + exact.total(squares) / len(gram) * (squares == 0.0))
+    squares, sizes = np.diag(gram), FREE_REACH * np.where(reach > 0.0, reach, 1.0)
+    return gram + np.diag(np.where(squares > 0.0, 1e-6 * squares, 1.0 / np.square(sizes)))

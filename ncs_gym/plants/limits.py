@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.plants.hard_bounds import FREE_REACH, reach_in_steps, weight_of
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
@@ -142,17 +143,29 @@ def sides(limits: Any, size: int, name: str, *, may_meet: bool = False) -> tuple
     return low, high
 
 
-def _from_center(limits: Any, center: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _from_center(limits: Any, center: np.ndarray, name: str, *, is_given: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Returns the ends of limits as distances from a point between them, shape (size,) each; infinite where free.
+
+    `is_given` tells whether somebody gave that point.
 
     Raises:
         ValueError: If they are no limits, or the point is not strictly between them, by more than rounding.
     """
     low, high = sides(limits, len(center), name)
     if not ((low < center) & (center < high)).all():
+        at_end, remedy = np.flatnonzero((low == center) | (center == high)), _POINT_TO_GIVE.get(name, "")
+        if is_given or not remedy:
+            remedy = (
+                ""
+                if not len(at_end)
+                else (
+                    f": entry {at_end[0] + 1} rests at its end, from where nothing can move it both ways; give an "
+                    "equilibrium whose states and inputs are inside their limits"
+                )
+            )
         raise ValueError(
             f"{name} must have the operating point {shown(center.tolist())} strictly between them, got {shown(limits)}"
-            f"{_POINT_TO_GIVE.get(name, '') if not center.any() else ''}"
+            f"{remedy}"
         )
     low, high = low - center, high - center
     nearest, finite = np.minimum(-low, high), np.isfinite(low) & np.isfinite(high)
@@ -162,6 +175,10 @@ def _from_center(limits: Any, center: np.ndarray, name: str) -> tuple[np.ndarray
     if not ((size >= SMALLEST_NUMBER) & (size < LARGEST_NUMBER)).all():
         raise ValueError(f"{name} must be finite numbers of usual size, or infinite, got {shown(limits)}")
     return low, high
+
+
+class ChosenLimitsWarning(UserWarning):
+    """No state has a limit: half-widths of the safe box were chosen, far beyond what inputs reach in a few steps."""
 
 
 class MovedOperatingPointWarning(UserWarning):
@@ -194,8 +211,8 @@ def in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ro
     )
 
 
-def _state_rows(limits: Any, center: np.ndarray) -> Rows:
-    return in_units_of_range(np.eye(len(center)), *_from_center(limits, center, "state_limits"))
+def _state_rows(limits: Any, center: np.ndarray, *, is_given: bool) -> Rows:
+    return in_units_of_range(np.eye(len(center)), *_from_center(limits, center, "state_limits", is_given=is_given))
 
 
 def _output_rows(outputs: Any, center: np.ndarray) -> Rows:
@@ -362,8 +379,8 @@ def _residual_of_equilibrium(
         return missing
     remedy = "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
     rest = np.eye(len(A)) - A
-    if np.linalg.cond(rest) < 1e9:
-        equilibrium = np.linalg.solve(rest, B @ applied + offset).tolist()
+    if exact.rank(rest) == len(A):
+        equilibrium = exact.product(exact.inverse(rest), B @ applied + offset).tolist()
         remedy = f"with this input the equilibrium is {shown(equilibrium)}, or {remedy}"
     raise ValueError(
         f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
@@ -397,7 +414,7 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     """
     arguments = {name: value for name, value in arguments.items() if not _is_no_limit(name, value)}
     _require_limits(arguments)
-    given = {name: arguments.get(name) for name in PUBLISHED}
+    given = {name: arguments.get(name) for name in (*PUBLISHED, "operating_state", "operating_input")}
     fields = {name: value for name, value in arguments.items() if name not in PUBLISHED}
     A, B = as_setting(fields.get("A")), as_setting(fields.get("B"))
     if A is None or B is None or A.ndim != 2 or B.ndim != 2 or len(A) != A.shape[1] or len(B) != len(A) or not B.size:
@@ -412,6 +429,8 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
         fields["step_offset"] = np.abs(offset)
         lacking = _residual_of_equilibrium(A, B, offset, state, applied)
     fields |= _input_fields(given, applied)
+    if all(arguments.get(name) is None for name in ("box", "state_limits", "output_limits")):
+        fields["box"] = _chosen_half_widths(A, B, fields["input_ends"])
     fields = _row_fields(fields, given, state)
     fields = _mixed_fields(fields, given["mixed_limits"], state, applied)
     bound = fields.get("disturbance_bound")
@@ -423,18 +442,42 @@ def fields_of(arguments: dict[str, Any]) -> dict[str, Any]:
     return fields
 
 
+def _chosen_half_widths(A: np.ndarray, B: np.ndarray, input_ends: Any) -> np.ndarray:
+    """Returns half-widths for states without limits, shape (n,): many times what inputs reach in n steps.
+
+    Raises:
+        TypeError: If no input moves a state, so that nothing says how large it gets.
+    """
+    n, m = B.shape
+    reach = reach_in_steps(A, B, np.abs(as_input_ends(input_ends, m)).max(axis=0), np.zeros(n))
+    if not reach.all():
+        raise TypeError(f"LinearPlant needs limits: no input moves state {reach.argmin() + 1}, so give state_limits")
+    widths = np.array([float(exact.rounded(FREE_REACH * each, 1)) for each in reach])
+    text = (
+        f"no state has a limit: half-widths {shown(widths.tolist())} were chosen, give box or state_limits for others"
+    )
+    warn_caller(text, ChosenLimitsWarning)
+    return widths
+
+
 def _is_no_limit(name: str, value: Any) -> bool:
-    """Returns whether an argument is a list of limits without any."""
-    return name in ("output_limits", "mixed_limits") and isinstance(value, list | tuple) and not len(value)
+    """Returns whether an argument is limits without any: an empty list, or ends that are all infinite."""
+    if name in ("output_limits", "mixed_limits"):
+        return isinstance(value, list | tuple) and not len(value)
+    ends = [as_setting(end) for end in value] if name == "state_limits" and isinstance(value, list | tuple) else []
+    return len(ends) == 2 and all(
+        end is not None and (end == infinity).all() for end, infinity in zip(ends, (-np.inf, np.inf), strict=True)
+    )
 
 
 def _require_limits(arguments: dict[str, Any]) -> None:
-    """Raises TypeError unless there are limits of states and of inputs."""
-    needed = ("box", "state_limits", "output_limits"), ("u_max", "input_limits", "input_ends")
-    missing = [names[:2] for names in needed if all(arguments.get(name) is None for name in names)]
-    if missing:
+    """Raises TypeError unless there are limits of inputs, or if those of states seem to be given by another name."""
+    of_states, of_inputs = ("box", "state_limits", "output_limits"), ("u_max", "input_limits", "input_ends")
+    missing = [names[:2] for names in (of_states, of_inputs) if all(arguments.get(name) is None for name in names)]
+    others = [name for name in arguments if name not in PUBLISHED]
+    near = [name for name in others if any(get_close_matches(name, names, 1, 0.8) for names in missing)]
+    if of_inputs[:2] in missing or (missing and (near or arguments.get("box_ends") is not None)):
         wanted = ", and ".join(" or ".join(names) for names in missing)
-        near = [name for name in arguments if any(get_close_matches(name, names, 1, 0.8) for names in missing)]
         given = f" (it has no argument {', '.join(near)})" if near else ""
         raise TypeError(f"LinearPlant needs limits: give {wanted}{given}")
 
@@ -459,7 +502,8 @@ def _input_fields(given: dict[str, Any], center: np.ndarray) -> dict[str, Any]:
         return {"input_ends": np.stack([-u_max, u_max])}
     if given["input_limits"] is None:
         return {}
-    ends = _from_center(given["input_limits"], center, "input_limits")
+    is_given = given["operating_input"] is not None
+    ends = _from_center(given["input_limits"], center, "input_limits", is_given=is_given)
     if not np.isfinite(ends).all():
         raise ValueError(
             "input_limits must be finite, since actions from -1 to 1 stand for inputs from the low to the high end, "
@@ -480,7 +524,8 @@ def _row_fields(fields: dict[str, Any], given: dict[str, Any], center: np.ndarra
     if given["state_limits"] is not None:
         if fields.get("box") is not None:
             raise ValueError("box follows from state_limits: give these alone")
-        parts.append(_state_rows(given["state_limits"], center))
+        is_given = given["operating_state"] is not None
+        parts.append(_state_rows(given["state_limits"], center, is_given=is_given))
     elif fields.get("box") is not None:
         rows = as_box_rows(fields["box"], len(center))
         parts.append(Rows(rows, *as_row_ends(fields.get("box_ends"), len(rows))))
@@ -550,12 +595,13 @@ def _around_middle_of_disturbance(
     ends = as_row_ends(fields.get("box_ends"), len(rows))
     inputs = as_input_ends(fields["input_ends"], m)
     reach = 0.5 * (inputs[1] - inputs[0])
-    balance = np.hstack([np.eye(n) - A, -B * reach])
-    found = np.linalg.lstsq(balance, E @ middle)[0]
+    widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
+    balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
+    found = np.linalg.lstsq(balance, E @ middle / widths)[0]
     directions = null_space(balance)
-    sizes = np.vstack([np.hstack([rows, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
+    sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
     found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
-    x, u = found[:n], reach * found[n:]
+    x, u = widths * found[:n], reach * found[n:]
 
     def missing_at(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))

@@ -310,6 +310,7 @@ class LinearPlant(LimitValues, HardBounds):
         as_bound(given.bound, self.n, "remainder")
         model = {name: getattr(self, name) for name in ("A", "B")}
         model |= {"box": np.vstack([self.box.T, self.box_ends]), "u_max": self.input_ends, "dt": self.dt}
+        model["mixed_limits"] = np.vstack([self.mixed_rows.T, self.mixed_ends]).T
         return given.of_model(model)
 
     def _check_between_samples(self) -> None:
@@ -339,7 +340,7 @@ class LinearPlant(LimitValues, HardBounds):
                 "between_samples is for an operating point that rests without a constant disturbance: how much of "
                 f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
             )
-        if np.linalg.matrix_rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
+        if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
             raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
 
     @classmethod
@@ -423,7 +424,7 @@ class LinearPlant(LimitValues, HardBounds):
         Ac, Bc = self.continuous_model[:, : self.n], self.continuous_model[:, self.n :]
         A, B = statespace.zero_order_hold(Ac, Bc, dt)
         of_constant = [statespace.zero_order_hold(Ac, np.eye(self.n), step)[1] for step in (dt, self.dt)]
-        if np.linalg.cond(of_constant[1]) > LARGEST_CONDITION:
+        if np.linalg.cond(of_constant[1] * self.half_widths / self.half_widths[:, None]) > LARGEST_CONDITION:
             raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
         G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
         ball = Ellipsoid(self.gamma * np.eye(self.n))

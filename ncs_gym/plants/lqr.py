@@ -10,17 +10,20 @@ def lqr_gain(
 ) -> np.ndarray | None:
     """Returns K, shape (m, n), of u = K x that minimizes the sum of x'Qx + u'Ru + 2 x'Nu; N is 0 by default.
 
-    None where the Riccati equation has no solution that scipy finds.
+    It is sought in units in which the diagonals of Q and R, which are positive, are about 1. None where the Riccati
+    equation has no solution that scipy finds.
     """
     from scipy.linalg import solve_discrete_are  # takes long to import
 
+    x, u = (np.exp2(-np.round(0.5 * np.log2(np.diag(weight)))) for weight in (Q, R))
+    A, B, Q, R = A * x / x[:, None], B * u / x[:, None], Q * np.outer(x, x), R * np.outer(u, u)
+    crossed = np.zeros(B.shape) if N is None else N * np.outer(x, u)
     try:
-        P = solve_discrete_are(A, B, Q, R, s=N)
-        answer = B.T @ P @ A if N is None else B.T @ P @ A + N.T
-        gain = -np.linalg.solve(R + B.T @ P @ B, answer)
+        P = solve_discrete_are(A, B, Q, R, s=crossed)
+        gain = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + crossed.T)
     except (np.linalg.LinAlgError, ValueError):
         return None
-    return gain if np.isfinite(gain).all() else None
+    return gain * u[:, None] / x if np.isfinite(gain).all() else None
 
 
 def regulator_gain(A: np.ndarray, B: np.ndarray, effort: float, decay: float) -> np.ndarray | None:

@@ -48,11 +48,12 @@ DIGITS = 9
 
 # Arguments of `LinearPlant` for the point that deviations are counted from, and for where states and inputs may be.
 _POINT = "operating_state", "operating_input"
-_OF_FRAME = "state_limits", "input_limits", "output_limits", "box_ends", "input_ends", *_POINT
+_ROWS = "output_limits", "mixed_limits", "mixed_rows", "mixed_ends"
+_OF_FRAME = "state_limits", "input_limits", "box_ends", "input_ends", *_ROWS, *_POINT
 
 
 class _Region(NamedTuple):
-    """Where the remainder is bounded: low <= (x, u) <= high in deviations, shape (n + m,) each."""
+    """Where the remainder is bounded, as far as other limits allow: low <= (x, u) <= high in deviations, (n + m,)."""
 
     low: np.ndarray
     high: np.ndarray
@@ -241,12 +242,20 @@ def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
 
 
 def _sampled(moving: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator) -> _Steps:
-    """Returns steps from random points of the region; half of them have coordinates on its boundary."""
+    """Returns steps from random points of the region; half of them have coordinates on its boundary.
+
+    A point that limits of several coordinates forbid is pulled towards zero onto their boundary.
+    """
     low, high = (side[:, None] for side in region)
     points = rng.uniform(-1.0, 1.0, (len(low), count))
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
     inside = np.clip(0.5 * (low + high) + 0.5 * (high - low) * points, low, high)
     points = np.where(at_end, np.where(points < 0.0, low, high), inside)
+    of_sums = np.count_nonzero(frame.box, axis=1) > 1
+    states_alone = np.hstack([frame.box[of_sums], np.zeros((of_sums.sum(), frame.m))])
+    values = np.concatenate([states_alone, frame.mixed_rows]) @ points
+    ends = np.concatenate([frame.box_ends[:, of_sums], frame.mixed_ends], axis=1)[:, :, None]
+    points = points / np.maximum(values / ends, 1.0).max(axis=(0, 1), initial=1.0)
     states, inputs = points[: frame.n], points[frame.n :]
     return _Steps(states, inputs, _moved(moving, frame, states, inputs, rng))
 
@@ -312,6 +321,8 @@ def fitted_matrices(
         widths: Half-widths of the box, shape (n,).
     """
     regressors = np.concatenate([states, inputs]).T
+    units = np.maximum(np.abs(regressors).max(axis=0), np.finfo(float).tiny)
+    regressors = regressors / units
     targets = (moved / widths[:, None]).T
     weights, best, smallest = np.ones(len(targets)), None, np.inf
     for _ in range(ROUNDS):
@@ -324,7 +335,7 @@ def fitted_matrices(
         weights /= weights.sum()
     if best is None:
         raise ValueError("the sampled steps are not finite: no linear model fits them")
-    fitted = np.round(best * widths, DIGITS).T
+    fitted = (np.round(best, DIGITS) * widths / units[:, None]).T
     return fitted[:, : len(states)], fitted[:, len(states) :]
 
 

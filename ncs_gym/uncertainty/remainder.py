@@ -16,7 +16,7 @@ from ncs_gym.validation import as_flag, require_short_text, shown
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits.
+    """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits (both in common ones).
 
     The remainder that a plant keeps knows the model, the box and the limits of that plant, and no plant of others takes
     it over. Whether its bound is proved has to be said again with `dataclasses.replace`. Of a family, the plant that
@@ -56,13 +56,17 @@ class Remainder:
         """Returns the same remainder, which from now on belongs to this model alone.
 
         Args:
-            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt.
+            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max, dt and
+                mixed_limits, of which there may be more, a row each.
 
         Raises:
             ValueError: If it belongs to another model.
         """
         if self._model is not None:
-            others = [name for name, value in model.items() if not np.array_equal(value, self._model[name])]
+            own = dict(self._model)
+            if all((model["mixed_limits"] == row).all(axis=1).any() for row in own["mixed_limits"]):
+                own["mixed_limits"] = model["mixed_limits"]
+            others = [name for name, value in model.items() if not np.array_equal(value, own[name])]
             if others:
                 raise ValueError(
                     f"the remainder belongs to a plant with another {', '.join(others)}: find the model anew by "

@@ -17,11 +17,11 @@ from shields.synthesis.invariant_set_program import InvariantSetProgram, max_sla
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
-_ALTERNATIONS = 40
-# An alternation that gains less than this in log det has converged.
-_SMALLEST_GAIN = 1e-4
-# Relative step of the pattern search over the multipliers; it is divided by 3 until it is below the smallest.
-_FIRST_STEP, _SMALLEST_STEP = 0.3, 0.03
+ALTERNATIONS = 40
+# An alternation that gains less than this in log det, 1 % of volume, is the last one with its step.
+_SMALLEST_GAIN = 0.02
+# Relative steps of the pattern search over the multipliers.
+_STEPS = (0.3, 0.1, 0.033)
 
 
 def largest_set(
@@ -29,7 +29,7 @@ def largest_set(
     slack: float,
     report: ProgressCallback,
     start: CandidateDesign | None = None,
-    alternations: int = _ALTERNATIONS,
+    alternations: int = ALTERNATIONS,
 ) -> CandidateDesign | None:
     """Returns the design of largest volume that alternation finds; None if no initial design is found.
 
@@ -45,16 +45,14 @@ def largest_set(
     best = best or initial_design(problem, program, report)
     if best is None:
         return None
-    step = _FIRST_STEP
+    steps = list(_STEPS)
     for turn in range(alternations):
-        if -best.log_det < VOLUME_TOLERANCE:
+        if -best.log_det < VOLUME_TOLERANCE or not steps:
             break
-        better = _alternate(problem, program, best, step)
+        better = _alternate(problem, program, best, steps[0])
         report(f"alternation {turn + 1} of at most {alternations}", better)
         if better.log_det - best.log_det < _SMALLEST_GAIN:
-            step /= 3.0
-            if step < _SMALLEST_STEP:
-                break
+            steps.pop(0)
         best = better
     return best
 
@@ -77,6 +75,11 @@ def _alternate(
         shifted_fraction = np.clip(error_fraction * (1.0 + shift), 1e-3, 0.99)
         best = _larger(best, program.solve(multiplier_triple(shifted_lx, shifted_fraction), best.inputs, best.L))
     return best
+
+
+def tightened(problem: DesignProblem, design: CandidateDesign, slack: float) -> CandidateDesign | None:
+    """Returns the largest set next to a design, with its multipliers, for a larger slack; None if there is none."""
+    return InvariantSetProgram(problem, slack).solve(design.multipliers, design.inputs, design.L)
 
 
 def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> CandidateDesign:

@@ -27,7 +27,7 @@ def certificate_of(
 ) -> Certificate:
     """Returns the certificate of a design, not yet verified."""
     L, K = problem.to_physical(design.L, design.K)
-    L, K = shape_in_digits(L), exact.rounded(K, DIGITS, axis=1)
+    L, K = shape_in_digits(L), gain_in_digits(K, plant)
     volume = float(np.exp(0.5 * design.log_det)) * _share_of_ellipsoid(plant, problem)
     return Certificate(
         L=L,
@@ -110,12 +110,15 @@ def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
     It is where the box has a center, a point in the middle between all of its pairs of ends.
     """
     middle, half = 0.5 * (plant.box_low + plant.box_high), 0.5 * (plant.box_high - plant.box_low)
-    if not np.isfinite(half).all() or np.linalg.matrix_rank(plant.box) < plant.n:
+    if not np.isfinite(half).all() or exact.rank(plant.box) < plant.n:
         return math.nan
-    center = np.linalg.lstsq(plant.box, middle, rcond=None)[0]
+    widths = plant.half_widths
+    center = widths * np.linalg.lstsq(plant.box * widths, middle, rcond=None)[0]
     if (np.abs(plant.box @ center - middle) > 1e-9 * half).any():
         return math.nan
-    return float(np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box / half[:, None]), L)) ** 0.5)
+    units = np.outer(widths, widths)
+    own = largest_box_ellipsoid(plant.box * widths / half[:, None])
+    return float(np.linalg.det(np.linalg.solve(own, L / units)) ** 0.5)
 
 
 def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
@@ -124,6 +127,12 @@ def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
         return 1.0
     own = np.linalg.cholesky(largest_box_ellipsoid(plant.box_rows))
     return float(np.exp(np.log(np.diag(problem.transform)).sum() - np.log(np.diag(own)).sum()))
+
+
+def gain_in_digits(K: np.ndarray, plant: LinearPlant) -> np.ndarray:
+    """Returns a gain, (m, n), with entries of few digits, each state in a power of ten of about its limit."""
+    units = np.array([float(f"1e{int(np.floor(np.log10(width)))}") for width in plant.half_widths])
+    return exact.rounded(K * units, DIGITS, axis=1) / units
 
 
 def shape_in_digits(L: np.ndarray) -> np.ndarray:

@@ -1,40 +1,30 @@
-"""Certificates for a plant: which search is for it, what helps where none is found, and what carries over."""
+"""Certificates for a plant: candidates, the exact check, why there is none, and what carries over to other problems."""
 
 from __future__ import annotations
-
-import time
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.validation import as_vector, shown
+from ncs_gym.validation import as_number, as_vector, shown
 from shields.certificate import Certificate
-from shields.errors import Infeasible, SynthesisInterrupted
-from shields.synthesis.design_problem import Rest, design_problem
-from shields.synthesis.diagnosis import Clock, infeasibility, is_feasible, with_age_that_helps
-from shields.synthesis.ellipsoid_certificates import LOST, Progress, certify, largest_ellipsoid, nearby_ellipsoid
+from shields.errors import Infeasible
+from shields.synthesis.design_problem import Rest
+from shields.synthesis.diagnosis import infeasibility, with_age_that_helps
+from shields.synthesis.ellipsoid_certificates import certify, largest_ellipsoid, with_tolerated_scale
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
-    fallbacks_around,
-    most_tolerant_polytope,
     polytope_share,
     with_polytope,
 )
 from shields.synthesis.resting_point import needs_resting_point, resting_at
+from shields.synthesis.search import Progress, Search
 from shields.verification import verify
 
-# A refusal should take so long at most [s], of its thread's own time: searches after the first for a polytope, and then
-# for an age that would help, begin no later than so much earlier. One that is under way goes on: where polytopes have
-# very many rows, a refusal has been seen to take 82 s.
-LONGEST_REFUSAL, _UNDER_WAY = 60.0, 10.0
 # Alternations of a search that begins near the design of a similar problem.
 _FEW_ALTERNATIONS = 4
-# Where no certificate is found, these fractions of the input limits are tried: wide limits can mislead the search.
-_LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
 
 
 @np.errstate(all="ignore")
@@ -44,6 +34,7 @@ def synthesize(
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
     resting_state: ArrayLike | None = None,
+    time_limit: float | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
     """Returns a verified certificate; that of the published method is `shields.paper.synthesize`.
@@ -60,10 +51,12 @@ def synthesize(
         resting_state: Equilibrium around which the fallback works, shape (n,) [deviations from the operating point],
             for a polytope; by default the operating point where limits are symmetric about it, else one that leaves
             much of the box.
+        time_limit: Seconds of the processor's time, > 0, after which the best certificate so far is verified and
+            returned, and says so. None for no limit: the search then ends by counted work, on every machine alike.
         progress: Called with a line of text per stage: what is sought, and the volume reached so far.
 
     Raises:
-        Infeasible: If no certificate is found; it names the binding condition and the shortfall.
+        Infeasible: If no certificate is found; it names the binding condition and the shortfall, or the time limit.
         SynthesisInterrupted: A KeyboardInterrupt that says what was reached, with the best certificate so far.
         ValueError: If an argument is out of range.
     """
@@ -76,30 +69,68 @@ def synthesize(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
             f"None, got {shown(contract)}"
         )
-    report, clock = progress or (lambda line: None), Clock(time.thread_time() + LONGEST_REFUSAL - _UNDER_WAY)
+    if time_limit is not None:
+        as_number(time_limit, "time_limit", low=0.0, low_open=True)
+    polytope, rest = safe_set != "ellipsoid", None
     if resting_state is not None or needs_resting_point(plant):
-        if safe_set == "ellipsoid":
+        if not polytope:
             raise ValueError(
                 "only a polytope is sought where limits are not symmetric, not all states have any, some are of states "
                 "and inputs together, or resting_state is given"
             )
         rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
-        try:
-            return around_resting_point(plant, contract, report, clock, rest)
-        except Infeasible as infeasible:
-            if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
-                raise Infeasible(
-                    f"{infeasible}; this is around the resting_state that was given, without one the synthesis chooses",
-                    infeasible.binding,
-                    infeasible.shortfall,
-                ) from None
-            raise _with_changes(infeasible, plant, contract, report, clock, polytope=True) from None
-    polytope = safe_set != "ellipsoid"
+    search = Search(progress, time_limit)
     try:
-        found = largest_ellipsoid(plant, contract, report)
-    except Infeasible as infeasible:
-        found = _second_search(infeasible, plant, contract, report, clock, polytope=polytope)
-    return with_polytope(found, plant, report) if polytope else found
+        return _found(plant, contract, search, rest, polytope=polytope)
+    except TimeoutError:
+        return search.best_in_time(plant)
+    except KeyboardInterrupt as interrupt:
+        raise search.interrupted(plant) from interrupt
+
+
+def _found(
+    plant: LinearPlant, contract: ChannelContract | None, search: Search, rest: Rest | None, *, polytope: bool
+) -> Certificate:
+    """Returns what `synthesize` does, around a given resting point or None.
+
+    Raises:
+        TimeoutError, KeyboardInterrupt: Where the search is ended; it holds what was reached.
+    """
+    failure: Infeasible | None = None
+    try:
+        if rest is not None or needs_resting_point(plant):
+            return around_resting_point(plant, contract, search, rest)
+        ellipsoid = largest_ellipsoid(plant, contract, search)
+        if ellipsoid.certificate is not None:
+            found = with_tolerated_scale(ellipsoid.certificate, ellipsoid.problem)
+            search.candidate = lambda: found
+            return with_polytope(found, plant, search) if polytope else found
+        search.candidate, failure = None, ellipsoid.failure
+        if not polytope:
+            raise failure or infeasibility(plant, contract, polytope=False)
+        known = [] if ellipsoid.K is None else [ellipsoid.K]
+        found = around_resting_point(plant, contract, search, known=known)
+        return with_tolerated_scale(found, ellipsoid.problem)
+    except Infeasible as none:
+        if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
+            given = "this is around the resting_state that was given, without one the synthesis chooses"
+            raise Infeasible(f"{none}; {given}", none.binding, none.shortfall) from None
+        if none.binding == "P":
+            search.refusal = failure or infeasibility(plant, contract, polytope=True, reason=str(none))
+        else:
+            search.refusal = none
+        raise _with_age(search.refusal, plant, contract, search, polytope=polytope) from None
+
+
+def _with_age(
+    refusal: Infeasible, plant: LinearPlant, contract: ChannelContract | None, search: Search, *, polytope: bool
+) -> Infeasible:
+    """Returns a refusal with an age of samples that has a certificate."""
+
+    def certifies(promised: ChannelContract) -> bool:
+        return nearby_certificate(plant, promised, polytope=polytope, progress=search) is not None
+
+    return with_age_that_helps(refusal, plant, contract, certifies, search, polytope=polytope)
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -146,118 +177,15 @@ def nearby_certificate(
         polytope: Whether a polytope is sought where no ellipsoid is found.
         progress: Called with a line of text now and then.
     """
-    if needs_resting_point(plant):
-        return _nearby_around(plant, contract, start, progress)
-    try:
-        certificate = nearby_ellipsoid(plant, contract, start, _FEW_ALTERNATIONS, progress)
-    except Infeasible:
-        certificate = None
-    carried = None if certificate or start is None else carried_over(start, plant, contract)
-    return certificate or carried or (most_tolerant_polytope(plant, contract, progress) if polytope else None)
-
-
-def _nearby_around(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    start: Certificate | None,
-    progress: Progress,
-) -> Certificate | None:
-    """Returns what `nearby_certificate` does, of a polytope around a resting point."""
     carried = None if start is None else carried_over(start, plant, contract)
+    known: list[np.ndarray] = []
     try:
-        for each in fallbacks_around(plant, contract, progress, quick=True):
-            found = certify_polytope(plant, each.K, contract, progress, each.rest)
-            if found is not None:
-                return found if carried is None else max([found, carried], key=polytope_share)
+        if not needs_resting_point(plant):
+            ellipsoid = largest_ellipsoid(plant, contract, Search(progress), start, _FEW_ALTERNATIONS)
+            if ellipsoid.certificate is not None or carried is not None or not polytope:
+                return ellipsoid.certificate or carried
+            known = [] if ellipsoid.K is None else [ellipsoid.K]
+        found = around_resting_point(plant, contract, progress, known=known)
     except Infeasible:
-        pass
-    return carried
-
-
-def _second_search(
-    infeasible: Infeasible,
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress,
-    clock: Clock,
-    *,
-    polytope: bool,
-) -> Certificate:
-    """Returns a verified certificate that is found in other ways where the search for an ellipsoid found none.
-
-    Raises:
-        Infeasible: If there is none; with the bounds that would be feasible.
-    """
-    if polytope and LOST in infeasible.details:
-        progress("no ellipsoid holds in exact arithmetic: seeking a polytope")
-        try:
-            return around_resting_point(plant, contract, progress, clock)
-        except Infeasible:
-            raise infeasible from None
-    was_sought = "share_of_radii" in infeasible.details
-    certificate = _with_closer_limits(plant, contract) if was_sought else None
-    if certificate is None and polytope and (was_sought or infeasible.binding == "B"):
-        progress("no ellipsoid: seeking the gain whose polytope bears most")
-        certificate = most_tolerant_polytope(plant, contract, progress)
-    if certificate is not None:
-        return certificate
-    if was_sought or infeasible.binding in ("B", "E1"):
-        raise _with_hints(infeasible, plant, contract, progress, clock, polytope=polytope) from None
-    raise infeasible
-
-
-def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
-    """Returns a certificate that is found with closer input limits and holds for the plant's own; None if none is."""
-    for fraction in _LIMIT_FRACTIONS if plant.remainder is None else ():
-        closer = replace(plant, u_max=fraction * plant.u_max)
-        certifies = is_feasible(closer, contract, polytope=False)
-        found = nearby_certificate(closer, contract, polytope=False) if certifies else None
-        certificate = found and carried_over(found, plant, contract)
-        if certificate is not None:
-            return certificate
-    return None
-
-
-def _with_hints(
-    infeasible: Infeasible,
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress,
-    clock: Clock,
-    *,
-    polytope: bool,
-) -> Infeasible:
-    """Returns the exception with an age that would help, where no ellipsoid was found.
-
-    Raises:
-        SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
-    """
-    if polytope and infeasible.binding != "E1":
-        sought = infeasibility(plant, design_problem(plant, contract)[0], polytope=True)
-        polytope = sought.shortfall > 0.0  # of one that exists but is out of reach there is nothing to say
-        infeasible = sought if polytope and infeasible.binding != "B" else infeasible
-    return _with_changes(infeasible, plant, contract, progress, clock, polytope=polytope)
-
-
-def _with_changes(
-    infeasible: Infeasible,
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress,
-    clock: Clock,
-    *,
-    polytope: bool,
-) -> Infeasible:
-    """Returns the exception with an age of samples that has a certificate.
-
-    Raises:
-        SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
-    """
-
-    def certifies(promised: ChannelContract) -> bool:
-        return nearby_certificate(plant, promised, polytope=polytope, progress=clock.check) is not None
-
-    try:
-        return with_age_that_helps(infeasible, plant, contract, certifies, clock, progress, polytope=polytope)
-    except KeyboardInterrupt as interrupt:
-        raise SynthesisInterrupted(f"interrupted while feasible ages were sought: {infeasible}") from interrupt
+        return carried
+    return found if carried is None else max(found, carried, key=polytope_share)

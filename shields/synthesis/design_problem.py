@@ -33,6 +33,8 @@ _SMALLEST_AXIS_RATIO = 0.01
 _NOTHING_LEFT = 1e-9
 # A box that is longer in one direction than in another by more, each state in units of its own limit, is refused.
 _FLATTEST = 1e7
+# Of the longest direction those states are named whose part in it is at least this much of the largest one.
+_SHARE_OF_DIRECTION = 0.1
 
 
 class Rest(NamedTuple):
@@ -176,7 +178,7 @@ def design_problem(
         Infeasible: If the plant has no error set, its safe box is unbounded, or far too wide for times between samples.
     """
     limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
-    free = plant.n - int(np.linalg.matrix_rank(limits.box_rows))
+    free = plant.n - exact.rank(limits.box_rows)
     if free:
         without = [name for name, column in zip(plant.state_names, limits.box_rows.T, strict=True) if not column.any()]
         among = f" (of {', '.join(without)})" if without else ""
@@ -186,11 +188,14 @@ def design_problem(
             "S",
             free,
         )
-    flatness = float(np.linalg.cond(limits.box_rows * plant.half_widths))
+    _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
+    flatness = float(sizes[0] / sizes[-1])
     if flatness > _FLATTEST:
+        large = np.flatnonzero(np.abs(directions[-1]) > _SHARE_OF_DIRECTION * np.abs(directions[-1]).max())
+        names = " or ".join(plant.state_names[j] for j in large.tolist())
         raise Infeasible(
             f"the safe box is flat, {flatness:.0e} times longer in one direction than in another that is no axis: add "
-            "rows to box that limit the long one, or leave out those that limit the short one",
+            f"a limit of {names}, along which it is long, or leave out those that limit the short one",
             "S",
             flatness,
         )

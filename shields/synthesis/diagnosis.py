@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -14,6 +13,8 @@ from ncs_gym.estimation.error_bound import unseen_state
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.estimation.error_sets import ErrorSetError
 from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
+from ncs_gym.plants.hard_bounds import FREE_REACH
+from ncs_gym.plants.past_inputs import is_row_of_past_input
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
@@ -32,6 +33,7 @@ from shields.synthesis.resting_point import (
     limits_around,
     needs_resting_point,
 )
+from shields.synthesis.search import Progress
 
 # Digits of the share of the radii that is named.
 _SHOWN_DIGITS = 3
@@ -40,74 +42,54 @@ _SHOWN_DIGITS = 3
 _HOPELESS = 0.8
 # Of contracts, where there is none, none for older samples is named [steps].
 _OLDEST_NAMED = 32
+# For so many ages that a quick search found feasible a certificate is sought.
+_MOST_AGES = 2
 # In the details of the exception: the fraction of all radii that a gain bears.
 _SHARE = "share_of_radii"
 
 
-class Clock:
-    """Ends a search after some time of its own thread: what else a machine does changes no message."""
-
-    def __init__(self, end: float) -> None:
-        self._end = end
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the time is over."""
-        return time.thread_time() >= self._end
-
-    def check(self, line: str = "") -> None:
-        """Raises `TimeoutError` if the time is over; may be called as `progress`, with a line of text."""
-        if self.is_over:
-            raise TimeoutError
-
-
-# Whether a plant has a certificate under a contract; raises `TimeoutError` once the clock has run out.
+# Whether a plant has a certificate under a contract.
 Certifies = Callable[[ChannelContract], bool]
 
 
-def infeasibility(plant: LinearPlant, problem: DesignProblem, *, polytope: bool) -> Infeasible:
+def infeasibility(
+    plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool, reason: str = ""
+) -> Infeasible:
     """Returns the exception that names the binding condition and the fraction of the radii that is feasible.
 
     Args:
         plant: The plant.
-        problem: Its scaled design problem.
-        polytope: Whether a polytope alone would do, too.
-    """
-    fraction = min(_margin(problem, polytope=polytope), 1.0)
-    if fraction == 0.0:
-        return _unstabilized(plant)
-    binding = "U" if _margin(problem, polytope=polytope, input_limits=False) >= 1.0 else "I"
-    missing = "ellipsoid or polytope" if polytope else "ellipsoid"
-    what = (
-        "(U) no gain was found that keeps the input limits"
-        if binding == "U"
-        else f"(I) no invariant {missing} in the box was found"
-    )
-    return _with_share(what, binding, fraction)
-
-
-def infeasibility_around(plant: LinearPlant, contract: ChannelContract | None, reason: str) -> Infeasible:
-    """Returns what `infeasibility` does where limits have two ends, or leave a state free.
-
-    Args:
-        plant: The plant.
         contract: Channel contract, if there is one.
-        reason: Why a gain that bears the radii was given up.
+        polytope: Whether a polytope alone would do, too.
+        reason: Why the polytope of a gain that bears the radii was given up.
+
+    Raises:
+        Infeasible: If there is no design problem.
     """
-    tolerance = _tolerance_around(plant, contract)
+    if needs_resting_point(plant):
+        problem, tolerance = None, _tolerance_around(plant, contract)
+    else:
+        problem, _ = design_problem(plant, contract)
+        tolerance = _Tolerance(_margin(problem, polytope=polytope))
     if tolerance.margin == 0.0:
         return _unstabilized(plant)
-    if tolerance.margin >= 1.0:
+    if polytope and tolerance.margin >= 1.0:
         what = "(P) a gain bears disturbances and errors within the limits, but its polytope was not found"
         return Infeasible(f"{what}: {reason}", "P", 0.0)
-    k, m = len(plant.box), plant.m
-    is_input = [k <= j < k + m for j in tolerance.binding]
-    what = "(I) no invariant polytope within the limits was found"
-    if is_input and all(is_input):
-        what = "(U) no gain was found that keeps the input limits"
-    elif tolerance.binding:
-        what += f" (those that bind: {', '.join(_limit(plant, j) for j in tolerance.binding)})"
-    return _with_share(what, what[1], tolerance.margin)
+    k, m, binding = len(plant.box), plant.m, tolerance.binding
+    if problem is not None:
+        inputs_bind = _margin(problem, polytope=polytope, input_limits=False) >= 1.0
+        missing = "ellipsoid or polytope in the box" if polytope else "ellipsoid in the box"
+    else:
+        inputs_bind = len(binding) > 0 and all(k <= j < k + m for j in binding)
+        missing = "polytope within the limits"
+    named = f" (those that bind: {', '.join(_limit(plant, j) for j in binding)})" if binding else ""
+    what = (
+        "(U) no gain was found that keeps the input limits"
+        if inputs_bind
+        else f"(I) no invariant {missing} was found{named}"
+    )
+    return _with_share(what, what[1], min(tolerance.margin, 1.0))
 
 
 def _unstabilized(plant: LinearPlant) -> Infeasible:
@@ -143,8 +125,7 @@ def with_age_that_helps(
     plant: LinearPlant,
     contract: ChannelContract | None,
     certifies: Certifies,
-    clock: Clock,
-    progress: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda line: None,
     *,
     polytope: bool = True,
 ) -> Infeasible:
@@ -156,16 +137,14 @@ def with_age_that_helps(
         contract: The channel contract. No age is sought where none helps, nor for an unstable plant without a contract:
             the exception is then returned as it is.
         certifies: Whether the plant has a certificate under a contract.
-        clock: Ends the search.
         progress: Called with a line of text.
         polytope: Whether a polytope alone would do, too.
     """
     if not _may_be_helped(infeasible, plant, contract):
         return infeasible
-    progress("no certificate: searching for a max_age that has one")
     below = contract or ChannelContract(_OLDEST_NAMED + 1)
-    age = _largest_age(plant, below, certifies, clock, polytope=polytope)
-    text, details = f"{infeasible}{_limits_exceeded(plant)}", dict(infeasible.details)
+    age = _largest_age(plant, below, certifies, progress, polytope=polytope)
+    text, details = f"{infeasible}{_limits_exceeded(plant)}{_limits_out_of_reach(plant)}", dict(infeasible.details)
     if age is not None:
         details["max_age"] = age
         text += f"; there is a certificate for max_age = {age}"
@@ -175,10 +154,10 @@ def with_age_that_helps(
 
 
 def _may_be_helped(infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> bool:
-    """Returns whether less age may help."""
+    """Returns whether less age may help: not against too many rows of a polytope, where a gain bears all."""
     if infeasible.binding == "E1":
         return contract is not None and _has_error_sets(plant, replace(contract, max_age=0))
-    return infeasible.binding != "S" and infeasible.details.get(_SHARE) != 0.0
+    return infeasible.binding not in ("S", "P") and infeasible.details.get(_SHARE) != 0.0
 
 
 def _has_error_sets(plant: LinearPlant, contract: ChannelContract) -> bool:
@@ -190,25 +169,19 @@ def _has_error_sets(plant: LinearPlant, contract: ChannelContract) -> bool:
 
 
 def _largest_age(
-    plant: LinearPlant, contract: ChannelContract, certifies: Certifies, clock: Clock, *, polytope: bool
+    plant: LinearPlant, contract: ChannelContract, certifies: Certifies, progress: Progress, *, polytope: bool
 ) -> int | None:
-    """Returns a max_age below the contract's that has a certificate, by bisection; None for none in the time."""
+    """Returns a max_age below the contract's that has a certificate, by bisection; None if few are tried in vain."""
     low, high = -1, contract.max_age
-    try:
-        while high - low > 1:
-            clock.check()
-            middle = (low + high) // 2
-            if is_feasible(plant, replace(contract, max_age=middle), polytope=polytope):
-                low = middle
-            else:
-                high = middle
-        for age in sorted({low, low - 1, (3 * low) // 4, low // 2, 0}, reverse=True):
-            clock.check()
-            if 0 <= age <= low and certifies(replace(contract, max_age=age)):
-                return age
-    except TimeoutError:
-        pass
-    return None
+    while high - low > 1:
+        progress("search for a max_age that has a certificate")
+        middle = (low + high) // 2
+        if is_feasible(plant, replace(contract, max_age=middle), polytope=polytope):
+            low = middle
+        else:
+            high = middle
+    tried = [age for age in sorted({low, (3 * low) // 4, low // 2}, reverse=True) if age >= 0][:_MOST_AGES]
+    return next((age for age in tried if certifies(replace(contract, max_age=age))), None)
 
 
 def _limits_exceeded(plant: LinearPlant) -> str:
@@ -223,6 +196,19 @@ def _limits_exceeded(plant: LinearPlant) -> str:
         for what, shape in alone.items()
         for j, size in enumerate(np.ravel(shape.support(plant.box)).tolist())
         if size >= 1.0 and j in two_ends
+    )
+
+
+def _limits_out_of_reach(plant: LinearPlant) -> str:
+    """Returns which limits nothing comes near, and which mislead the search, as the rest of a sentence."""
+    alone = (np.count_nonzero(plant.box, axis=1) == 1) & ~is_row_of_past_input(plant)
+    out_of_reach = np.abs(plant.box) @ (FREE_REACH * plant.reach_from_rest) < 1.0
+    names = [row_limit(plant, j) for j in np.flatnonzero(alone & out_of_reach).tolist()]
+    if not names:
+        return ""
+    return (
+        f"; inputs and disturbances take no state to a hundredth of {', '.join(names)} in {plant.n} steps: leave out "
+        "limits that stand for none"
     )
 
 

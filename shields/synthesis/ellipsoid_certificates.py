@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from ncs_gym import LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from shields.certificate import Certificate
-from shields.certificate_text import size_of
-from shields.errors import Infeasible, SynthesisInterrupted
-from shields.synthesis.alternating_optimization import largest_set, with_best_gain
+from shields.errors import Infeasible
+from shields.synthesis.alternating_optimization import ALTERNATIONS, largest_set, tightened, with_best_gain
 from shields.synthesis.certificate_fields import certificate_of
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, SymmetricLimits, design_problem
-from shields.synthesis.diagnosis import infeasibility
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
-from shields.synthesis.polytope_gain import ellipsoid_margin
+from shields.synthesis.polytope_gain import ellipsoid_margin, polytope_margin
+from shields.synthesis.search import Search
 from shields.verification import Report, verify
 
-# Called with a line of text: the stage, and the volume reached so far.
-Progress = Callable[[str], object]
-# Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
+# Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly: the search takes
+# the first, and what it found is tightened by the others.
 SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
-# In the details of an `Infeasible`: a candidate was found that does not hold in exact arithmetic.
-LOST = "lost_in_exact_arithmetic"
 # What helps where float64 has too few digits.
 MORE_DIGITS = (
     "give states units in which the half-widths of the box are of similar size, and leave out rows of the box that are "
@@ -63,91 +60,95 @@ def certify(
     return certificate if verify(certificate, plant).valid else None
 
 
+class Ellipsoid(NamedTuple):
+    """What a search for the largest ellipsoid found.
+
+    Attributes:
+        problem: Its design problem.
+        certificate: The verified certificate; None if there is none.
+        K: The gain of the largest set, also of one that does not verify, shape (m, n); None where there is no set.
+        failure: Why there is no certificate; None where no set was found for no known reason.
+    """
+
+    problem: DesignProblem
+    certificate: Certificate | None
+    K: np.ndarray | None
+    failure: Infeasible | None
+
+
 def largest_ellipsoid(
-    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, tightened: tuple[np.ndarray, ...] = ()
-) -> Certificate:
-    """Returns the verified certificate of the largest set found.
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    search: Search,
+    start: Certificate | None = None,
+    alternations: int = ALTERNATIONS,
+    tightened_boxes: tuple[np.ndarray, ...] = (),
+) -> Ellipsoid:
+    """Returns the largest set that alternation finds, verified.
 
     Args:
         plant: The plant.
         contract: Channel contract, if there is one.
-        progress: Called with a line of text per stage.
-        tightened: The boxes that sets were sought in so far, rows (k, n), and one more; empty for the plant's own.
-    """
-    progress("error set")
-    problem, errors = design_problem(plant, contract, _within(plant, tightened))
-    failure, slack = None, 0.0
-    reached: tuple[str, CandidateDesign | None] = "start", None
-
-    def report(stage: str, design: CandidateDesign | None) -> None:
-        nonlocal reached
-        reached = stage, design or reached[1]
-        progress(progress_text(*reached))
-
-    try:
-        for slack in SLACKS:
-            found = largest_set(problem, slack, report)
-            if found is None:
-                break
-            design = with_best_gain(problem, found)
-            report("exact verification", design)
-            certificate = certificate_of(plant, problem, design, errors, slack)
-            box_rows = _tightened_box(certificate, plant, tightened)
-            if box_rows is not None:
-                return largest_ellipsoid(plant, contract, progress, (*tightened, box_rows))
-            verification = verify(certificate, plant)
-            if verification.valid:
-                return _with_tolerated_scale(certificate, problem)
-            failure = _failed_verification(verification)
-    except KeyboardInterrupt as interrupt:
-        stage, design = reached
-        best = design and certificate_of(plant, problem, with_best_gain(problem, design), errors, slack)
-        raise _interrupted(plant, stage, best) from interrupt
-    if tightened and not failure:  # there is a set in the plant's box
-        raise _leaves_between_samples(float(np.abs(tightened[-1]).max() / np.abs(plant.box_rows).max() - 1.0))
-    if not failure and (spread := float(plant.half_widths.max() / plant.half_widths.min())) > _WIDEST_SPREAD:
-        failure = Infeasible(
-            f"the plant is too ill-conditioned for this search, its half-widths differ by a factor of {spread:.0e}: "
-            f"{MORE_DIGITS}",
-            "I",
-            1.0,
-        )
-    raise failure or infeasibility(plant, problem, polytope=False)
-
-
-def nearby_ellipsoid(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    start: Certificate | None,
-    alternations: int,
-    progress: Progress,
-    tightened: tuple[np.ndarray, ...] = (),
-) -> Certificate | None:
-    """Returns what `nearby_certificate` searches, in the boxes of `largest_ellipsoid`.
+        search: Is told the stages, and holds the best candidate.
+        start: Certificate of a similar problem with as many states and inputs, which the search begins near.
+        alternations: Largest number of them.
+        tightened_boxes: The boxes that sets were sought in so far, rows (k, n), and one more; empty for the plant's
+            own.
 
     Raises:
-        Infeasible: If the plant has no error set, or the state leaves every box between two samples.
+        Infeasible: If the plant has no design problem (`design_problem`).
     """
-    problem, errors = design_problem(plant, contract, _within(plant, tightened))
+    search("error set")
+    problem, errors = design_problem(plant, contract, _within(plant, tightened_boxes))
     near = None
-
-    def report(stage: str, design: CandidateDesign | None) -> None:
-        progress(progress_text(stage, design))
-
     if start is not None and (shares := start.proofs[-1].shares) is not None:
         lx, le, ld = shares.tolist()
         near = _design_at(problem, start.L, start.K, (lx, le, ld))
+
+    def report(stage: str, design: CandidateDesign | None) -> None:
+        if design is not None:
+            finished = partial(with_best_gain, problem, design)
+            search.candidate = lambda: certificate_of(plant, problem, finished(), errors, SLACKS[0])
+        search(progress_text(stage, design))
+
+    found = largest_set(problem, SLACKS[0], report, near, alternations)
+    if found is None:
+        return Ellipsoid(problem, None, None, _known_reason(plant, tightened_boxes))
+    failure, K = None, None
     for slack in SLACKS:
-        found = largest_set(problem, slack, report, near, alternations)
-        if found is None:
-            return None
-        certificate = certificate_of(plant, problem, with_best_gain(problem, found), errors, slack)
-        box_rows = _tightened_box(certificate, plant, tightened)
+        design = found if slack == SLACKS[0] else tightened(problem, found, slack)
+        if design is None:
+            continue
+        report("exact verification", design)
+        certificate = certificate_of(plant, problem, with_best_gain(problem, design), errors, slack)
+        K = certificate.K if K is None else K
+        try:
+            box_rows = _tightened_box(certificate, plant, tightened_boxes)
+        except Infeasible as leaves:
+            return Ellipsoid(problem, None, K, leaves)
         if box_rows is not None:
-            return nearby_ellipsoid(plant, contract, start, alternations, progress, (*tightened, box_rows))
-        if verify(certificate, plant).valid:
-            return certificate
-    return None
+            boxes = (*tightened_boxes, box_rows)
+            return largest_ellipsoid(plant, contract, search, start, alternations, boxes)
+        verification = verify(certificate, plant)
+        if verification.valid:
+            return Ellipsoid(problem, certificate, K, None)
+        failure = failure or _failed_verification(verification)
+    return Ellipsoid(problem, None, K, failure)
+
+
+def with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
+    """Returns a certificate with a record of how much larger all radii could be for some set and gain.
+
+    It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
+    of all ages by one. Of a polytope alone it is what its own gain bears.
+    """
+    if certificate.keeps_ellipsoid:
+        gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
+        scale = 1.0 if gain is None else ellipsoid_margin(problem, gain)
+    else:
+        scale = polytope_margin(problem, problem.to_scaled(certificate.L, certificate.K)[1])
+    record = {"tolerated_scale": float(exact.rounded(max(scale, 1.0), 3))}
+    return replace(certificate, provenance=certificate.provenance | record)
 
 
 def _design_at(
@@ -160,13 +161,13 @@ def _design_at(
     return CandidateDesign(scaled_L, scaled_K, best, inputs, float(np.linalg.slogdet(scaled_L)[1]))
 
 
-def _within(plant: LinearPlant, tightened: tuple[np.ndarray, ...]) -> SymmetricLimits:
+def _within(plant: LinearPlant, tightened_boxes: tuple[np.ndarray, ...]) -> SymmetricLimits:
     """Returns the limits within which a set is sought: the last of the boxes so far, or the plant's own."""
-    return SymmetricLimits(tightened[-1] if tightened else plant.box_rows, plant.u_max)
+    return SymmetricLimits(tightened_boxes[-1] if tightened_boxes else plant.box_rows, plant.u_max)
 
 
 def _tightened_box(
-    certificate: Certificate, plant: LinearPlant, tightened: tuple[np.ndarray, ...]
+    certificate: Certificate, plant: LinearPlant, tightened_boxes: tuple[np.ndarray, ...]
 ) -> np.ndarray | None:
     """Returns rows of a smaller box, shape (k, n), if the set leaves the plant's between samples; None if it does not.
 
@@ -180,9 +181,11 @@ def _tightened_box(
     over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
     if over.max() <= 1.0 - 0.1 * _BETWEEN_MARGIN:
         return None
-    if len(tightened) == _MOST_BOXES or grid.high.min() <= 0.0:
+    if len(tightened_boxes) == _MOST_BOXES or grid.high.min() <= 0.0:
         raise _leaves_between_samples(float(over.max() - 1.0))
-    return (tightened[-1] if tightened else plant.box_rows) * np.maximum(over / (1.0 - _BETWEEN_MARGIN), 1.0)[:, None]
+    return (tightened_boxes[-1] if tightened_boxes else plant.box_rows) * np.maximum(
+        over / (1.0 - _BETWEEN_MARGIN), 1.0
+    )[:, None]
 
 
 def _leaves_between_samples(shortfall: float) -> Infeasible:
@@ -201,25 +204,20 @@ def progress_text(stage: str, design: CandidateDesign | None) -> str:
     return f"{stage}: {volume}"
 
 
-def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> SynthesisInterrupted:
-    """Returns the exception for an interrupted search, with the best certificate so far if it verifies."""
-    message = f"interrupted: the synthesis was at {stage}"
-    if best is None or not verify(best, plant).valid:
-        return SynthesisInterrupted(f"{message} and had no certificate yet")
-    size = size_of(best)
-    best = replace(best, provenance=best.provenance | {"interrupted_at": stage})
-    return SynthesisInterrupted(f"{message}, its best certificate has {size}", best)
-
-
-def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
-    """Returns the certificate with a record of how much larger all radii could be for some set and gain.
-
-    It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
-    of all ages by one.
-    """
-    gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-    scale = 1.0 if gain is None else max(ellipsoid_margin(problem, gain), 1.0)
-    return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
+def _known_reason(plant: LinearPlant, tightened_boxes: tuple[np.ndarray, ...]) -> Infeasible | None:
+    """Returns why no set was found, where that is known."""
+    if tightened_boxes:  # there is a set in the plant's box
+        widest = float(np.abs(tightened_boxes[-1]).max() / np.abs(plant.box_rows).max())
+        return _leaves_between_samples(widest - 1.0)
+    spread = float(plant.half_widths.max() / plant.half_widths.min())
+    if spread <= _WIDEST_SPREAD:
+        return None
+    return Infeasible(
+        f"the plant is too ill-conditioned for this search, its half-widths differ by a factor of {spread:.0e}: "
+        f"{MORE_DIGITS}",
+        "I",
+        1.0,
+    )
 
 
 def _failed_verification(report: Report) -> Infeasible:
@@ -229,5 +227,4 @@ def _failed_verification(report: Report) -> Infeasible:
         f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {MORE_DIGITS}",
         failed.name.split()[0].strip("():"),
         -failed.margin,
-        {LOST: -failed.margin},
     )

@@ -8,7 +8,7 @@ that is a row again. What a linear program shows to hold already is not added. A
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -83,12 +83,7 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
     return Faces(rows / half[:, None], low / half, high / half)
 
 
-def invariant_polytope(
-    feedback: Feedback,
-    plant: LinearPlant,
-    progress: Callable[[str], object],
-    margins: Sequence[float] = MARGINS,
-) -> Polytope:
+def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
     Where it would have too many rows, it is one that is nearly as large and has fewer.
@@ -97,18 +92,17 @@ def invariant_polytope(
         feedback: The fallback.
         plant: Its plant.
         progress: Called with a line of text now and then.
-        margins: Those of `MARGINS` that are tried, each where the one before makes too many rows.
 
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows, `MOST_FOLLOWED` of them followed; the message says why.
     """
     too_large: Infeasible | None = None
-    for margin in margins:
+    for margin in MARGINS:
         implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
         try:
             return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
         except Infeasible as infeasible:
-            if not is_too_large(infeasible):  # with a smaller margin it is a matter of rows
+            if not _is_too_large(infeasible):  # with a smaller margin it is a matter of rows
                 raise (too_large or infeasible) from None
             too_large = infeasible
             progress(f"polytope: {infeasible}")
@@ -116,7 +110,7 @@ def invariant_polytope(
     raise too_large
 
 
-def is_too_large(infeasible: Infeasible) -> bool:
+def _is_too_large(infeasible: Infeasible) -> bool:
     """Returns whether there may be a polytope, but not within the limits of rows."""
     return _TOO_LARGE in infeasible.details
 

@@ -13,26 +13,22 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.hard_bounds import inflated
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
-from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
+from shields.errors import CertificateError, Infeasible
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.certificate_fields import (
-    DIGITS,
     fields_of_problem,
+    gain_in_digits,
     proofs_of,
     provenance_of,
     shape_in_digits,
     volume_of,
 )
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, Rest, design_problem
-from shields.synthesis.diagnosis import Clock, infeasibility_around
-from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, SLACKS, Progress, progress_text
-from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
+from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, SLACKS, progress_text
 from shields.synthesis.invariant_polytope import (
-    MARGINS,
     Feedback,
     feedback_of,
     invariant_polytope,
-    is_too_large,
     points_of_box,
     share_in_polytope,
     share_of_last_input,
@@ -48,6 +44,7 @@ from shields.synthesis.resting_point import (
     improved,
     limits_around,
 )
+from shields.synthesis.search import Progress
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.verification import verify
 
@@ -55,6 +52,8 @@ from shields.verification import verify
 _INSIDE = 1.0 - 1e-9
 # Points of the box by which resting points are compared.
 _POINTS_OF_REST_LOG2 = 12
+# For so many gains a polytope is sought.
+_MOST_SOUGHT = 4
 # What an equilibrium lacks is computed with an error of at most this, relative to its terms.
 _OF_REST = 1e-14
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
@@ -71,23 +70,22 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
         certificate: A verified one.
         plant: Its plant.
         progress: Called with a line of text now and then.
-
-    Raises:
-        SynthesisInterrupted: A KeyboardInterrupt with the certificate as it was.
     """
     if not certificate.keeps_ellipsoid:
         return certificate
     try:
         polytope = invariant_polytope(feedback_of(certificate), plant, progress)
         return _verified_polytope(replace(certificate, polytope=polytope), plant, progress)
-    except Infeasible as none:
-        reason = str(none)
-    except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
-        reason = f"its numbers are out of reach of float64 ({error}): {MORE_DIGITS}"
-    except KeyboardInterrupt as interrupt:
-        message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
-        raise SynthesisInterrupted(message, certificate) from interrupt
+    except _NOT_CERTIFIED as failure:
+        reason = _reason_of(failure)
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
+
+
+def _reason_of(failure: Exception) -> str:
+    """Returns why there is no polytope; what a library says of numbers stands in parentheses."""
+    if isinstance(failure, Infeasible):
+        return str(failure)
+    return f"its numbers are out of reach of float64 ({failure}): {MORE_DIGITS}"
 
 
 def certify_polytope(
@@ -126,7 +124,6 @@ def _certified_polytope(
     contract: ChannelContract | None,
     progress: Progress,
     rest: Rest,
-    margins: Sequence[float] = MARGINS,
 ) -> Certificate:
     """Returns what `certify_polytope` does.
 
@@ -134,9 +131,9 @@ def _certified_polytope(
         Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
     """
     problem, errors = design_problem(plant, contract, limits_around(plant, rest))
-    K, proofs = exact.rounded(K, DIGITS, axis=1), proofs_of(errors)
+    K, proofs = gain_in_digits(K, plant), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
-    polytope = invariant_polytope(feedback, plant, progress, margins)
+    polytope = invariant_polytope(feedback, plant, progress)
     faces = polytope.F
     L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
     L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
@@ -147,66 +144,37 @@ def _certified_polytope(
     return _verified_polytope(certificate, plant, progress)
 
 
-def most_tolerant_polytope(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress = lambda line: None,
-) -> Certificate | None:
-    """Returns a verified certificate of a polytope for the gain that bears the largest radii; None if none is found.
-
-    Raises:
-        SynthesisInterrupted: A KeyboardInterrupt.
-    """
-    try:
-        problem, _ = design_problem(plant, contract)
-        start = max_margin_gain(problem, problem.covering_error_shape)
-        gain = start and most_tolerant_gain(problem, start)
-        if gain is None or gain.margin < SUFFICIENT_MARGIN:
-            return None
-        _, K = problem.to_physical(np.eye(plant.n), gain.K)
-        found = certify_polytope(plant, K, contract, progress)
-    except Infeasible:
-        return None
-    except KeyboardInterrupt as interrupt:
-        message = "interrupted while a polytope was sought, and had no certificate yet"
-        raise SynthesisInterrupted(message) from interrupt
-    record = {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
-    return found and replace(found, provenance=found.provenance | record)
-
-
 def around_resting_point(
     plant: LinearPlant,
     contract: ChannelContract | None,
     progress: Progress,
-    clock: Clock,
     fixed: Rest | None = None,
+    known: Sequence[np.ndarray] | None = None,
 ) -> Certificate:
-    """Returns a verified certificate of a polytope for limits that are not symmetric about the operating point.
+    """Returns a verified certificate of a polytope alone, around a resting point.
 
     The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
-    fixed one; where the share of the box is known, a better resting point then.
-    Once the clock has run out, no further gain is tried, but for one with the larger margin.
+    fixed one; where the share of the box is known, a better resting point then. One polytope is sought for each of the
+    `_MOST_SOUGHT` first gains.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract; None for none.
+        progress: Called with a line of text now and then.
+        fixed: The resting point; the one that suits each gain by default.
+        known: As in `fallbacks_around`.
 
     Raises:
-        Infeasible: If none is found.
+        Infeasible: If none is found; the message says why the first gain was given up.
     """
     progress("resting point")
-    tried = _different(fallbacks_around(plant, contract, progress, fixed))
     reasons: list[str] = []
-    for margin in MARGINS:  # a larger one for gains whose polytopes have too many rows, once no gain has a smaller one
-        larger = []
-        for each in tried:
-            try:
-                return _certified_polytope(plant, each.K, contract, progress, each.rest, (margin,))
-            except _NOT_CERTIFIED as failure:
-                reasons.append(str(failure))
-                if isinstance(failure, Infeasible) and is_too_large(failure):
-                    larger.append(each)
-            if clock.is_over:
-                break
-        tried = larger
-    reason = reasons[0] if reasons else "no gain was found"
-    raise Infeasible(reason, "P", 0.0) if fixed else infeasibility_around(plant, contract, reason)
+    for each in _different(fallbacks_around(plant, contract, progress, fixed, known), plant)[:_MOST_SOUGHT]:
+        try:
+            return _certified_polytope(plant, each.K, contract, progress, each.rest)
+        except _NOT_CERTIFIED as failure:
+            reasons.append(_reason_of(failure))
+    raise Infeasible(reasons[0] if reasons else "no gain was found", "P", 0.0)
 
 
 def fallbacks_around(
@@ -214,8 +182,7 @@ def fallbacks_around(
     contract: ChannelContract | None,
     progress: Progress,
     fixed: Rest | None = None,
-    *,
-    quick: bool = False,
+    known: Sequence[np.ndarray] | None = None,
 ) -> list[Feedback]:
     """Returns what may keep a polytope around a resting point: those that keep the most of the box first.
 
@@ -226,8 +193,7 @@ def fallbacks_around(
         contract: Channel contract; None for none.
         progress: Called with a line of text now and then.
         fixed: The resting point; the one that suits each gain by default.
-        quick: Whether to leave out the gain of the largest ellipsoid, which takes longest, and gains for which no
-            resting point leaves what they need.
+        known: Gains, shape (m, n), that are tried as well; by default that of the largest ellipsoid, which is sought.
 
     Raises:
         Infeasible: If the plant has no error set, or no resting point.
@@ -239,10 +205,8 @@ def fallbacks_around(
     def feedback(K: np.ndarray, at: Rest) -> Feedback:
         return Feedback(K, shapes, _disturbance_around(plant, at), at)
 
-    gains = gains_around(plant, problem, progress, quick=quick)
+    gains = [*(_ellipsoid_gain(problem, progress) if known is None else known), *_gains(plant, problem, progress)]
     suited = [(K, Farthest(rest, 1.0, np.empty(0, int)) if fixed else rest_for(K, plant, errors, rest)) for K in gains]
-    if quick:
-        suited = [(K, at) for K, at in suited if at.distance >= 1.0]
     tried = [feedback(K, at.rest) for K, at in sorted(suited, key=lambda pair: pair[1].distance < 1.0)]
     points = points_of_box(plant, _POINTS_OF_REST_LOG2)
     if points is None or not tried:
@@ -257,27 +221,24 @@ def fallbacks_around(
     return [feedback(K, rest), *tried]
 
 
-def _different(fallbacks: Sequence[Feedback]) -> list[Feedback]:
+def _different(fallbacks: Sequence[Feedback], plant: LinearPlant) -> list[Feedback]:
     """Returns fallbacks in their order, of those that are the same in a certificate's digits the first."""
-    keys = [(exact.rounded(each.K, DIGITS, axis=1).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
+    keys = [(gain_in_digits(each.K, plant).tobytes(), each.rest.state.tobytes()) for each in fallbacks]
     return [each for number, each in enumerate(fallbacks) if keys[number] not in keys[:number]]
 
 
-def gains_around(
-    plant: LinearPlant, problem: DesignProblem, progress: Progress, *, quick: bool = False
-) -> Iterator[np.ndarray]:
-    """Yields gains, shape (m, n), for symmetric limits around a point.
-
-    Those of the largest ellipsoid, which takes longest and is left out if `quick`, of the largest tolerated radii, and
-    of regulators.
-    """
+def _ellipsoid_gain(problem: DesignProblem, progress: Progress) -> list[np.ndarray]:
+    """Returns the gain of the largest ellipsoid, shape (m, n), for symmetric limits around a point, if there is one."""
 
     def report(stage: str, design: CandidateDesign | None) -> None:
         progress(progress_text(stage, design))
 
-    found = None if quick else largest_set(problem, SLACKS[0], report)
-    if found is not None:
-        yield problem.to_physical(found.L, with_best_gain(problem, found).K)[1]
+    found = largest_set(problem, SLACKS[0], report)
+    return [] if found is None else [problem.to_physical(found.L, with_best_gain(problem, found).K)[1]]
+
+
+def _gains(plant: LinearPlant, problem: DesignProblem, progress: Progress) -> Iterator[np.ndarray]:
+    """Yields gains, shape (m, n), of the largest tolerated radii within symmetric limits, and of regulators."""
     progress("gain that tolerates most")
     start = max_margin_gain(problem, problem.covering_error_shape)
     if start is not None:

@@ -16,8 +16,9 @@ from shields.synthesis.max_margin_gain import MaxMarginGain
 # Weights of the inputs, in units of their limits, against those of the states, in units of the box, in the
 # linear-quadratic regulators.
 _INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-# The search for the most tolerant gain tries at most so many gains per entry; fewer where it is asked often.
-_TRIES_PER_ENTRY, _FEW_TRIES_PER_ENTRY = 25, 8
+# The search for the most tolerant gain tries at most so many gains per entry, fewer where it is asked often, and so
+# many in all.
+_TRIES_PER_ENTRY, _FEW_TRIES_PER_ENTRY, _MOST_TRIES = 25, 8, 200
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
 # over no more steps than the second number.
 _LEFT_OVER, _MOST_STEPS = 1e-7, 4000
@@ -73,7 +74,8 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
         if -intermediate_result.fun >= enough:
             raise StopIteration
 
-    options = {"maxfev": (_TRIES_PER_ENTRY if enough == np.inf else _FEW_TRIES_PER_ENTRY) * start.K.size}
+    tries = (_TRIES_PER_ENTRY if enough == np.inf else _FEW_TRIES_PER_ENTRY) * start.K.size
+    options = {"maxfev": min(tries, _MOST_TRIES)}
     found = minimize(loss, start.K.ravel(), method="Nelder-Mead", callback=stop, options=options)
     return TolerantGain(found.x.reshape(start.K.shape), float(-found.fun))
 

@@ -10,6 +10,7 @@ from scipy.linalg import null_space
 from scipy.optimize import linprog
 
 from ncs_gym import LinearPlant, exact
+from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.validation import shown
 from shields.errors import Infeasible
@@ -52,7 +53,7 @@ def _limit_rows(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def needs_resting_point(plant: LinearPlant) -> bool:
     """Returns whether limits are not symmetric about the operating point, or leave a state free."""
-    return not plant.is_symmetric or bool(np.linalg.matrix_rank(plant.box) < plant.n)
+    return not plant.is_symmetric or exact.rank(plant.box) < plant.n
 
 
 class Farthest(NamedTuple):
@@ -121,7 +122,8 @@ def resting_at(plant: LinearPlant, state: np.ndarray) -> Rest:
         ValueError: If no input holds it, or it is not strictly within the limits.
     """
     missing = state - plant.A @ state
-    applied = plant.input_half * np.linalg.lstsq(plant.B * plant.input_half, missing)[0]
+    widths = plant.half_widths
+    applied = plant.input_half * np.linalg.lstsq(plant.B * plant.input_half / widths[:, None], missing / widths)[0]
     terms = np.abs(plant.A) @ np.abs(state) + np.abs(plant.B) @ np.abs(applied) + np.abs(state)
     left = plant.B @ applied - missing
     if not (np.abs(left) <= _HELD * terms).all():
@@ -159,7 +161,7 @@ def limits_around(plant: LinearPlant, rest: Rest) -> SymmetricLimits:
         raise Infeasible("the resting point is not strictly within the limits of states and inputs", "S", 1.0)
     k = len(plant.box)
     rows, u_max = plant.box / nearest[:k, None], plant.input_half * nearest[k : k + plant.m]
-    if np.linalg.matrix_rank(rows * plant.half_widths) < plant.n:
+    if exact.rank(plant.box) < plant.n:
         rows = np.concatenate([rows, _generous_rows(plant, rows, u_max)])
     return SymmetricLimits(rows, u_max)
 
@@ -170,7 +172,7 @@ def units_of_states(plant: LinearPlant, rest: Rest) -> np.ndarray:
     Raises:
         Infeasible: If the point is not strictly within the limits.
     """
-    if np.linalg.matrix_rank(plant.box * plant.half_widths) == plant.n:
+    if exact.rank(plant.box) == plant.n:
         return plant.half_widths
     rows = limits_around(plant, rest).box_rows
     return np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)))
@@ -184,8 +186,7 @@ def _generous_rows(plant: LinearPlant, rows: np.ndarray, u_max: np.ndarray) -> n
     free = np.flatnonzero(
         [not any(np.count_nonzero(row) == 1 and row[i] != 0.0 for row in rows) for i in range(plant.n)]
     )
-    weight = rows.T @ rows
-    K = lqr_gain(plant.A, plant.B, weight + 1e-9 * np.trace(weight) * np.eye(plant.n), np.diag(u_max**-2.0))
+    K = lqr_gain(plant.A, plant.B, weight_of(rows, plant.reach_from_rest), np.diag(u_max**-2.0))
     reach = plant.half_widths
     if K is not None:
         # Of the states from which the undisturbed regulator keeps all rows and inputs, over these steps.

@@ -29,7 +29,9 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
     Returns:
         One entry: `share_of_box` or `share_of_box_at_rest`, a number in (0, 1], or `share_of_box_unknown`, the reason.
     """
-    if not (np.isfinite(L).all() and np.linalg.eigvalsh(L)[0] > 0.0):
+    try:
+        np.linalg.cholesky(L)
+    except np.linalg.LinAlgError:
         return {"share_of_box_unknown": "the set is flat in float64"}
     if not plant.is_symmetric and (len(plant.box) != plant.n or not np.isfinite(plant.box_ends).all()):
         return {"share_of_box_unknown": "the volume of limits with two ends that are no box is not computed"}
@@ -52,9 +54,8 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
 def _share(C: np.ndarray, L: np.ndarray) -> float | None:
     """Returns the volume of E(L) in that of the box {|c_j x| <= 1}; None if that has too many corners."""
     n = len(L)
-    values, axes = np.linalg.eigh(L)
     # In coordinates in which E(L) is the unit ball, so that units do not matter.
-    volume = _volume(C @ (axes * np.sqrt(values)))
+    volume = _volume(C @ np.linalg.cholesky(L))
     return None if volume is None else math.pi ** (n / 2) / math.gamma(n / 2 + 1) / volume
 
 

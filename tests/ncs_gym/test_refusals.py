@@ -320,7 +320,7 @@ PLANTS = [
         LinearPlant,
         {
             "offset": [[1.0], [1.0, 2.0]],
-            "state_limits": [(20.0, 25.0), 25.0, ([1.0, 2.0], 30.0), (np.nan, 30.0), (-np.inf, np.inf), (25.0, 18.0)],
+            "state_limits": [(20.0, 25.0), 25.0, ([1.0, 2.0], 30.0), (np.nan, 30.0), (np.inf, -np.inf), (25.0, 18.0)],
             "input_limits": [(0.0, 9.0), (-np.inf, np.inf)],
             "operating_state": [[20.0, 1.0]],
             "operating_input": ["10"],
@@ -511,9 +511,9 @@ OTHER_ERRORS = [
     (partial(truck_trailer, wheels=18), TypeError),
     (partial(linear_model, np.add, dt=1.0), TypeError),
     (partial(LinearPlant, A=A, B=B, dt=0.1), TypeError),
-    (partial(LinearPlant, A=A, B=B, dt=0.1, u_max=1.0), TypeError),
+    (partial(LinearPlant, A=A, B=0.0 * B, dt=0.1, u_max=1.0), TypeError),  # nothing says how large the states get
+    (partial(LinearPlant, A=A, B=B, dt=0.1, u_max=1.0, boxs=1.0), TypeError),
     (partial(LinearPlant, A=A, B=B, dt=0.1, box=[1.0, 1.0], umax=1.0), TypeError),
-    (partial(LinearPlant.from_statespace, MODEL, dt=0.1, input_limits=(-2.0, 3.0), **QUIET), TypeError),
     (partial(exact.inverse, np.ones((2, 2))), ZeroDivisionError),
     (partial(certified_error_set, batch_reactor(), ChannelContract(200)), ErrorSetError),
     (partial(certified_error_set, batch_reactor(), ChannelContract(1000)), ErrorSetError),

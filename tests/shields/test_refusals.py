@@ -35,8 +35,8 @@ def kept(name="stable", safe_set="ellipsoid"):
     return certificate_of(*named(name), safe_set)
 
 
-def synthesized(box):
-    noise = {"gamma": 1e-4, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
+def synthesized(box, gamma=1e-4):
+    noise = {"gamma": gamma, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
     return synthesize(linear_plant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
 
 
@@ -84,7 +84,12 @@ REFUSED = [
     (
         lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]),
         Infeasible,
-        r"the safe box is flat, \de\+\d+ times longer in one direction .*: add rows to box that limit the long one",
+        r"the safe box is flat, \de\+\d+ times longer in one direction .*: add a limit of x1 or x2, along which it is",
+    ),
+    (
+        lambda: synthesized([1.0, 1e5], gamma=4.0),
+        Infeasible,
+        r"take no state to a hundredth of \|x2\| <= 1e\+05 in 2 steps: leave out limits that stand for none",
     ),
     (
         lambda: synthesized([1.0, 1e7]),

@@ -14,6 +14,7 @@ import gymnasium as gym
 import pytest
 
 from agents.hyperparams import complete_hyperparams
+from experiments.settings import SynthesizeSettings
 from ncs_gym import truck_trailer
 from shields import Certificate
 from tests.command import assert_one_sentence, environment, ncs, succeeded, without_pictures
@@ -156,6 +157,15 @@ def test_plant_of_a_file_is_certified(tmp_path):
     checked = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
     assert checked.stdout.endswith("\ncertificate.json verifies\n")
     assert json.loads((tmp_path / "v.json").read_text())["env"] == "plant.json"
+
+
+def test_synthesis_ends_after_a_minute_unless_another_limit_is_given(tmp_path):
+    random_plant(3, 3, 2).save(tmp_path / "plant.json")
+    over = ncs("synthesize", "--plant", "plant.json", "--time-limit", 1e-9, cwd=tmp_path)
+    assert over.returncode == 2
+    assert over.stderr.splitlines()[-1].startswith("ncs: the time_limit of 1e-09 s was over at error set, before ")
+    succeeded("synthesize", "--plant", "plant.json", "--time-limit", "None", cwd=tmp_path)
+    assert SynthesizeSettings().time_limit == 60.0
 
 
 def test_plant_of_a_file_under_a_contract(tmp_path):

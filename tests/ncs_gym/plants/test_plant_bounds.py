@@ -188,3 +188,33 @@ def test_first_error_along_an_oblique_line_is_held_in_rational_arithmetic():
         assert is_positive_semidefinite(
             subtract(rational(bound.shape_matrix), congruence(line, rational(np.ones((1, 1)))))
         )
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        np.array([[0.1, 0.3], [0.3, 0.9]], np.float32),  # a perfect correlation, rounded
+        [[1.0, 0.5], [0.5 * (1.0 + 1e-9), 1.0]],
+    ],
+)
+def test_covariance_may_lack_the_rounding_of_its_own_type(given):
+    kept = plain(process_noise_cov=given).process_noise_cov
+    assert np.array_equal(kept, kept.T)
+    np.testing.assert_allclose(kept, given, rtol=2e-6)
+    assert is_positive_semidefinite(rational(kept))
+    asked = np.asarray(given, np.float64)
+    assert (np.diag(kept) >= np.diag(asked)).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([[1e-12, 2e-9], [2.1e-9, 1.0]], "symmetric"),
+        ([[1e-12, 2e-6], [2e-6, 1.0]], "positive semidefinite"),
+        ([[1e-12, 1e-6, 0.0], [1e-6, 1.0, 0.1], [0.0, 0.1, 1.0]], "positive semidefinite"),
+        ([[0.0, 1e-9], [1e-9, 1.0]], "positive semidefinite"),
+    ],
+)
+def test_more_than_rounding_of_a_covariance_is_seen_in_whatever_units(given, message):
+    with pytest.raises(ValueError, match=message):
+        plain(A=0.5 * np.eye(len(given)), B=np.ones((len(given), 1)), box=1.0, process_noise_cov=given)

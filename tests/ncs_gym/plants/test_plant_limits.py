@@ -1,8 +1,11 @@
 """The safe box, and limits around an operating point."""
 
+import warnings
+
 import numpy as np
 import pytest
 
+from ncs_gym import ChosenLimitsWarning
 from tests.product import altered, family_of, linear_plant
 
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
@@ -32,7 +35,7 @@ def test_rows_stay_what_they_are_when_a_plant_is_replaced():
 def test_empty_lists_of_limits_are_none():
     plain, empty = linear_plant(**MODEL, box=1.0), linear_plant(**MODEL, box=1.0, output_limits=[], mixed_limits=[])
     assert plain.fingerprint == empty.fingerprint
-    with pytest.raises(TypeError, match="LinearPlant needs limits"):
+    with pytest.warns(ChosenLimitsWarning, match="no state has a limit"):
         linear_plant(**MODEL, output_limits=[])
 
 
@@ -161,3 +164,51 @@ def test_own_limits_are_the_closest_of_each_state_alone():
     limits = [(row, low, high) for row, low, high in zip(rows, (-1, -4, -1, -np.inf), (5, 6, 1, 2), strict=True)]
     plant = linear_plant(A=0.5 * np.eye(3), B=np.ones((3, 1)), u_max=1.0, dt=0.1, output_limits=limits, **QUIET)
     np.testing.assert_allclose(plant.own_limits, [[-1.0, -np.inf, -np.inf], [2.0, np.inf, 0.5]])
+
+
+def test_half_widths_are_chosen_where_inputs_alone_are_limited():
+    """What |u| <= 2 moves from rest in two steps is .4 and .2; a hundred times that is far beyond what counts."""
+    model = {"A": [[1.0, 1.0], [0.0, 1.0]], "B": [[0.1], [0.05]], "dt": 0.1} | dict.fromkeys(QUIET, 0.0)
+    with pytest.warns(ChosenLimitsWarning, match=r"half-widths \[50.0, 20.0\] were chosen"):
+        plant = linear_plant(**model, u_max=2.0)
+    np.testing.assert_allclose(plant.box_rows, np.diag([1.0 / 50.0, 1.0 / 20.0]))
+    with pytest.warns(ChosenLimitsWarning):
+        same = linear_plant(**model, u_max=2.0, state_limits=(-np.inf, [np.inf, np.inf]))
+    assert same.fingerprint == plant.fingerprint
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert altered(plant, dt=0.2).fingerprint != plant.fingerprint
+
+
+def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_it():
+    """Not that of the limits of others: in micrometers the same state is a million times as large."""
+    settings = {"dt": 0.1, "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    A, B = np.array([[0.9, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
+    in_meters = linear_plant(A=A, B=B, box=[1.0, np.inf], **settings)
+    units = np.array([1.0, 1e6])
+    in_micrometers = linear_plant(A=A * units[:, None] / units, B=B * units[:, None], box=[1.0, np.inf], **settings)
+    np.testing.assert_allclose(in_micrometers.half_widths, in_meters.half_widths * units, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"input_limits": (0.0, 5.0), "operating_input": [0.0]}, "entry 1 rests at its end"),
+        ({"input_limits": (0.0, 5.0)}, "give operating_input="),
+        ({"input_limits": (-1.0, 5.0), "operating_state": [0.0], "state_limits": (0.0, 1.0)}, "entry 1 rests at its"),
+    ],
+)
+def test_input_that_rests_at_its_end_is_told_from_one_that_nobody_gave(limits, message):
+    model = {"A": [[0.9]], "B": [[0.1]], "dt": 1.0, "sensor_bound": 0.0, "initial_bound": 0.0, "disturbance_bound": 0.0}
+    with pytest.raises(ValueError, match=message) as refused:
+        linear_plant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
+    assert ("give operating" in str(refused.value)) == ("give operating" in message)
+
+
+def test_disturbance_may_act_in_some_directions_alone():
+    model = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "box": 1.0, "u_max": 1.0}
+    some = linear_plant(
+        **model, disturbance_bound=(np.eye(2), [-0.0, -0.1], [0.0, 0.1]), sensor_bound=0.0, initial_bound=0.0
+    )
+    own = linear_plant(**model, disturbance_bound=[0.0, 0.1], sensor_bound=0.0, initial_bound=0.0)
+    assert some.fingerprint == own.fingerprint

@@ -296,3 +296,27 @@ def test_operating_point_that_does_not_stay_is_told():
         warnings.simplefilter("error", NoEquilibriumWarning)
         moved = linear_model(lambda x, u: tank(x, u + 0.5), [0.5], [0.6], 0.1, samples=500, **settings)
     assert moved.remainder.bound.shape_matrix.item() < model.remainder.bound.shape_matrix.item()
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"mixed_limits": [([0.0, 0.0], [1.0, 1.0], -1.0, 1.0)]},
+        {"output_limits": [([4.0, 1.0], -1.0, 1.0)], "state_limits": ([-1.0, -1.0], [1.0, 1.0])},
+    ],
+)
+def test_remainder_is_not_sampled_where_limits_of_several_entries_forbid(limits):
+    """Beyond them this process does what no linear model bears."""
+
+    def bursting(state, u):
+        beyond = max(abs(u[0] + u[1]) - 1.0, 0.0) if "mixed_limits" in limits else abs(state @ [4.0, 1.0]) - 1.0
+        return 0.5 * state + 0.1 * u[0] + (50.0 if beyond > 1e-9 else 0.0)
+
+    settings = {"box": None if "state_limits" in limits else [1.0, 1.0], "samples": 2_000} | QUIET | limits
+    plant = linear_model(bursting, u_max=[1.0, 1.0], dt=STEP, **settings)
+    assert plant.remainder.bound.support(np.eye(2)).max() < 1e-6
+    if "mixed_limits" in limits:
+        fewer = {"mixed_rows": None, "mixed_ends": None}
+        with pytest.raises(ValueError, match="another mixed_limits"):
+            altered(plant, **fewer)
+        assert altered(plant, mixed_limits=[([0.0, 0.0], [1.0, -1.0], -0.5, 0.5)]).remainder is plant.remainder

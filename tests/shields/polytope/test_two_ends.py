@@ -422,3 +422,13 @@ def test_other_half_widths_of_a_plant_with_two_ends_are_symmetric():
     assert (altered(plant, box=[1.0]).box_low, altered(plant, box=[1.0]).box_high) == (-1.0, 1.0)
     aside = altered(plant, box=[1.0], box_ends=[[-0.5], [1.5]])  # given together
     assert (aside.box_low, aside.box_high) == (-0.5, 1.5)
+
+
+def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monkeypatch):
+    def failing(*arguments):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    monkeypatch.setattr("shields.synthesis.polytope_certificates._certified_polytope", failing)
+    said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
+    with pytest.raises(Infeasible, match=said):
+        synthesize(ANGLE, contract=CONTRACT)

@@ -10,7 +10,6 @@ import pytest
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Infeasible
-from shields.synthesis.certification import LONGEST_REFUSAL
 from tests.product import sampled_plant, synthesize
 from tests.verdicts import verified
 
@@ -20,6 +19,8 @@ CALLS = json.loads((Path(__file__).parents[2] / "data" / "first_calls.json").rea
 # Which are refused, and why.
 REFUSED = {"zone_22": r"those that bind: 20 <= air <= 24 .*radii shrink to"}
 QUICK = ("cstr_mathworks", "buck_geyer")
+# A first call takes so long at most [s of the processor].
+LONGEST = 60.0
 
 
 def plant_of_call(name: str) -> LinearPlant:
@@ -37,7 +38,7 @@ def test_first_call_is_accepted_or_refused_with_what_helps(name):
             synthesize(plant, contract=contract)
     else:
         found = synthesize(plant, contract=contract)
-    assert time.thread_time() - began < LONGEST_REFUSAL
+    assert time.thread_time() - began < LONGEST
     if name not in REFUSED:
         assert verified(found, plant).valid
 

@@ -1,0 +1,108 @@
+"""The search ends by counted work, whatever the processor, or by its user's time limit with the best so far."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract
+from shields import Infeasible, verify
+from shields.synthesis import ellipsoid_certificates, invariant_polytope, search
+from tests.certificates import feasible_age_not_sought
+from tests.product import linear_plant, synthesize
+from tests.verdicts import verified
+
+# A plant that is refused under its contract, and certified for less age.
+AGED = linear_plant(
+    A=[[2.0, 0.1], [0.1, 1.0]], B=[[0.0], [0.1]], dt=0.1, box=[0.3, 1.0], u_max=5.0, disturbance_bound=1e-5,
+    sensor_bound=1e-3, initial_bound=(np.eye(2), [1e-3, 1e-3]),
+)  # fmt: skip
+
+
+class Processor:
+    """Its time goes on by some seconds whenever somebody asks for it."""
+
+    def __init__(self, step):
+        self.now, self.step = 0.0, step
+
+    def __call__(self):
+        self.now += self.step
+        return self.now
+
+
+def test_set_that_fails_the_exact_check_is_tightened_and_not_sought_again(loaded, monkeypatch):
+    def strict(certificate, plant):
+        slack = certificate.provenance["slack"]
+        return verify(certificate if slack >= 1e-4 else replace(certificate, K=100.0 * certificate.K), plant)
+
+    monkeypatch.setattr(ellipsoid_certificates, "verify", strict)
+    lines = []
+    found = synthesize(loaded, safe_set="ellipsoid", progress=lines.append)
+    assert found.provenance["slack"] == 1e-4
+    assert sum(line.startswith("initial design 1 of") for line in lines) == 1
+    assert sum(line.startswith("exact verification") for line in lines) == 3
+    assert verified(found, loaded).valid
+
+
+def test_alternations_that_gain_less_than_a_percent_are_the_last_with_their_step():
+    env, lines = gym.make("ncs_gym/LaneKeeping-v0").unwrapped, []
+    synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid", progress=lines.append)
+    volumes = [float(line.split()[6]) for line in lines if line.startswith("alternation")]
+    small = [after < 1.0101 * before for before, after in pairwise(volumes)]
+    assert sum(small) <= 3
+    assert small[-1]
+
+
+def test_few_gains_whose_polytopes_have_too_many_rows_end_the_search(monkeypatch):
+    plant = linear_plant(
+        A=[[0.9, 0.3], [-0.3, 0.9]], B=[[0.0], [0.1]], dt=0.1, state_limits=([-0.9, -0.8], [1.1, 1.2]), u_max=1.0,
+        disturbance_bound=1e-3, sensor_bound=1e-3, initial_bound=1e-3,
+    )  # fmt: skip
+    assert len(synthesize(plant, contract=ChannelContract(1)).polytope.rows) > 3
+    monkeypatch.setattr(invariant_polytope, "MOST_ROWS", 3)
+    lines = []
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match="more than 3 rows"):
+        synthesize(plant, contract=ChannelContract(1), progress=lines.append)
+    assert sum("more than 3 rows" in line for line in lines) == 4 * len(invariant_polytope.MARGINS)
+
+
+def test_without_a_time_limit_a_slow_processor_says_the_same(monkeypatch):
+    monkeypatch.setattr(search.time, "thread_time", Processor(1e6))
+    with pytest.raises(Infeasible, match="there is a certificate for max_age"):
+        synthesize(AGED, contract=ChannelContract(400))
+
+
+def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(loaded, monkeypatch):
+    monkeypatch.setattr(search.time, "thread_time", Processor(1.0))
+    certificate = synthesize(loaded, time_limit=3.0)
+    assert verified(certificate, loaded).valid
+    told = "the synthesis was stopped at initial design 2 of 14, when the time_limit of 3 s was over: other sets may be"
+    assert told in " ".join(str(certificate).split())
+
+
+def test_time_that_ends_before_anything_is_found_is_named(loaded):
+    with pytest.raises(Infeasible, match="the time_limit of 1e-09 s was over at error set, before a cert") as caught:
+        synthesize(loaded, time_limit=1e-9)
+    assert caught.value.binding == "T"
+
+
+def test_refusal_that_is_known_when_the_time_is_over_is_said(monkeypatch):
+    processor = Processor(0.0)
+    monkeypatch.setattr(search.time, "thread_time", processor)
+
+    def progress(line):
+        processor.now = 10.0 * line.startswith("search for a max_age")
+
+    with pytest.raises(Infeasible, match=r"promise less age.* \(the time_limit of 5 s was over at search") as caught:
+        synthesize(AGED, contract=ChannelContract(400), time_limit=5.0, progress=progress)
+    assert caught.value.binding == "E1"
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, "long"])
+def test_time_limit_that_is_none_is_refused(loaded, limit):
+    with pytest.raises(ValueError, match="time_limit must be"):
+        synthesize(loaded, time_limit=limit)
