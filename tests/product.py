@@ -1,24 +1,20 @@
 """The one door through which tests make plants, loops, shields and certificates of the product.
 
-Where a constructor changes, this file translates; what tests say of plants and loops stays as it is written.
-`tests/test_product.py` finds the calls that go past it.
+Where a constructor changes, this file translates; `tests/test_product.py` finds the calls that go past it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 
 import ncs_gym
 import shields
-from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
-from shields import Certificate, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
-
-if TYPE_CHECKING:
-    from shields.paper import PaperCertificate
+from ncs_gym import LinearPlant
+from shields import Certificate
 
 
 def linear_plant(**described: Any) -> LinearPlant:
@@ -61,14 +57,14 @@ def rate_limited(plant: LinearPlant, largest: Any, **settings: Any) -> LinearPla
     return plant.with_rate_limits(largest, **settings)
 
 
-def loop_env(plant: LinearPlant, *channel: Any, **settings: Any) -> NCSEnv:
+def loop_env(plant: LinearPlant, *channel: Any, **settings: Any) -> ncs_gym.NCSEnv:
     """The environment of one loop."""
-    return NCSEnv(plant, *channel, **settings)
+    return ncs_gym.NCSEnv(plant, *channel, **settings)
 
 
-def vector_env(num_envs: int = 1, **settings: Any) -> NCSVectorEnv:
+def vector_env(num_envs: int = 1, **settings: Any) -> ncs_gym.NCSVectorEnv:
     """The environment of several loops."""
-    return NCSVectorEnv(num_envs, **settings)
+    return ncs_gym.NCSVectorEnv(num_envs, **settings)
 
 
 def gym_env(**settings: Any) -> gym.Env:
@@ -81,24 +77,24 @@ def gym_vector_env(num_envs: int, **settings: Any) -> gym.vector.VectorEnv:
     return gym.make_vec("ncs_gym/LinearNCS-v0", num_envs, **settings)
 
 
-def safety_shield(env: gym.Env, *certificate: Any, **settings: Any) -> SafetyShield:
+def safety_shield(env: gym.Env, *certificate: Any, **settings: Any) -> shields.SafetyShield:
     """The environment behind a shield."""
-    return SafetyShield(env, *certificate, **settings)
+    return shields.SafetyShield(env, *certificate, **settings)
 
 
-def vector_safety_shield(env: gym.vector.VectorEnv, *certificate: Any, **settings: Any) -> VectorSafetyShield:
+def vector_shield(env: gym.vector.VectorEnv, *certificate: Any, **settings: Any) -> shields.VectorSafetyShield:
     """The vector environment behind a shield."""
-    return VectorSafetyShield(env, *certificate, **settings)
+    return shields.VectorSafetyShield(env, *certificate, **settings)
 
 
-def safety_filter(certificate: Certificate, plant: LinearPlant, *mode: Any, **settings: Any) -> SafetyFilter:
+def safety_filter(certificate: Certificate, plant: LinearPlant, *mode: Any, **settings: Any) -> shields.SafetyFilter:
     """The filter that decides on inputs."""
-    return SafetyFilter(certificate, plant, *mode, **settings)
+    return shields.SafetyFilter(certificate, plant, *mode, **settings)
 
 
-def safe_loop(certificate: Certificate, plant: LinearPlant, *channel: Any, **settings: Any) -> SafeLoop:
+def safe_loop(certificate: Certificate, plant: LinearPlant, *channel: Any, **settings: Any) -> shields.SafeLoop:
     """The controller's side of a loop, whose plant is elsewhere."""
-    return SafeLoop(certificate, plant, *channel, **settings)
+    return shields.SafeLoop(certificate, plant, *channel, **settings)
 
 
 def synthesize(plant: LinearPlant, **settings: Any) -> Certificate:
@@ -106,6 +102,6 @@ def synthesize(plant: LinearPlant, **settings: Any) -> Certificate:
     return shields.synthesize(plant, **settings)
 
 
-def paper_synthesis(plant: LinearPlant, **settings: Any) -> PaperCertificate:
+def paper_synthesis(plant: LinearPlant, **settings: Any) -> Any:
     """A certificate of the published method that is made here."""
     return shields.paper.synthesize(plant, **settings)

@@ -13,7 +13,7 @@ import numpy as np
 from agents.loop import LoopConfig
 from agents.training import train
 from ncs_gym import Channel, ChannelContract, GilbertElliott
-from tests.product import linear_plant, safety_shield, synthesize, vector_safety_shield
+from tests.product import linear_plant, safety_shield, synthesize, vector_shield
 
 CHANNEL = Channel(
     GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4), quantization_step=0.05, send_period=2, delay=1, jitter=2
@@ -64,7 +64,7 @@ def vector_runs(seed: int, steps: int) -> dict[str, str]:
         changes = {"channel": CHANNEL} if name != "CartPole-v0" else {}
         env = gym.make_vec(f"ncs_gym/{name}", num_envs=8, max_episode_steps=20, **changes)
         runs[f"{name} many"] = stepped(env, seed, steps, (8, 1))
-    env = vector_safety_shield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
+    env = vector_shield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
     return runs | {"shields": stepped(env, seed, steps, (8, 1))}
 
 

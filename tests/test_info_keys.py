@@ -31,7 +31,7 @@ from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.ncs_gym.networked.environments import Counter
-from tests.product import family_of, linear_plant, loop_env, safety_shield, vector_safety_shield
+from tests.product import family_of, linear_plant, loop_env, safety_shield, vector_shield
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "ncs_gym.md").read_text()
 ENVIRONMENTS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0")
@@ -93,7 +93,7 @@ def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env_id, certificate = loop
     env, envs = gym.make(env_id), gym.make_vec(env_id, num_envs=NUMBER)
     if mode is not None:
-        env, envs = safety_shield(env, certificate, mode), vector_safety_shield(envs, certificate, mode)
+        env, envs = safety_shield(env, certificate, mode), vector_shield(envs, certificate, mode)
     expected = kinds(mode)
     for info in infos(env, 4):
         assert set(info) == set(expected)
@@ -119,7 +119,7 @@ def test_page_names_what_the_end_of_an_episode_adds():
 
 def test_actions_of_infos_are_those_that_stand_for_the_inputs(loop):
     env_id, certificate = loop
-    env, envs = safety_shield(gym.make(env_id), certificate), vector_safety_shield(gym.make_vec(env_id, 3), certificate)
+    env, envs = safety_shield(gym.make(env_id), certificate), vector_shield(gym.make_vec(env_id, 3), certificate)
     plant, reported = env.unwrapped.plant, [*infos(env, 60, share=1.0), *infos(envs, 60, share=1.0)]
     low, high = plant.input_ends
     for info in reported:
@@ -232,7 +232,7 @@ def test_nobody_changes_a_shield_by_writing_into_what_it_told(loop, mode):
     assert_tells_what_is_the_listeners_own(lambda: safety_shield(gym.make(env_id), certificate, mode))
 
     def many(reset):
-        return vector_safety_shield(gym.make_vec(env_id, autoreset_mode=reset, **FEW), certificate, mode)
+        return vector_shield(gym.make_vec(env_id, autoreset_mode=reset, **FEW), certificate, mode)
 
     for reset in VECTORS:
         assert_tells_what_is_the_listeners_own(lambda reset=reset: many(reset))

@@ -8,8 +8,7 @@ from gymnasium.envs.registration import WrapperSpec
 from gymnasium.wrappers import vector
 from stable_baselines3.common.env_util import make_vec_env
 
-from shields import SafetyShield
-from tests.product import safety_shield, vector_safety_shield
+from tests.product import safety_shield, vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 # Steps of an episode, and of runs that need not end.
@@ -100,7 +99,7 @@ def test_vector_recorder_adds_up_what_the_vector_environment_pays(mode, shielded
     count, limit = 3, 20
     env = gym.make_vec(CRUISE, num_envs=count, max_episode_steps=limit, autoreset_mode=mode)
     if shielded:
-        env = vector_safety_shield(env, certificate, penalty=0.5)
+        env = vector_shield(env, certificate, penalty=0.5)
     env = vector.RecordEpisodeStatistics(env)
     _, rewards, infos = play(env, 45, count, 1)
     first = infos[limit]
@@ -124,8 +123,8 @@ def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, orde
         if order == "bare":
             return wrap(env)
         if order == "outside":
-            return wrap(vector_safety_shield(env, certificate, penalty=0.5))
-        return vector_safety_shield(wrap(env), certificate, penalty=0.5)
+            return wrap(vector_shield(env, certificate, penalty=0.5))
+        return vector_shield(wrap(env), certificate, penalty=0.5)
 
     plain, wrapped = play(make(lambda env: env), 45, count, 1), play(make(VECTOR[name]), 45, count, 1)
     np.testing.assert_array_equal(plain[1], wrapped[1])
@@ -137,7 +136,7 @@ def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, orde
 
 def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificate):
     env = gym.make_vec(CRUISE, num_envs=3, autoreset_mode="Disabled")
-    env = vector.RecordEpisodeStatistics(vector_safety_shield(env, certificate))
+    env = vector.RecordEpisodeStatistics(vector_shield(env, certificate))
     env.reset(seed=0)
     for action in actions(5, 3, 1):
         env.step(action)
@@ -148,7 +147,7 @@ def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificat
 
 def wrapped_outside_monitor(keywords, **settings):
     return make_vec_env(
-        CRUISE, seed=0, wrapper_class=SafetyShield, wrapper_kwargs=settings, monitor_kwargs={"info_keywords": keywords}
+        CRUISE, seed=0, wrapper_class=safety_shield, wrapper_kwargs=settings, monitor_kwargs={"info_keywords": keywords}
     )
 
 

@@ -9,7 +9,7 @@ from benchmarks import published as script
 from experiments.commands.attack import attacked, worst_case
 from ncs_gym import certified_error_set
 from tests.certificates import certificate_of
-from tests.product import altered, linear_plant, vector_env, vector_safety_shield
+from tests.product import altered, linear_plant, vector_env, vector_shield
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
 
 
@@ -21,7 +21,7 @@ def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
 
     def counts_of(mode):
         settings = {"plant": plant, "contract": CONTRACT, "channel": CHANNEL} | worst_case(certificate)
-        shield = vector_safety_shield(vector_env(100, **settings), certificate, mode, on_unproved="ignore")
+        shield = vector_shield(vector_env(100, **settings), certificate, mode, on_unproved="ignore")
         return sum(attacked(shield, np.random.default_rng(0)), Counter())
 
     counts = counts_of("project")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ncs_gym import Channel
 from tests.fuzz import NOTHING_USABLE, examples
-from tests.product import loop_env, safety_shield, vector_env, vector_safety_shield
+from tests.product import loop_env, safety_shield, vector_env, vector_shield
 
 # Inside a safe set, and outside of any.
 CHANNEL = Channel(0.3, quantization_step=0.05, send_period=2, delay=1, jitter=1)
@@ -66,7 +66,7 @@ def pair(kind, certificate, loaded):
     if kind == "shield":
         return [safety_shield(loop_env(**settings), certificate) for _ in range(2)], None
     many = [vector_env(2, max_episode_steps=6, **settings) for _ in range(2)]
-    return [vector_safety_shield(env, certificate) for env in many] if kind == "vector shield" else many, 2
+    return [vector_shield(env, certificate) for env in many] if kind == "vector shield" else many, 2
 
 
 @pytest.mark.parametrize("kind", ["scalar", "vector", "shield", "vector shield"])

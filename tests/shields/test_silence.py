@@ -19,7 +19,7 @@ from shields.synthesis.faces import Extremes, Faces
 from shields.synthesis.polytope_certificates import certify_polytope
 from tests.certificates import certificate_of
 from tests.plants import named, small
-from tests.product import altered, linear_plant, sampled_plant, vector_env, vector_safety_shield
+from tests.product import altered, linear_plant, sampled_plant, vector_env, vector_shield
 
 CASES = ("CartPole", "CSTR", "Convoy", "Pendulum", "drifts", "open")
 HEARD, SILENT = 24, 80
@@ -141,7 +141,7 @@ def test_box_is_kept_in_silence_under_the_worst_disturbances(name):
     env = gym.make_vec(
         f"ncs_gym/{name}-v0", 64, channel=channel, disturbance="adversarial", terminate_on_violation=False
     )
-    shield = vector_safety_shield(env, certificate, mode="switch", on_unproved="ignore")
+    shield = vector_shield(env, certificate, mode="switch", on_unproved="ignore")
     rng = np.random.default_rng(0)
     directions = rng.standard_normal((64, plant.n))
     starts = 0.45 * directions / certificate.polytope.gauge(directions)[:, None]
@@ -191,7 +191,7 @@ def test_box_is_kept_in_silence_whatever_an_agent_does():
     env = vector_env(
         64, plant=plant, channel=TraceChannel(trace=tuple(trace)), contract=certificate.contract, **settings
     )
-    shield, rng = vector_safety_shield(env, certificate, on_unproved="ignore"), np.random.default_rng(0)
+    shield, rng = vector_shield(env, certificate, on_unproved="ignore"), np.random.default_rng(0)
     shield.reset(seed=0)
     pushed, ages, outside = rng.choice([-1.0, 1.0], (64, 1)).astype(np.float32), [], []
     for _ in range(len(trace) - 1):

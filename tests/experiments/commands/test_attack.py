@@ -13,7 +13,7 @@ from ncs_gym.registration import needing_extras
 from shields import VectorSafetyShield, certificate_for
 from tests.certificates import certificate_of
 from tests.command import ncs, succeeded
-from tests.product import linear_plant, vector_env, vector_safety_shield
+from tests.product import linear_plant, vector_env, vector_shield
 
 CRUISE, CART, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
 
@@ -23,7 +23,7 @@ def shield_of(env_id, count, mode="project", **changed):
     env = ncs_env(gym.make(env_id))
     certificate = certificate_for(env.plant, env.certificate_contract)
     vector = gym.make_vec(env_id, num_envs=count, **(worst_case(certificate, mode) | changed))
-    return vector_safety_shield(vector, certificate, mode, on_unproved="ignore")
+    return vector_shield(vector, certificate, mode, on_unproved="ignore")
 
 
 def counts_of(shield, seed=0):
@@ -174,7 +174,7 @@ def first_errors(plant: LinearPlant) -> np.ndarray:
     """First errors of the attack, shape (COUNT, n); no step of it breaks an assumption."""
     certificate = certificate_of(plant)
     many = vector_env(COUNT, plant=plant, channel=Channel(), **worst_case(certificate))
-    env = vector_safety_shield(many, certificate)
+    env = vector_shield(many, certificate)
     _, info = env.reset(seed=0, options={"state": starts(certificate, np.random.default_rng(0), COUNT)})
     errors = info["estimation_error"]
     for _ in range(20):

@@ -17,7 +17,7 @@ from ncs_gym.processes.plant_step import PlantSimulation
 from shields import Certificate, SafetyShield
 from shields.runtime.guarantee import OUTSIDE_BOUND
 from tests import arrays
-from tests.product import safe_loop, safety_shield, vector_safety_shield
+from tests.product import safe_loop, safety_shield, vector_shield
 
 
 class RecordingGenerator:
@@ -267,7 +267,7 @@ def compare(
     """
     shielded = certificate is not None
     settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore"}
-    outer = vector_safety_shield(many, certificate, **settings) if shielded else many
+    outer = vector_shield(many, certificate, **settings) if shielded else many
     _, infos = outer.reset(seed=3, options=options)
     singles = scalar_versions(many)
     outers = [safety_shield(each, certificate, **settings) if shielded else each for each in singles]

@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env
 
 from ncs_gym import Channel, ChannelContract, RequestActions, VectorRequestActions, cart_pole
 from tests.certificates import certificate_of
-from tests.product import safety_shield, vector_safety_shield
+from tests.product import safety_shield, vector_shield
 
 ID, COST = "ncs_gym/CartPole-v0", 0.25
 CHANNEL = Channel(0.5, delay=1, max_consecutive_losses=1, quantization_step=1e-4, on_request=True)
@@ -47,7 +47,7 @@ def test_last_entry_asks_and_every_packet_costs():
 
 def test_vector_wrapper_does_what_the_scalar_one_does():
     envs = gym.make_vec(ID, num_envs=6, max_episode_steps=20, **SETTINGS)
-    envs = VectorRequestActions(vector_safety_shield(envs, certificate_of(cart_pole(), CONTRACT)), COST)
+    envs = VectorRequestActions(vector_shield(envs, certificate_of(cart_pole(), CONTRACT)), COST)
     observations, _ = envs.reset(seed=0)
     assert envs.observation_space.contains(observations)
     rng, before = np.random.default_rng(0), np.zeros(6)

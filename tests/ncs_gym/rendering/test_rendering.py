@@ -28,7 +28,7 @@ from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.phase_plane import PhasePlane, ends_of
 from tests.certificates import certificate_of
 from tests.plants import random_plant
-from tests.product import linear_plant, safety_shield, vector_safety_shield
+from tests.product import linear_plant, safety_shield, vector_shield
 
 CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 DRAWN = [env_id for env_id in ENVIRONMENTS if env_id not in needing_extras()]
@@ -301,10 +301,8 @@ def test_plane_shows_safe_set_error_plan_path_and_interventions_in_their_sizes_a
 
 
 def test_outline_of_a_set_is_around_its_projection_and_touches_it():
-    plant, polytope = (
-        (made := safety_shield(gym.make("ncs_gym/CartPole-v0"))).unwrapped.plant,
-        made.certificate.polytope,
-    )
+    shield = safety_shield(gym.make("ncs_gym/CartPole-v0"))
+    plant, polytope = shield.unwrapped.plant, shield.certificate.polytope
     corners = PhasePlane(plant)._outline(polytope)
     directions = np.zeros((8, 4))
     directions[:, [2, 3]] = np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
@@ -483,7 +481,7 @@ def test_recorders_of_gymnasium_and_stable_baselines3_write_files(tmp_path):
 def test_chosen_environment_of_a_vector_is_drawn_as_a_single_one_would_be(mode):
     settings = {"rendered_env": 2, "max_episode_steps": 11, "autoreset_mode": mode}
     env = gym.make_vec(CRUISE, num_envs=3, render_mode="rgb_array", **settings)
-    shield = vector_safety_shield(env, certificate_of(env.unwrapped.plant))
+    shield = vector_shield(env, certificate_of(env.unwrapped.plant))
     single = safety_shield(make(), shield.certificate)
     _, info = shield.reset(seed=0)
     single.reset(options={"state": info["state"][2]})

@@ -15,7 +15,7 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Packet
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from tests.certificates import certificate_of
 from tests.plants import varying_cart_pole, varying_truck
-from tests.product import altered, family_of, safe_loop, sampled_plant, vector_env, vector_safety_shield
+from tests.product import altered, family_of, safe_loop, sampled_plant, vector_env, vector_shield
 from tests.verdicts import verified
 
 FAMILIES = {
@@ -50,7 +50,7 @@ def attacked(name, plant, certificate, count, steps, mode="project", seed=0, pro
     """Counts of an attack on a certificate, of members that are chosen; their steps are compared with the equations."""
     rng, settings, family = np.random.default_rng(seed), FAMILIES[name][1], FAMILIES[name][0]().remainder.family
     many = vector_env(count, plant=plant, process=process, **settings, **worst_case(certificate))
-    shield = vector_safety_shield(many, certificate, mode, on_unproved="ignore")
+    shield = vector_shield(many, certificate, mode, on_unproved="ignore")
     chosen = members(family, count, rng)
     fixed = {"parameters": {each: chosen[:, k] for k, each in enumerate(family.names)}}
     begun = {"state": starts(certificate, rng, count)}
@@ -160,7 +160,7 @@ def test_members_keep_limits_of_every_kind(kind, count, steps):
         noise="extreme",
     )
     certificate = certificate_of(plant, many.certificate_contract, "polytope")
-    shield = vector_safety_shield(many, certificate, on_unproved="ignore")
+    shield = vector_shield(many, certificate, on_unproved="ignore")
     rng = np.random.default_rng(0)
     _, info = shield.reset(seed=0, options={"parameters": {"member": np.arange(count) % 3}})
     act, held, near, overridden = hostile_agents(certificate, plant, count, rng), 0, -1.0, 0

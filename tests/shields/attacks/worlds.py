@@ -13,7 +13,7 @@ from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import contract_of
 from shields import silence_of
 from tests.ncs_gym.envs.same_draws import holding_gain
-from tests.product import safe_loop, safety_shield, vector_env, vector_safety_shield
+from tests.product import safe_loop, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.adversary import Adversary, Between, Traffic, boundary, box_of, farthest, gauges, region_of
 from tests.shields.attacks.cases import Case, box_ellipsoid
 
@@ -210,7 +210,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
     if many:
         autoreset = ("NextStep", "SameStep")[seed % 2]
         env = vector_env(count, max_episode_steps=VECTOR_EPISODE, autoreset_mode=autoreset, **settings)
-        shield: Any = vector_safety_shield(env, certificate, **given)
+        shield: Any = vector_shield(env, certificate, **given)
     else:
         env = SeenEnv(**settings)
         env.render_mode = "rgb_array"  # nothing is drawn: there is no renderer

@@ -9,7 +9,7 @@ from shields.runtime.backup_plans.plan_search import Plans
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_safety_shield
+from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.cases import box_ellipsoid, case, plan_case
 
 COUNT = 6
@@ -21,7 +21,7 @@ def many():
     plant, horizon, network, contract = plan_case("batch reactor", "overtaking")
     start = {"initial_set": box_ellipsoid(plant, 0.95), "disturbance": "adversarial"}
     env = vector_env(COUNT, plant=plant, channel=network, contract=contract, **start)
-    return vector_safety_shield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
+    return vector_shield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
 
 
 def test_a_restart_before_the_first_step_drops_the_plan_of_the_start_and_no_other(many):
@@ -175,7 +175,7 @@ def test_start_outside_the_safe_set_is_guaranteed_exactly_if_a_first_plan_is_cer
 def test_final_info_says_what_the_last_decision_stored():
     env = gym.make_vec("ncs_gym/BatchReactor-v0", num_envs=8, max_episode_steps=5, autoreset_mode="SameStep")
     certificate = certificate_of(env.unwrapped.plant, env.unwrapped.certificate_contract, safe_set="ellipsoid")
-    shield, lengths = vector_safety_shield(env, certificate, mode="lookahead"), []
+    shield, lengths = vector_shield(env, certificate, mode="lookahead"), []
     shield.reset(seed=0)
     for step in range(40):
         *_, truncated, info = shield.step(np.ones((8, 2), np.float32))

@@ -8,7 +8,7 @@ import pytest
 from ncs_gym import NCSEnv, NCSVectorEnv, Packet
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE, OLD_SAMPLE
 from tests.certificates import certificate_of
-from tests.product import safe_loop, safety_shield, vector_safety_shield
+from tests.product import safe_loop, safety_shield, vector_shield
 from tests.shields.attacks.cases import plan_case
 
 NAMES = ("cruise", "cart-pole", "batch reactor")
@@ -163,7 +163,7 @@ def test_wrappers_say_so_while_a_tail_is_stored_and_the_error_is_not_certified(n
     plant, horizon, channel, contract = plan_case(name, CHANNEL)
     certificate = certificate_of(plant, contract)
     if is_vector:
-        inner, kind = DoubtfulVectorEnv(3, plant=plant, channel=channel, contract=contract), vector_safety_shield
+        inner, kind = DoubtfulVectorEnv(3, plant=plant, channel=channel, contract=contract), vector_shield
     else:
         inner, kind = DoubtfulEnv(plant, channel, contract=contract), safety_shield
     env = kind(inner, certificate, "lookahead", horizon=horizon)

@@ -30,15 +30,7 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
-from tests.product import (
-    linear_plant,
-    loop_env,
-    safe_loop,
-    safety_filter,
-    safety_shield,
-    vector_env,
-    vector_safety_shield,
-)
+from tests.product import linear_plant, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.cases import behind
 from tests.shields.edges import edge_of
 
@@ -155,7 +147,7 @@ def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effec
     certificate, rng, shape = UNSTABLE.certificate, np.random.default_rng(0), UNSTABLE.plant.A.shape
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
     if many:
-        shield = vector_safety_shield(vector_env(1, plant=UNSTABLE.plant, **settings), certificate, "lookahead")
+        shield = vector_shield(vector_env(1, plant=UNSTABLE.plant, **settings), certificate, "lookahead")
     else:
         shield = safety_shield(loop_env(UNSTABLE.plant, **settings), certificate, "lookahead")
     stored = 0
@@ -275,7 +267,7 @@ class MeddlingWithMany(VectorWrapper):
 def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
     env = MeddlingWithMany(vector_env(6, plant=UNSTABLE.plant, **settings))
-    shield, rng, kept = vector_safety_shield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
+    shield, rng, kept = vector_shield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
     for seed in range(5):
         shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng, 6)})
         env.chosen = np.arange(6) % 2 == 0
@@ -290,7 +282,7 @@ def test_resetting_some_environments_makes_no_other_wait_less():
     waits = []
     for others in (0, 3):
         env = vector_env(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
-        shield = vector_safety_shield(env, certificate_of(PLANT))
+        shield = vector_shield(env, certificate_of(PLANT))
         _, info = shield.reset(seed=0, options={"state": np.array([[1.99, 1.0], [0.0, 0.0]])})
         for _ in range(others):
             options = {"reset_mask": np.array([False, True]), "state": np.zeros((2, 2))}

@@ -82,12 +82,9 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
 
     def scaled(factor):
         factor *= scale
-        return library_plant(
-            truck_trailer,
-            gamma=factor * 5e-4,
-            process_noise_cov=factor * 1e-4 * np.eye(2),
-            initial_cov=factor * 1e-4 * np.eye(2),
-        )
+        covariance = factor * 1e-4 * np.eye(2)
+        bounds = {"gamma": factor * 5e-4, "process_noise_cov": covariance, "initial_cov": covariance}
+        return library_plant(truck_trailer, **bounds)
 
     assert verified(paper_synthesis(scaled(0.97), dkappa=0.005, drho=0.01), scaled(0.97)).valid
     with pytest.raises(Infeasible):

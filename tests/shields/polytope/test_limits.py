@@ -9,7 +9,7 @@ import pytest
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid
 from shields import Certificate, verify
-from tests.product import safety_filter, vector_safety_shield
+from tests.product import safety_filter, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS, certificate, mixed_values
 
@@ -87,7 +87,7 @@ def test_no_limit_is_passed_while_guaranteed(name, mode):
     names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "max_episode_steps": 70}
     for disturbance in (AdversarialDisturbance(), AdversarialDisturbance(rows=P.rows), "sphere"):
         env = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=count, disturbance=disturbance, noise="extreme", **names)
-        shield = vector_safety_shield(env, found, mode)
+        shield = vector_shield(env, found, mode)
         starts = P.center + 0.9 * (P.sample_boundary(rng, count) - P.center)
         _, info = shield.reset(seed=3, options={"state": starts})
         assert info["shield_guaranteed"].all()

@@ -24,7 +24,7 @@ from tests.product import (
     safety_shield,
     sampled_plant,
     synthesize,
-    vector_safety_shield,
+    vector_shield,
 )
 from tests.shields.polytope.limits import (
     CHANNEL,
@@ -65,7 +65,7 @@ def test_without_the_limit_in_the_certificate_it_is_passed(name):
     blind = altered(plant, mixed_rows=None, mixed_ends=None)
     found = certificate_of(blind, CONTRACT, "polytope")
     env = gym_vector_env(count, plant=blind, channel=CHANNEL, contract=CONTRACT, max_episode_steps=70)
-    shield = vector_safety_shield(env, found)
+    shield = vector_shield(env, found)
     _, info = shield.reset(seed=3)
     rng, passed = np.random.default_rng(1), 0
     for _ in range(60):

@@ -16,7 +16,7 @@ from ncs_gym import AdversarialDisturbance, ChannelContract, MovedOperatingPoint
 from shields import CertificateError, Infeasible
 from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
 from tests.certificates import certificate_of
-from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_safety_shield
+from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
 from tests.verdicts import broken, verified
@@ -261,7 +261,7 @@ def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
     P, rng = found.polytope, np.random.default_rng(0)
     names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "disturbance": AdversarialDisturbance()}
     for mode in ("project", "lookahead"):
-        env = vector_safety_shield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=30, **names), found, mode)
+        env = vector_shield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=30, **names), found, mode)
         _, info = env.reset(seed=1)
         seen = info["shield_guaranteed"].copy()
         for k in range(80):
@@ -299,7 +299,7 @@ def test_published_plant_keeps_its_limits_under_attack(name):
         env = gym.make_vec(
             "ncs_gym/LinearNCS-v0", num_envs=100, disturbance=AdversarialDisturbance(rows=P.rows), **names
         )
-        shield = vector_safety_shield(env, found, mode)
+        shield = vector_shield(env, found, mode)
         starts = P.center + 0.5 * (P.sample_boundary(rng, 100) - P.center)
         _, info = shield.reset(seed=0, options={"state": starts})
         assert info["shield_guaranteed"].mean() > 0.5

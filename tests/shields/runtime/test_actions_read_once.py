@@ -7,7 +7,7 @@ from gymnasium.vector import VectorWrapper
 
 from ncs_gym import Ellipsoid, truck_trailer
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_safety_shield
+from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.cases import CHANNELS
 
 PLANT = truck_trailer(mass=4000.0)
@@ -24,7 +24,7 @@ def vector(wrapper=lambda env: env, mode="project"):
     S = certificate_of(PLANT).safe_set
     settings = {"initial_set": Ellipsoid(0.9 * S.shape_matrix), "disturbance": "adversarial"}
     env = vector_env(COUNT, plant=PLANT, channel=CHANNELS["perfect"], **settings)
-    return vector_safety_shield(wrapper(env), certificate_of(PLANT), mode)
+    return vector_shield(wrapper(env), certificate_of(PLANT), mode)
 
 
 class Shifting:

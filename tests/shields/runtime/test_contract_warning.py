@@ -12,7 +12,7 @@ from shields import GuaranteeLostWarning
 from tests import product
 from tests.certificates import certificate_of
 from tests.plants import small
-from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_safety_shield
+from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT, CONTRACT = cart_pole(), ChannelContract(4)
 DOWNLINK = Channel(loss=0.2, delay=1, max_consecutive_losses=2)  # c = 3
@@ -27,12 +27,12 @@ def shield(channel, downlink):
     return safety_shield(env, certificate_of(PLANT, CONTRACT))
 
 
-def vector_shield(channel, downlink):
+def many_shields(channel, downlink):
     env = vector_env(num_envs=2, plant=PLANT, channel=channel, contract=CONTRACT, downlink=downlink)
-    return vector_safety_shield(env, certificate_of(PLANT, CONTRACT))
+    return vector_shield(env, certificate_of(PLANT, CONTRACT))
 
 
-@pytest.mark.parametrize("make", [loop, shield, vector_shield])
+@pytest.mark.parametrize("make", [loop, shield, many_shields])
 @pytest.mark.parametrize(
     ("channel", "downlink", "words"),
     [
@@ -57,7 +57,7 @@ def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, 
 )
 @pytest.mark.parametrize("make", [loop_env, vector_env])
 def test_rounding_that_the_contract_does_not_allow_is_pointed_out(make, channel, words):
-    many, shielded = ((2,), vector_safety_shield) if make is vector_env else ((), safety_shield)
+    many, shielded = ((2,), vector_shield) if make is vector_env else ((), safety_shield)
     promised = replace(channel, max_consecutive_losses=0)
     env = make(*many, plant=PLANT, channel=promised)  # whose contract is that of its channel
     with pytest.warns(BrokenContractWarning, match=words) as caught:
@@ -65,7 +65,7 @@ def test_rounding_that_the_contract_does_not_allow_is_pointed_out(make, channel,
     assert len([each for each in caught if each.category is BrokenContractWarning]) == 1
 
 
-@pytest.mark.parametrize("make", [loop, shield, vector_shield])
+@pytest.mark.parametrize("make", [loop, shield, many_shields])
 @pytest.mark.parametrize(
     ("channel", "downlink"),
     [
@@ -117,7 +117,7 @@ def test_certificate_of_the_registered_contract_is_compared_with_the_channel_ask
         safety_shield(env, certificate_of(env.unwrapped.plant, env.unwrapped.contract))
 
 
-@pytest.mark.parametrize("make", [shield, vector_shield])
+@pytest.mark.parametrize("make", [shield, many_shields])
 def test_channel_of_an_episode_that_breaks_the_contract_is_pointed_out_once(make):
     env, late = make(Channel(), None), Channel(delay=9)
     for _ in range(2):
@@ -135,7 +135,7 @@ def test_shield_keeps_its_guarantee_over_drawn_channels_and_says_where_it_is_los
     fitting = [Channel(), Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(delay=4, quantization_step=0)]
 
     def shielded(env, vector):
-        drawn, safe = (VectorRandomChannel, vector_safety_shield) if vector else (RandomChannel, safety_shield)
+        drawn, safe = (VectorRandomChannel, vector_shield) if vector else (RandomChannel, safety_shield)
         certificate = certificate_of(PLANT, CONTRACT)
         return drawn(safe(env, certificate), fitting) if outside else safe(drawn(env, fitting), certificate)
 
@@ -158,7 +158,7 @@ def test_environment_of_a_stable_plant_without_the_contract_of_the_certificate_i
     plant, channel = small(0.5 * np.eye(2)), Channel(delay=1)
     certificate = certificate_of(plant, ChannelContract(max_age=1), "polytope")
     for make in (gym.make, gym.make_vec):
-        shield = safety_shield if make is gym.make else vector_safety_shield
+        shield = safety_shield if make is gym.make else vector_shield
         env = make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel)
         with pytest.warns(BrokenContractWarning, match=r"made without one.*contract=ChannelContract\(max_age=1"):
             shield(env, certificate)

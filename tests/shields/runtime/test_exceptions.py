@@ -18,7 +18,7 @@ from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_safety_shield
+from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 MODES = ["project", "lookahead"]
@@ -61,7 +61,7 @@ def stopped(*_, **__):
 def shield_of(kind, mode):
     if kind == "one":
         return safety_shield(RaisingOne(loop_env(PLANT)), certificate_of(PLANT), mode)
-    return vector_safety_shield(RaisingMany(vector_env(3, plant=PLANT)), certificate_of(PLANT), mode)
+    return vector_shield(RaisingMany(vector_env(3, plant=PLANT)), certificate_of(PLANT), mode)
 
 
 @pytest.mark.parametrize("raised", RAISED)
@@ -184,7 +184,7 @@ def test_solver_that_does_not_come_to_its_end_has_no_answer_and_is_not_asked_aga
 def test_what_numpy_is_told_to_raise_does_not_stop_a_step(mode):
     certificate = certificate_of(PLANT)
     shields = [safety_shield(loop_env(PLANT), certificate, mode)]
-    shields.append(vector_safety_shield(vector_env(2, plant=PLANT), certificate, mode))
+    shields.append(vector_shield(vector_env(2, plant=PLANT), certificate, mode))
     loop, shield = safe_loop(certificate, PLANT, Channel(delay=1), mode), safety_filter(certificate, PLANT, mode)
     for each in (*shields, loop):
         each.start(np.zeros(2)) if each is loop else each.reset(seed=0)
@@ -216,7 +216,7 @@ def episodes(env, seed):
 def test_environments_in_threads_go_as_alone(mode):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        made = [safety_shield(gym.make(ID), mode=mode), vector_safety_shield(gym.make_vec(ID, num_envs=5), mode=mode)]
+        made = [safety_shield(gym.make(ID), mode=mode), vector_shield(gym.make_vec(ID, num_envs=5), mode=mode)]
     envs = [deepcopy(made[number % 2]) for number in range(8)]
     with ThreadPoolExecutor(8) as pool:
         answers = list(pool.map(episodes, envs, range(8)))

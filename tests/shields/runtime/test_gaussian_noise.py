@@ -9,7 +9,7 @@ from ncs_gym import Channel, ChannelContract, batch_reactor, bound_violation_pro
 from shields.runtime.guarantee import ALARM
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
-from tests.product import library_plant, linear_plant, vector_env, vector_safety_shield
+from tests.product import library_plant, linear_plant, vector_env, vector_shield
 from tests.shields.attacks.adversary import gauges
 
 # So large a delta that draws leave their ellipsoids all the time.
@@ -37,7 +37,7 @@ LOOPS = {
 def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
     plant, contract, channel = LOOPS[name]
     settings = {"channel": channel, "contract": contract, "noise": "gaussian", "max_episode_steps": 60}
-    shield = vector_safety_shield(vector_env(20, plant=plant, **settings), certificate_of(plant, contract), mode=mode)
+    shield = vector_shield(vector_env(20, plant=plant, **settings), certificate_of(plant, contract), mode=mode)
     shield.reset(seed=0)
     escaped, alarms, reasons, rng = False, 0, set(), np.random.default_rng(0)
     for _ in range(80):
@@ -71,7 +71,7 @@ def share_of_exits(delta, noise):
     plant = tight_plant(delta)
     certificate = certificate_of(plant)
     env = vector_env(COUNT, plant=plant, channel=Channel(loss=0.3), noise=noise, max_episode_steps=None)
-    shield, rng = vector_safety_shield(env, certificate), np.random.default_rng(0)
+    shield, rng = vector_shield(env, certificate), np.random.default_rng(0)
     _, info = shield.reset(seed=0)
     assert info["shield_guaranteed"].all()
     outside = np.zeros(COUNT, np.bool_)

@@ -20,7 +20,7 @@ from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 from tests.plants import swinging
-from tests.product import altered, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_safety_shield
+from tests.product import altered, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 
 KEEPING = ("project", "switch", "boundary", "lookahead")
 STEPS = 8
@@ -77,9 +77,7 @@ def follow_wrapper(mode: str, kind: str, c: int, start: np.ndarray) -> Trace:
 
 
 def follow_vector(mode: str, kind: str, c: int, starts: np.ndarray) -> list[Trace]:
-    env = vector_safety_shield(
-        vector_env(num_envs=len(starts), **settings(c)), certificate(kind), mode, on_unproved="ignore"
-    )
+    env = vector_shield(vector_env(num_envs=len(starts), **settings(c)), certificate(kind), mode, on_unproved="ignore")
     rng, traces = np.random.default_rng(0), [Trace([], [], []) for _ in starts]
     _, info = env.reset(seed=0, options={"state": starts})
     for _ in range(STEPS):

@@ -17,7 +17,7 @@ from tests.product import (
     safety_shield,
     sampled_plant,
     synthesize,
-    vector_safety_shield,
+    vector_shield,
 )
 
 COMMON = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1}
@@ -150,7 +150,7 @@ def test_a_step_that_no_measurement_shows_is_no_measurement(many):
     given = {"plant": plant, "process": process, "allow_assumption_violation": True}
     certificate = synthesize(plant)
     if many:
-        env = vector_safety_shield(gym.make_vec(LINEAR, num_envs=2, **given), certificate, on_unproved="ignore")
+        env = vector_shield(gym.make_vec(LINEAR, num_envs=2, **given), certificate, on_unproved="ignore")
     else:
         env = safety_shield(gym.make(LINEAR, **given), certificate, on_unproved="ignore")
     env.reset(seed=0)

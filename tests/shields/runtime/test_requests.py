@@ -5,7 +5,7 @@ import pytest
 
 from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole, lane_keeping, truck_trailer
 from tests.certificates import certificate_of
-from tests.product import safe_loop, vector_env, vector_safety_shield
+from tests.product import safe_loop, vector_env, vector_shield
 
 PLANT = cart_pole()
 CHANNEL = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
@@ -73,7 +73,7 @@ def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, con
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])
 def test_shield_keeps_its_set_whatever_is_asked_for(downlink):
     env = vector_env(40, plant=PLANT, channel=CHANNEL, contract=CONTRACT, downlink=downlink, disturbance="sphere")
-    shield, rng = vector_safety_shield(env, certificate_of(PLANT, env.certificate_contract)), np.random.default_rng(0)
+    shield, rng = vector_shield(env, certificate_of(PLANT, env.certificate_contract)), np.random.default_rng(0)
     shield.reset(seed=0)
     packets = 0
     for _ in range(150):

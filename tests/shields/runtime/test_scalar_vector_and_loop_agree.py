@@ -29,16 +29,14 @@ from tests.shields.polytope.limits import CHANNEL, CONTRACT, TANKS
 
 TRUCK, CART, REACTOR, LOCAL = truck_trailer(mass=4000.0), cart_pole(), batch_reactor(), with_remainder()
 BOUNDS = {"box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "sensor_bound": 0.001, "initial_bound": 0.001}
-RATES = rate_limited(
-    linear_plant(
-        A=[[0.9, 0.1], [0.0, 0.8]],
-        B=[[0.0], [0.3]],
-        disturbance_bound=0.01,
-        mixed_limits=[([0.5, -1.0], [0.5], -0.7, 0.8)],
-        **BOUNDS,
-    ),
-    0.4,
+RATES = linear_plant(
+    A=[[0.9, 0.1], [0.0, 0.8]],
+    B=[[0.0], [0.3]],
+    disturbance_bound=0.01,
+    mixed_limits=[([0.5, -1.0], [0.5], -0.7, 0.8)],
+    **BOUNDS,
 )
+RATES = rate_limited(RATES, 0.4)
 SPARSE = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
 ASKED = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)

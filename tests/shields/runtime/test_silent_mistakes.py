@@ -34,7 +34,7 @@ from tests.product import (
     safety_shield,
     synthesize,
     vector_env,
-    vector_safety_shield,
+    vector_shield,
 )
 
 PLANT, TWO = truck_trailer(mass=4000.0), np.zeros(2)
@@ -82,7 +82,7 @@ def test_actions_with_a_gradient_are_refused(certificate, wrong):
     env, envs = loop_env(PLANT), vector_env(1, plant=PLANT)
     asks = Channel(on_request=True)
     asking, many = RequestActions(loop_env(PLANT, asks)), VectorRequestActions(vector_env(1, plant=PLANT, channel=asks))
-    shields = safety_shield(loop_env(PLANT), certificate), vector_safety_shield(vector_env(1, plant=PLANT), certificate)
+    shields = safety_shield(loop_env(PLANT), certificate), vector_shield(vector_env(1, plant=PLANT), certificate)
     for each in (env, envs, asking, many, *shields):
         each.reset(seed=0)
         with pytest.raises(ValueError, match="must be finite with shape"):
@@ -94,7 +94,7 @@ def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certifi
     asked = DictInfoToList(vector_env(2, plant=PLANT, channel=Channel(on_request=True)))
     classic = DictInfoToList(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
     around = {
-        "VectorSafetyShield": vector_safety_shield(inside, certificate),
+        "VectorSafetyShield": vector_shield(inside, certificate),
         "VectorRequestActions": VectorRequestActions(asked),
         "VectorNetworked": VectorNetworked(classic),
         "SB3VecEnv": SB3VecEnv(inside),
@@ -102,7 +102,7 @@ def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certifi
     for name, env in around.items():
         with pytest.raises(ValueError, match=rf"{name} reads .* makes a list .* outside of {name}"):
             env.reset()
-    outside = DictInfoToList(vector_safety_shield(vector_env(2, plant=PLANT), certificate))
+    outside = DictInfoToList(vector_shield(vector_env(2, plant=PLANT), certificate))
     assert outside.reset()[1][1]["shield_guaranteed"]
 
 

@@ -12,7 +12,7 @@ from ncs_gym.processes.plant_step import PlantSimulation
 from shields import GuaranteeLostWarning
 from shields.runtime.guarantee import ALARM, NOT_FINITE, UNKNOWN_START
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_safety_shield
+from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 
@@ -138,7 +138,7 @@ def test_environments_name_it_as_well(many, monkeypatch):
     monkeypatch.setattr(PlantSimulation, "measure", damaged)
     settings = {"plant": PLANT, "channel": Channel()}
     inner = vector_env(num_envs=2, **settings) if many else loop_env(**settings)
-    env = (vector_safety_shield if many else safety_shield)(inner, certificate_of(PLANT), on_unproved="ignore")
+    env = (vector_shield if many else safety_shield)(inner, certificate_of(PLANT), on_unproved="ignore")
     env.reset(seed=0)
     reasons = [np.unique(env.step(np.zeros((2, 1) if many else 1, np.float32))[4]["shield_reason"]) for _ in range(5)]
     assert [each.tolist() for each in reasons] == [[""], [""], [NOT_FINITE], [NOT_FINITE], [NOT_FINITE]]

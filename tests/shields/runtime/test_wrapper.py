@@ -16,7 +16,7 @@ from shields.runtime.guarantee import (
     OTHER_INPUT,
     OTHER_STEPS,
 )
-from tests.product import safety_shield, vector_safety_shield
+from tests.product import safety_shield, vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 KEYS = {
@@ -234,7 +234,7 @@ def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, auto
         make, shield, layer = gym.make, safety_shield, rewriting(gym.Wrapper)
         settings = {}
     else:
-        make, shield, layer = gym.make_vec, vector_safety_shield, rewriting(VectorWrapper)
+        make, shield, layer = gym.make_vec, vector_shield, rewriting(VectorWrapper)
         settings = {"num_envs": 5, "max_episode_steps": 25, "autoreset_mode": autoreset}
     plain, inner, wrapped = (make(CRUISE, disturbance="adversarial", **settings) for _ in range(3))
     plain, inside = shield(plain, certificate), shield(layer(inner, REWRITES[rewrite]), certificate)
@@ -271,7 +271,7 @@ def test_what_is_handed_on_lies_in_the_action_space(kind, certificate):
         env, shape = safety_shield(spy(gym.Wrapper)(gym.make(CRUISE)), certificate), (1,)
     else:
         inner = spy(gym.vector.VectorWrapper)(gym.make_vec(CRUISE, num_envs=3))
-        env, shape = vector_safety_shield(inner, certificate), (3, 1)
+        env, shape = vector_shield(inner, certificate), (3, 1)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     for _ in range(60):

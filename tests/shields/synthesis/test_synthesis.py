@@ -206,14 +206,13 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
             synthesize(plant, safe_set="ellipsoid")
         if answer is not None:  # the others of these are as the first
             return
+        oblique = library_plant(truck_trailer, box=OBLIQUE)
         with pytest.raises(Infeasible):
-            safety_shield(
-                gym.make("ncs_gym/TruckTrailer-v0", plant=library_plant(truck_trailer, box=OBLIQUE), channel=Channel())
-            )
+            safety_shield(gym.make("ncs_gym/TruckTrailer-v0", plant=oblique, channel=Channel()))
         # A polytope of no other rows than the box's needs no such program.
         assert verify(synthesize(plant), plant).valid
         with pytest.raises(Infeasible, match="largest ellipsoid"):
-            synthesize(library_plant(truck_trailer, box=OBLIQUE))
+            synthesize(oblique)
 
 
 @pytest.mark.slow

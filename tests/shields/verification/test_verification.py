@@ -76,13 +76,8 @@ def test_report_prints_conditions_that_differ_in_the_age_alone_once_and_every_br
 
 def test_only_positive_definiteness_excludes_a_flat_set():
     # Without L > 0 the point set {0} would be "invariant": only a plant without any disturbance could have it.
-    plant = library_plant(
-        truck_trailer,
-        gamma=0.0,
-        process_noise_cov=np.zeros((2, 2)),
-        initial_cov=np.zeros((2, 2)),
-        measurement_noise_cov=np.eye(2),
-    )
+    noise = dict.fromkeys(("process_noise_cov", "initial_cov"), np.zeros((2, 2))) | {"measurement_noise_cov": np.eye(2)}
+    plant = library_plant(truck_trailer, gamma=0.0, **noise)
     certificate = certificate_of(plant)
     flat = replace(certificate, L=np.zeros((2, 2)), K=np.zeros((1, 2)))
     found = broken(flat, plant)
