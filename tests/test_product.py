@@ -1,4 +1,4 @@
-"""Tests make plants, loops, shields and certificates through `tests/product.py` alone, but for those of constructors' own refusals."""
+"""Only tests of what constructors refuse make anything of the product themselves; the others ask `tests/product.py`."""
 
 import ast
 import inspect

@@ -10,12 +10,13 @@ def lqr_gain(
 ) -> np.ndarray | None:
     """Returns K, shape (m, n), of u = K x that minimizes the sum of x'Qx + u'Ru + 2 x'Nu; N is 0 by default.
 
-    It is sought in units in which the diagonals of Q and R, which are positive, are about 1. None where the Riccati
+    It is sought in units in which the diagonals of Q and R are about 1 where they are not 0. None where the Riccati
     equation has no solution that scipy finds.
     """
     from scipy.linalg import solve_discrete_are  # takes long to import
 
-    x, u = (np.exp2(-np.round(0.5 * np.log2(np.diag(weight)))) for weight in (Q, R))
+    sizes = [np.where(np.diag(weight) > 0.0, np.diag(weight), 1.0) for weight in (Q, R)]
+    x, u = (np.exp2(-np.round(0.5 * np.log2(size))) for size in sizes)
     A, B, Q, R = A * x / x[:, None], B * u / x[:, None], Q * np.outer(x, x), R * np.outer(u, u)
     crossed = np.zeros(B.shape) if N is None else N * np.outer(x, u)
     try:

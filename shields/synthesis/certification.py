@@ -19,7 +19,7 @@ from shields.synthesis.polytope_certificates import (
     polytope_share,
     with_polytope,
 )
-from shields.synthesis.resting_point import needs_resting_point, resting_at
+from shields.synthesis.resting_point import at_operating_point, needs_resting_point, resting_at
 from shields.synthesis.search import Progress, Search
 from shields.verification import verify
 
@@ -109,7 +109,7 @@ def _found(
         if not polytope:
             raise failure or infeasibility(plant, contract, polytope=False)
         known = [] if ellipsoid.K is None else [ellipsoid.K]
-        found = around_resting_point(plant, contract, search, known=known)
+        found = around_resting_point(plant, contract, search, at_operating_point(plant), known)
         return with_tolerated_scale(found, ellipsoid.problem)
     except Infeasible as none:
         if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
@@ -178,14 +178,15 @@ def nearby_certificate(
         progress: Called with a line of text now and then.
     """
     carried = None if start is None else carried_over(start, plant, contract)
-    known: list[np.ndarray] = []
+    rest, known = None, []
     try:
         if not needs_resting_point(plant):
+            rest = at_operating_point(plant)
             ellipsoid = largest_ellipsoid(plant, contract, Search(progress), start, _FEW_ALTERNATIONS)
             if ellipsoid.certificate is not None or carried is not None or not polytope:
                 return ellipsoid.certificate or carried
             known = [] if ellipsoid.K is None else [ellipsoid.K]
-        found = around_resting_point(plant, contract, progress, known=known)
+        found = around_resting_point(plant, contract, progress, rest, known)
     except Infeasible:
         return carried
     return found if carried is None else max(found, carried, key=polytope_share)

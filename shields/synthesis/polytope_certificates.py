@@ -97,7 +97,8 @@ def certify_polytope(
 ) -> Certificate | None:
     """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
 
-    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it.
+    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it, and inside generous
+    limits where states have none.
 
     Args:
         plant: The plant with its bounds.
@@ -130,12 +131,16 @@ def _certified_polytope(
     Raises:
         Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
     """
-    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    limits = limits_around(plant, rest)
+    problem, errors = design_problem(plant, contract, limits)
     K, proofs = gain_in_digits(K, plant), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), _disturbance_around(plant, rest), rest)
     polytope = invariant_polytope(feedback, plant, progress)
     faces = polytope.F
-    L = largest_box_ellipsoid(polytope.rows if polytope.is_symmetric else faces)
+    inside = polytope.rows if polytope.is_symmetric else faces
+    if exact.rank(plant.box) < plant.n:  # a polytope may have no end, or a very far one, where a state has no limit
+        inside = np.concatenate([inside, limits.box_rows])
+    L = largest_box_ellipsoid(inside)
     L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
     others: dict[str, Any] = fields_of_problem(plant, problem, errors) | {"D": feedback.D}
     others |= {"resting_state": rest.state, "resting_input": rest.input}

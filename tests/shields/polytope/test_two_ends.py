@@ -80,11 +80,8 @@ def test_ellipsoid_is_inside_the_polytope_around_the_resting_point_as_the_certif
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_share_of_the_box_is_that_of_random_points(name):
     plant, found = PLANTS[name], certificate(name)
-    if "polytope_share_of_box" not in found.provenance:  # limits of sums: a box that is no product
-        assert name == "tanks"
-        return
-    low, high = np.sort(plant.box_ends / plant.box.sum(axis=1), axis=0)
-    points = np.random.default_rng(0).uniform(low, high, (20_000, plant.n))
+    points = np.random.default_rng(0).uniform(*plant.own_limits, (20_000, plant.n))
+    points = points[(plant.constraint_values(points.T) <= 0.0).all(axis=0)]  # the tanks have a limit of a sum, too
     P = found.polytope
     inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
     assert found.provenance["polytope_share_of_box"] == pytest.approx(inside.mean(), abs=0.02)
@@ -432,3 +429,18 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
     said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
     with pytest.raises(Infeasible, match=said):
         synthesize(ANGLE, contract=CONTRACT)
+
+
+def test_state_that_only_follows_needs_no_limit():
+    """It decays by itself: whatever a regulator does, it may be as large as it likes."""
+    plant = linear_plant(
+        A=[[1.02, 0.0], [0.05, 0.9]],
+        B=[[0.1], [0.0]],
+        dt=0.1,
+        box=[1.0, np.inf],
+        u_max=1.0,
+        disturbance_bound=[2e-3, 1e-3],
+        sensor_bound=2e-3,
+        initial_bound=0.01,
+    )
+    assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
