@@ -18,6 +18,7 @@ from numpy._core._multiarray_umath import __cpu_features__
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate
 from shields.packaged_certificates import certificate_of_package
+from tests.product import synthesize
 
 ROOT = Path(__file__).resolve().parent.parent
 # Those of named plants by their names, the others by `_name_of`.
@@ -74,8 +75,6 @@ def feasible_age_not_sought() -> Iterator[None]:
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None, safe_set: str) -> Certificate:
-    from shields import synthesize  # what is kept needs no solver
-
     known = certificate_of_package(plant, contract) or _checked_in(plant, contract)
     if known is not None and (safe_set == "polytope" or known.keeps_ellipsoid):
         return known.without_polytope() if safe_set == "ellipsoid" else known

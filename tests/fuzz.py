@@ -20,6 +20,7 @@ from ncs_gym import (
     SpeedTracking,
 )
 from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
+from tests.product import linear_plant
 
 
 def examples(count: int, *, same: bool = True) -> settings:
@@ -54,7 +55,7 @@ def plants(draw, most_states=6, most_inputs=3, radius=(0.0, 0.98), units=6.0, un
         size**2 * covariance(rng, len(units), units, rank)
         for size, rank, units in zip(sizes, ranks, (scale, y, scale), strict=True)
     ]
-    return LinearPlant(
+    return linear_plant(
         A=scale[:, None] * A / scale,
         B=scale[:, None] * rng.standard_normal((n, m)),
         box=C / scale,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import gymnasium as gym
@@ -11,20 +10,21 @@ import numpy as np
 
 from benchmarks.random_plants import random_plant as random_plant
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
+from tests.product import altered, family_of, linear_plant, sampled_plant
 
 
 def small(A: object, **changes: object) -> LinearPlant:
     """Two states and one input, in the unit box; without changes everything is Gaussian but a ball of disturbances."""
     sizes = {"B": [[0.1], [0.2]], "box": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-5}
     noises = dict.fromkeys(("process_noise_cov", "measurement_noise_cov", "initial_cov"), 1e-6 * np.eye(2))
-    return LinearPlant(**{"A": A} | sizes | noises | changes)
+    return linear_plant(**{"A": A} | sizes | noises | changes)
 
 
 def with_remainder() -> LinearPlant:
     """The linear model of another process."""
     left_out = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
     bounds = {"disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
-    return LinearPlant(
+    return linear_plant(
         A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], box=[1.0, 1.0], u_max=1.0, dt=0.1, remainder=left_out, **bounds
     )
 
@@ -33,9 +33,7 @@ def oscillator(between_samples: int | None = 3) -> LinearPlant:
     """A mass on a spring, with few samples per period; its box counts between them, too."""
     model = [[0.0, 1.0], [-1.0, -0.4]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))
     bounds = {"disturbance_bound": 0.01, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    return LinearPlant.from_statespace(
-        model, dt=0.5, box=[1.0, 1.0], u_max=1.0, between_samples=between_samples, **bounds
-    )
+    return sampled_plant(model, dt=0.5, box=[1.0, 1.0], u_max=1.0, between_samples=between_samples, **bounds)
 
 
 def swinging(damping: float, u_max: float) -> LinearPlant:
@@ -43,7 +41,7 @@ def swinging(damping: float, u_max: float) -> LinearPlant:
     w = 2.0 * np.pi
     model = [[0.0, 1.0], [-w * w, -2.0 * damping * w]], [[0.0], [w * w]], np.eye(2), np.zeros((2, 1))
     bounds = {"gamma": 1e-6, "initial_bound": 1e-3, "sensor_bound": 1e-4}
-    return LinearPlant.from_statespace(model, dt=1.0, box=(1.0, 8.0), u_max=u_max, between_samples=32, **bounds)
+    return sampled_plant(model, dt=1.0, box=(1.0, 8.0), u_max=u_max, between_samples=32, **bounds)
 
 
 def servo(factor: float = 1.2, **changes: object) -> LinearPlant:
@@ -51,32 +49,32 @@ def servo(factor: float = 1.2, **changes: object) -> LinearPlant:
     motor = ([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]])
     bounds = {"disturbance_bound": [0.0, 0.25], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
     scaled = {name: factor * np.array(bound) for name, bound in bounds.items()}
-    return LinearPlant.from_statespace(motor, **{"dt": 0.005, "box": [0.2, 4.0], "u_max": 12.0} | scaled | changes)
+    return sampled_plant(motor, **{"dt": 0.005, "box": [0.2, 4.0], "u_max": 12.0} | scaled | changes)
 
 
 def delayed(steps: int) -> LinearPlant:
     """A damped oscillator whose inputs arrive some steps late."""
     model = [[0.0, 1.0], [-0.2, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]], None
     bounds = {"disturbance_bound": [0.0005, 0.003], "sensor_bound": 0.01, "initial_bound": 0.02}
-    return LinearPlant.from_statespace(model, dt=0.1, box=[1.0, 1.5], u_max=0.8, input_delay=steps, **bounds)
+    return sampled_plant(model, dt=0.1, box=[1.0, 1.5], u_max=0.8, input_delay=steps, **bounds)
 
 
 def counted_between(name: str, points: int) -> tuple[LinearPlant, ChannelContract | None]:
     """The plant of a registered environment, whose box counts between samples, too, and its contract."""
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    return replace(env.plant, between_samples=points), env.certificate_contract
+    return altered(env.plant, between_samples=points), env.certificate_contract
 
 
 @cache
 def varying_truck() -> LinearPlant:
     """The loaded truck, 4000 kg +- 5 %."""
-    return LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
+    return family_of(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)
 
 
 @cache
 def varying_cart_pole() -> LinearPlant:
     """The cart-pole, mass and length of the pole +- 2 %."""
-    return LinearPlant.family(cart_pole, {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}, monotone=True)
+    return family_of(cart_pole, {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}, monotone=True)
 
 
 # Plants with contracts, whose certificates with polytopes are checked in: data/certificates.
@@ -105,4 +103,4 @@ def with_radii(plant: LinearPlant, factor: float) -> LinearPlant:
     names = ("disturbance_bound", "sensor_bound", "initial_bound")
     given = {name: bound for name in names if (bound := getattr(plant, name)) is not None}
     scaled = {name: Ellipsoid(factor**2 * bound.shape_matrix) for name, bound in given.items()}
-    return replace(plant, gamma=factor**2 * plant.gamma, **scaled)
+    return altered(plant, gamma=factor**2 * plant.gamma, **scaled)

@@ -12,8 +12,8 @@ import numpy as np
 
 from agents.loop import LoopConfig
 from agents.training import train
-from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant
-from shields import SafetyShield, VectorSafetyShield, synthesize
+from ncs_gym import Channel, ChannelContract, GilbertElliott
+from tests.product import linear_plant, safety_shield, synthesize, vector_shield
 
 CHANNEL = Channel(
     GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4), quantization_step=0.05, send_period=2, delay=1, jitter=2
@@ -53,7 +53,7 @@ def scalar_runs(seed: int, steps: int) -> dict[str, str]:
     for name in IDS:
         changes = {"channel": CHANNEL, "disturbance": "sphere"} if name != "CartPole-v0" else {}
         runs[name] = stepped(gym.make(f"ncs_gym/{name}", **changes), seed, steps, (1,))
-    runs["shield"] = stepped(SafetyShield(gym.make(f"ncs_gym/{IDS[1]}")), seed, steps, (1,))
+    runs["shield"] = stepped(safety_shield(gym.make(f"ncs_gym/{IDS[1]}")), seed, steps, (1,))
     return runs
 
 
@@ -64,15 +64,15 @@ def vector_runs(seed: int, steps: int) -> dict[str, str]:
         changes = {"channel": CHANNEL} if name != "CartPole-v0" else {}
         env = gym.make_vec(f"ncs_gym/{name}", num_envs=8, max_episode_steps=20, **changes)
         runs[f"{name} many"] = stepped(env, seed, steps, (8, 1))
-    env = VectorSafetyShield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
+    env = vector_shield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
     return runs | {"shields": stepped(env, seed, steps, (8, 1))}
 
 
 def synthesized() -> dict[str, str]:
     """Whole certificate files, without a contract and with one."""
     sizes = {"B": [[0.1], [0.2]], "box": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-6}
-    stable = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], **sizes)
-    unstable = LinearPlant(A=[[1.02, 0.1], [0.0, 0.8]], measurement_noise_cov=1e-6 * np.eye(2), **sizes)
+    stable = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], **sizes)
+    unstable = linear_plant(A=[[1.02, 0.1], [0.0, 0.8]], measurement_noise_cov=1e-6 * np.eye(2), **sizes)
     certificates = {
         "certified": synthesize(stable),
         "contract": synthesize(unstable, contract=ChannelContract(1)),

@@ -1,5 +1,6 @@
 """The commands of `benchmarks/` are those that pages, Makefile, CI and docstrings name."""
 
+import json
 import re
 from functools import wraps
 from importlib import import_module
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import project
+from benchmarks import hashes, project
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -73,3 +74,25 @@ def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(mo
     names = {path.name for path in project.templates_and_data()}
     assert {"comparison.html.j2", "style.css", "ppo.json", "tuned.json", "cart_pole_nonlinear.json"} <= names
     assert not {"agent.json", "CSTR-v0.json"} & names
+
+
+def test_hashes_come_out_again_and_one_that_does_not_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(hashes, "STEPS", 12)
+    name, file = "ncs_gym/TruckTrailer-v0", tmp_path / "hashes.json"
+
+    def asked(command):
+        try:
+            run(None, (hashes.record, hashes.compare), [command, str(file), "--names", name])
+        except SystemExit as ended:
+            return ended.code, capsys.readouterr().out
+
+    asked("record")
+    found = json.loads(file.read_text())
+    assert capsys.readouterr().out.splitlines() == [f"{what}: {digest}" for what, digest in found.items()]
+    assert {f"{name} {what}" for what in ("bare", *hashes.MODES, "loop", "vector project SameStep")} < set(found)
+    assert asked("compare") == (0, f"0 of {len(found)} hashes differ\n")
+    file.write_text(json.dumps(found | {f"{name} loop": "0" * 16}))
+    other = f"{name} loop: {found[f'{name} loop']}, before {'0' * 16}"
+    assert asked("compare") == (1, f"{other}\n1 of {len(found)} hashes differ\n")
+    monkeypatch.setattr(hashes, "STEPS", 15)
+    assert f"\n{len(found)} of {len(found)} hashes differ" in asked("compare")[1]

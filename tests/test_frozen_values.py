@@ -32,7 +32,6 @@ from ncs_gym import (
     Limits,
     LinearProcess,
     Model,
-    NCSEnv,
     PacketLog,
     Regulation,
     SetpointTracking,
@@ -52,10 +51,10 @@ from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
 from ncs_gym.uncertainty.disturbances import as_disturbance
 from ncs_gym.validation import ReadOnlyArrays
-from shields import SafetyFilter
 from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
 from tests.plants import varying_truck
+from tests.product import loop_env, safety_filter
 
 DOWNLINK = {"downlink": Channel(delay=1), "downlink_contract": ChannelContract(2)}
 PLANT, ERRORS = pendulum(), certified_error_set(batch_reactor(), ChannelContract(3))
@@ -76,7 +75,7 @@ VALUES = [
     GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5),
     TraceChannel(trace=(0, -1)),
     ChannelContract(3),
-    NCSEnv(truck_trailer(), **DOWNLINK).downlink_protocol,
+    loop_env(truck_trailer(), **DOWNLINK).downlink_protocol,
     PacketLog(np.arange(3.0), np.ones(3)),
     TRUCK_TRAILER,
     Regulation(state_cost=np.eye(2)),
@@ -100,7 +99,7 @@ VALUES = [
     CERTIFICATE.proofs[0],
     CERTIFICATE.updates,
     PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),
-    SafetyFilter(CERTIFICATE, batch_reactor()),
+    safety_filter(CERTIFICATE, batch_reactor()),
     Model(np.eye(2), np.ones((2, 1)), None, 0.1, at=(np.ones(2), np.ones(1))),
     Limits((-np.ones(2), np.ones(2)), np.ones(1), [(np.ones(2), np.ones(1), -1.0, 1.0)], np.ones(1)),
     Bounds(Box(np.zeros(2), np.ones(2)), 0.1, np.ones(2)),

@@ -18,7 +18,6 @@ from agents.loop import CostPenalty
 from experiments.baselines.filters import EstimateFilterSettings
 from ncs_gym import (
     Channel,
-    LinearPlant,
     NCSEnv,
     Networked,
     RandomChannel,
@@ -29,9 +28,10 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.registration import registered_ids
-from shields import SafetyShield, VectorSafetyShield
+from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.ncs_gym.networked.environments import Counter
+from tests.product import family_of, linear_plant, loop_env, safety_shield, vector_shield
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "ncs_gym.md").read_text()
 ENVIRONMENTS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0")
@@ -93,7 +93,7 @@ def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env_id, certificate = loop
     env, envs = gym.make(env_id), gym.make_vec(env_id, num_envs=NUMBER)
     if mode is not None:
-        env, envs = SafetyShield(env, certificate, mode), VectorSafetyShield(envs, certificate, mode)
+        env, envs = safety_shield(env, certificate, mode), vector_shield(envs, certificate, mode)
     expected = kinds(mode)
     for info in infos(env, 4):
         assert set(info) == set(expected)
@@ -119,7 +119,7 @@ def test_page_names_what_the_end_of_an_episode_adds():
 
 def test_actions_of_infos_are_those_that_stand_for_the_inputs(loop):
     env_id, certificate = loop
-    env, envs = SafetyShield(gym.make(env_id), certificate), VectorSafetyShield(gym.make_vec(env_id, 3), certificate)
+    env, envs = safety_shield(gym.make(env_id), certificate), vector_shield(gym.make_vec(env_id, 3), certificate)
     plant, reported = env.unwrapped.plant, [*infos(env, 60, share=1.0), *infos(envs, 60, share=1.0)]
     low, high = plant.input_ends
     for info in reported:
@@ -131,7 +131,7 @@ def test_actions_of_infos_are_those_that_stand_for_the_inputs(loop):
     assert all(np.abs(info["action_committed"]).min() < 1.0 for info in overridden)
 
 
-TWO_ENDED = LinearPlant(
+TWO_ENDED = linear_plant(
     A=[[0.9, 0.1], [0.0, 0.8]],
     B=[[0.0], [0.3]],
     state_limits=(-1.0, 1.0),
@@ -145,7 +145,7 @@ TWO_ENDED = LinearPlant(
 
 def test_actions_of_infos_move_another_environment_alike_also_where_limits_have_two_ends():
     settings = {"plant": TWO_ENDED, "disturbance": "box"}
-    shielded, bare = SafetyShield(NCSEnv(**settings)), NCSEnv(**settings)
+    shielded, bare = safety_shield(loop_env(**settings)), loop_env(**settings)
     one, other = shielded.reset(seed=3)[1], bare.reset(seed=3)[1]
     changed, rng = 0, np.random.default_rng(0)
     for _ in range(200):
@@ -159,7 +159,7 @@ def test_actions_of_infos_move_another_environment_alike_also_where_limits_have_
 
 def test_correction_is_what_the_docstring_says(loop):
     env_id, certificate = loop
-    steps = infos(SafetyShield(gym.make(env_id), certificate), 100, share=1.0)
+    steps = infos(safety_shield(gym.make(env_id), certificate), 100, share=1.0)
     assert any(info["shield_correction"] > 0.0 for info in steps)
     for info in steps:
         correction = np.linalg.norm(info["input_committed"] - info["input_proposed"])
@@ -229,10 +229,10 @@ def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
 @pytest.mark.parametrize("mode", ["project", "monitor", "lookahead"])
 def test_nobody_changes_a_shield_by_writing_into_what_it_told(loop, mode):
     env_id, certificate = loop
-    assert_tells_what_is_the_listeners_own(lambda: SafetyShield(gym.make(env_id), certificate, mode))
+    assert_tells_what_is_the_listeners_own(lambda: safety_shield(gym.make(env_id), certificate, mode))
 
     def many(reset):
-        return VectorSafetyShield(gym.make_vec(env_id, autoreset_mode=reset, **FEW), certificate, mode)
+        return vector_shield(gym.make_vec(env_id, autoreset_mode=reset, **FEW), certificate, mode)
 
     for reset in VECTORS:
         assert_tells_what_is_the_listeners_own(lambda reset=reset: many(reset))
@@ -264,11 +264,11 @@ def test_nobody_changes_a_network_by_writing_into_what_it_told(kind, network):
         )
 
 
-FAMILY = {"plant": LinearPlant.family(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)}
+FAMILY = {"plant": family_of(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)}
 CONVOY = "ncs_gym/ConvoyOnRequest-v0"
 TRUCK = EstimateFilterSettings("trusting", certificate_of(gym.make(ENVIRONMENTS[0]).unwrapped.plant))
 OTHERS = {
-    "a plant that varies": lambda: NCSEnv(**FAMILY),
+    "a plant that varies": lambda: loop_env(**FAMILY),
     "plants that vary": lambda: gym.make_vec("ncs_gym/LinearNCS-v0", **FEW, **FAMILY),
     "requests": lambda: RequestActions(gym.make(CONVOY), 0.1),
     "requests of many": lambda: VectorRequestActions(gym.make_vec(CONVOY, **FEW), 0.1),

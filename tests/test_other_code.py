@@ -8,7 +8,7 @@ from gymnasium.envs.registration import WrapperSpec
 from gymnasium.wrappers import vector
 from stable_baselines3.common.env_util import make_vec_env
 
-from shields import SafetyShield, VectorSafetyShield
+from tests.product import safety_shield, vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 # Steps of an episode, and of runs that need not end.
@@ -58,7 +58,7 @@ def bare():
 
 @pytest.fixture(scope="module")
 def shielded(certificate):
-    return play(SafetyShield(gym.make(CRUISE), certificate, penalty=0.5), SOME, 1)
+    return play(safety_shield(gym.make(CRUISE), certificate, penalty=0.5), SOME, 1)
 
 
 @pytest.mark.parametrize("name", SCALAR)
@@ -72,9 +72,9 @@ def test_wrappers_leave_the_bare_environment_as_it_is(name, bare):
 @pytest.mark.parametrize("name", SCALAR)
 def test_wrappers_change_no_decision_on_either_side_of_the_shield(name, order, shielded, certificate):
     if order == "outside":
-        env = SCALAR[name](SafetyShield(gym.make(CRUISE), certificate, penalty=0.5))
+        env = SCALAR[name](safety_shield(gym.make(CRUISE), certificate, penalty=0.5))
     else:
-        env = SafetyShield(SCALAR[name](gym.make(CRUISE)), certificate, penalty=0.5)
+        env = safety_shield(SCALAR[name](gym.make(CRUISE)), certificate, penalty=0.5)
     wrapped = play(env, SOME, 1)
     assert shielded[2][-1]["episode_interventions"] > 0
     assert wrapped[2][-1]["shield_guaranteed"]
@@ -84,8 +84,8 @@ def test_wrappers_change_no_decision_on_either_side_of_the_shield(name, order, s
 
 def test_recorded_return_pays_the_penalty_only_where_the_recorder_is_outside_the_shield(certificate):
     record = wrappers.RecordEpisodeStatistics
-    _, rewards, outside = play(record(SafetyShield(gym.make(CRUISE), certificate, penalty=0.5)), STEPS, 1)
-    _, same, inside = play(SafetyShield(record(gym.make(CRUISE)), certificate, penalty=0.5), STEPS, 1)
+    _, rewards, outside = play(record(safety_shield(gym.make(CRUISE), certificate, penalty=0.5)), STEPS, 1)
+    _, same, inside = play(safety_shield(record(gym.make(CRUISE)), certificate, penalty=0.5), STEPS, 1)
     np.testing.assert_array_equal(rewards, same)
     paid = 0.5 * outside[-1]["episode_interventions"]
     assert paid > 0.0
@@ -99,7 +99,7 @@ def test_vector_recorder_adds_up_what_the_vector_environment_pays(mode, shielded
     count, limit = 3, 20
     env = gym.make_vec(CRUISE, num_envs=count, max_episode_steps=limit, autoreset_mode=mode)
     if shielded:
-        env = VectorSafetyShield(env, certificate, penalty=0.5)
+        env = vector_shield(env, certificate, penalty=0.5)
     env = vector.RecordEpisodeStatistics(env)
     _, rewards, infos = play(env, 45, count, 1)
     first = infos[limit]
@@ -123,8 +123,8 @@ def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, orde
         if order == "bare":
             return wrap(env)
         if order == "outside":
-            return wrap(VectorSafetyShield(env, certificate, penalty=0.5))
-        return VectorSafetyShield(wrap(env), certificate, penalty=0.5)
+            return wrap(vector_shield(env, certificate, penalty=0.5))
+        return vector_shield(wrap(env), certificate, penalty=0.5)
 
     plain, wrapped = play(make(lambda env: env), 45, count, 1), play(make(VECTOR[name]), 45, count, 1)
     np.testing.assert_array_equal(plain[1], wrapped[1])
@@ -136,7 +136,7 @@ def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, orde
 
 def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificate):
     env = gym.make_vec(CRUISE, num_envs=3, autoreset_mode="Disabled")
-    env = vector.RecordEpisodeStatistics(VectorSafetyShield(env, certificate))
+    env = vector.RecordEpisodeStatistics(vector_shield(env, certificate))
     env.reset(seed=0)
     for action in actions(5, 3, 1):
         env.step(action)
@@ -147,7 +147,7 @@ def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificat
 
 def wrapped_outside_monitor(keywords, **settings):
     return make_vec_env(
-        CRUISE, seed=0, wrapper_class=SafetyShield, wrapper_kwargs=settings, monitor_kwargs={"info_keywords": keywords}
+        CRUISE, seed=0, wrapper_class=safety_shield, wrapper_kwargs=settings, monitor_kwargs={"info_keywords": keywords}
     )
 
 

@@ -1,16 +1,15 @@
 """Published plants under attack: limits with two ends and limits of rates, and what share of a box could be kept."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks import published as script
 from experiments.commands.attack import attacked, worst_case
-from ncs_gym import LinearPlant, NCSVectorEnv, certified_error_set
-from shields import VectorSafetyShield
+from ncs_gym import certified_error_set
 from tests.certificates import certificate_of
+from tests.product import altered, linear_plant, vector_env, vector_shield
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
 
 
@@ -22,7 +21,7 @@ def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
 
     def counts_of(mode):
         settings = {"plant": plant, "contract": CONTRACT, "channel": CHANNEL} | worst_case(certificate)
-        shield = VectorSafetyShield(NCSVectorEnv(100, **settings), certificate, mode, on_unproved="ignore")
+        shield = vector_shield(vector_env(100, **settings), certificate, mode, on_unproved="ignore")
         return sum(attacked(shield, np.random.default_rng(0)), Counter())
 
     counts = counts_of("project")
@@ -47,9 +46,9 @@ def test_a_plant_has_a_row_of_its_share_and_one_of_its_attack(capsys, monkeypatc
 def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
     """x+ = 1.25 x + u with |u| <= 1: from |x| <= 4; that of the other state is kept, whatever the sign of its row."""
     exact = {"dt": 0.1, "disturbance_bound": 0.01, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=np.diag([1.25, 0.5]), B=np.eye(2, 1), box=np.diag([0.1, -1.0]), u_max=1.0, **exact)
+    plant = linear_plant(A=np.diag([1.25, 0.5]), B=np.eye(2, 1), box=np.diag([0.1, -1.0]), u_max=1.0, **exact)
     assert script.largest_share(plant) == pytest.approx(0.4, abs=0.01)
-    assert script.largest_share(replace(plant, box=np.array([[0.1, 0.0]]))) is None
+    assert script.largest_share(altered(plant, box=np.array([[0.1, 0.0]]))) is None
 
 
 @pytest.mark.parametrize("name", ["spacecraft", "tvc_rocket", "propofol", "heli_tondel"])

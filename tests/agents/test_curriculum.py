@@ -15,18 +15,18 @@ from ncs_gym import (
     VectorNetworked,
     VectorRandomChannel,
 )
-from shields import SafetyShield, VectorSafetyShield
+from tests.product import safety_shield, vector_shield
 
 ID, CLASSIC = "ncs_gym/TruckTrailerCruise-v0", "CartPole-v1"
 ASKS = {"channel": Channel(on_request=True, max_consecutive_losses=1)}
 
 
 def shield():
-    return SafetyShield(gym.make(ID))
+    return safety_shield(gym.make(ID))
 
 
 def shields():
-    return VectorSafetyShield(gym.make_vec(ID, num_envs=2))
+    return vector_shield(gym.make_vec(ID, num_envs=2))
 
 
 def test_channel_of_a_shield_is_not_set_through_stable_baselines3_or_the_adapter():
@@ -101,7 +101,7 @@ def test_specification_of_vector_wrappers_makes_no_environments_without_them():
     for other in (gym.make_vec(CLASSIC, num_envs=2), gym.make_vec(ID, num_envs=2, vectorization_mode="sync")):
         with pytest.raises(ValueError, match="VectorRandomChannel is for an NCSVectorEnv"):
             VectorRandomChannel(other, [Channel()])
-    made_of = [VectorSafetyShield(envs), VectorRandomChannel(envs, [Channel()]), CostPenalty(envs, 1.0)]
+    made_of = [vector_shield(envs), VectorRandomChannel(envs, [Channel()]), CostPenalty(envs, 1.0)]
     made_of.append(VectorNetworked(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"), Channel(delay=1)))
     for env in made_of:
         assert env.spec.additional_wrappers[-1].name == type(env).__name__

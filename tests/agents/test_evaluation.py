@@ -7,11 +7,12 @@ from gymnasium.vector import VectorWrapper
 
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
-from ncs_gym import Channel, LinearPlant
+from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import certificate_for
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
+from tests.product import linear_plant
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 
@@ -38,7 +39,7 @@ def scalar(monkeypatch):
 
 
 def test_steps_of_its_trajectory_that_cost_are_told():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], dt=0.1, box=[1.0, 1.0], u_max=0.3, du_max=0.5,
         disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001,
     )  # fmt: skip

@@ -23,8 +23,8 @@ from agents import (
 )
 from agents.results import HISTORY_FILE, history_document
 from ncs_gym import truck_trailer
-from shields import SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
+from tests.product import safety_shield, vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 SMALL = {"n_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
@@ -157,7 +157,7 @@ def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
         model = SAC("MlpPolicy", env, learning_starts=50, replay_buffer_class=AppliedActionBuffer, seed=0)
         model.learn(60)
 
-    shield = partial(SafetyShield, gym.make(CRUISE))
+    shield = partial(safety_shield, gym.make(CRUISE))
     learn(gym.wrappers.RescaleAction(shield(), np.float32(-3.0), np.float32(5.0)))  # stable-baselines3 scales, too
     turned = gym.wrappers.TransformAction(shield(), lambda action: -0.5 * action, shield().action_space)
     with pytest.raises(ValueError, match="a wrapper outside the shield changes actions"):
@@ -167,6 +167,6 @@ def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
 
 
 def test_agent_trained_behind_a_filter_says_so_in_its_files(loop, tmp_path):
-    filtered = LoopConfig(env=CRUISE, filter=partial(VectorSafetyShield, certificate=loop.shield.certificate))
+    filtered = LoopConfig(env=CRUISE, filter=partial(vector_shield, certificate=loop.shield.certificate))
     train(filtered, 128, 0, hyperparams=SMALL).agent.save(tmp_path)
     assert Agent.load(tmp_path).is_filtered

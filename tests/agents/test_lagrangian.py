@@ -8,7 +8,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents.callbacks import DualAscentCallback
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from agents.training import train
-from ncs_gym import NCSEnv, truck_trailer
+from ncs_gym import truck_trailer
+from tests.product import loop_env
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = dict(n_envs=4, n_steps=50, batch_size=200, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
@@ -56,9 +57,9 @@ def test_multiplier_falls_below_the_limit_but_not_below_zero():
 
 def test_an_episode_is_as_long_as_the_environment_says():
     gym.register(
-        "Own50-v0", entry_point=lambda **kwargs: NCSEnv(truck_trailer(mass=4000.0), **kwargs), max_episode_steps=50
+        "Own50-v0", entry_point=lambda **kwargs: loop_env(truck_trailer(mass=4000.0), **kwargs), max_episode_steps=50
     )
-    gym.register("OwnWithoutEnd-v0", entry_point=lambda **kwargs: NCSEnv(truck_trailer(), **kwargs))
+    gym.register("OwnWithoutEnd-v0", entry_point=lambda **kwargs: loop_env(truck_trailer(), **kwargs))
     settings = LagrangianSettings(cost_limit=2.0, multiplier=1.0)
     for env, kwargs, steps in (
         ("Own50-v0", {}, 50),

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from agents import LoopConfig, SB3VecEnv, train
 from ncs_gym import Channel, VectorNetworked, VectorRequestActions
 from shields import SafetyShield, VectorSafetyShield
+from tests.product import vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -131,7 +132,7 @@ def test_options_reach_the_environment_once():
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_sums_over_the_infos_are_those_over_the_arrays(mode):
-    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20, autoreset_mode=mode))
+    shield = vector_shield(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20, autoreset_mode=mode))
     env = SB3VecEnv(shield, info_keywords=SUMMED)
     env.reset()
     sums, arrays, ends = dict.fromkeys(SUMMED, 0.0), dict.fromkeys(SUMMED, 0.0), 0
@@ -154,7 +155,7 @@ ENDS = "episode", "terminal_observation", "episode_violations", "is_success", "e
 
 
 def test_infos_of_a_step_are_plain_dictionaries_of_what_callbacks_read():
-    env = SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3)))
+    env = SB3VecEnv(vector_shield(gym.make_vec(CRUISE, num_envs=3)))
     env.reset()
     infos = env.step(np.ones((3, 1), np.float32))[3]
     shields = {"shield_intervened", "shield_correction", "shield_guaranteed"}
@@ -241,7 +242,7 @@ def test_dictionary_observations_are_refused():
 
 
 def test_attributes():
-    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3), mode="switch")
+    shield = vector_shield(gym.make_vec(CRUISE, num_envs=3), mode="switch")
     env = SB3VecEnv(RecordEpisodeStatistics(shield))
     assert env.get_attr("render_mode") == [None] * 3
     assert env.get_attr("plant", [0, 2]) == [shield.unwrapped.plant] * 2

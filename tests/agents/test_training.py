@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from agents import SafetyCallback, SB3VecEnv, evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
-from shields import SafetyShield
 from tests.certificates import certificate_of
+from tests.product import safety_shield
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=2)
@@ -281,7 +281,7 @@ class Totals(BaseCallback):
 
 @pytest.mark.parametrize("order", [1, -1], ids=["bare first", "shielded first"])
 def test_overrides_are_counted_where_only_some_environments_have_a_shield(order, certificate):
-    makes = [lambda: gym.make(CRUISE.env), lambda: SafetyShield(gym.make(CRUISE.env), certificate)]
+    makes = [lambda: gym.make(CRUISE.env), lambda: safety_shield(gym.make(CRUISE.env), certificate)]
     counted, totals = SafetyCallback(), Totals()
     model = PPO("MlpPolicy", DummyVecEnv(makes[::order]), n_steps=64, batch_size=64, n_epochs=1, seed=0)
     model.learn(256, callback=[counted, totals])

@@ -24,6 +24,7 @@ from shields import Certificate, CertificateError
 from shields.json_documents import document_of
 from shields.verification.between_samples import between_conditions
 from tests.certificates import certificate_of
+from tests.product import altered, sampled_plant
 
 pytestmark = pytest.mark.filterwarnings("ignore:the times in")
 
@@ -232,7 +233,7 @@ def stiff(speed, points=64):
     """A plant with a state that follows its input so many times faster than the other."""
     model = np.array([[-1.0, 1.0], [0.0, -speed]]), np.array([[0.0], [speed]]), np.eye(2), np.zeros((2, 1))
     bounds = {name: [1e-3, 1e-3] for name in ("disturbance_bound", "sensor_bound", "initial_bound")}
-    return LinearPlant.from_statespace(model, dt=0.1, box=[1.0, 1.0], u_max=1.0, between_samples=points, **bounds)
+    return sampled_plant(model, dt=0.1, box=[1.0, 1.0], u_max=1.0, between_samples=points, **bounds)
 
 
 def grid_conditions(plant):
@@ -258,7 +259,7 @@ def test_bound_between_grid_points_is_hardly_more_than_it_has_to_be(speed):
     """The plant's own eta is one percent more than needed, of which the verification leaves most."""
     plant = stiff(speed)
     rows = plant.grid_rows
-    other = replace(plant)
+    other = altered(plant)
     other.__dict__["grid_rows"] = rows._replace(remainder=0.98 * rows.remainder)
     assert all(each.holds for each in grid_conditions(plant))
     assert not all(each.holds for each in grid_conditions(other))

@@ -7,10 +7,9 @@ from gymnasium import wrappers
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, NCSVectorEnv
-from ncs_gym.envs.env import NCSEnv
-from shields import SafetyShield, VectorSafetyShield
+from ncs_gym import Channel
 from tests.fuzz import NOTHING_USABLE, examples
+from tests.product import loop_env, safety_shield, vector_env, vector_shield
 
 # Inside a safe set, and outside of any.
 CHANNEL = Channel(0.3, quantization_step=0.05, send_period=2, delay=1, jitter=1)
@@ -63,11 +62,11 @@ def pair(kind, certificate, loaded):
         "disturbance": "sphere",
     }
     if kind == "scalar":
-        return [NCSEnv(**settings) for _ in range(2)], None
+        return [loop_env(**settings) for _ in range(2)], None
     if kind == "shield":
-        return [SafetyShield(NCSEnv(**settings), certificate) for _ in range(2)], None
-    many = [NCSVectorEnv(2, max_episode_steps=6, **settings) for _ in range(2)]
-    return [VectorSafetyShield(env, certificate) for env in many] if kind == "vector shield" else many, 2
+        return [safety_shield(loop_env(**settings), certificate) for _ in range(2)], None
+    many = [vector_env(2, max_episode_steps=6, **settings) for _ in range(2)]
+    return [vector_shield(env, certificate) for env in many] if kind == "vector shield" else many, 2
 
 
 @pytest.mark.parametrize("kind", ["scalar", "vector", "shield", "vector shield"])
@@ -141,13 +140,13 @@ def stacked(env, names):
 )
 @examples(40)
 def test_a_stack_is_refused_or_its_proof_is_right(certificate, loaded, inside, outside, mode, start, seed):
-    env = stacked(NCSEnv(loaded, Channel(0.5, quantization_step=0.05, delay=1), disturbance="adversarial"), inside)
+    env = stacked(loop_env(loaded, Channel(0.5, quantization_step=0.05, delay=1), disturbance="adversarial"), inside)
     changed = sorted(set(inside) & set(CHANGING))
     if changed:
         with pytest.raises(ValueError, match=r"changes (or repeats actions|the action space)"):
-            SafetyShield(env, certificate, mode)
+            safety_shield(env, certificate, mode)
         return
-    shield = SafetyShield(env, certificate, mode)
+    shield = safety_shield(env, certificate, mode)
     assert_proof_is_right(stacked(shield, outside), shield, certificate, start, seed)
 
 
@@ -170,7 +169,7 @@ def assert_proof_is_right(env, shield, certificate, start, seed):
 
 def test_a_wrapper_that_turns_actions_is_found_out(certificate, loaded):
     for what in MEDDLERS:
-        shield = SafetyShield(MEDDLERS[what](NCSEnv(loaded)), certificate)
+        shield = safety_shield(MEDDLERS[what](loop_env(loaded)), certificate)
         shield.reset(seed=0)
         info = shield.step(np.array([1.0], np.float32))[-1]
         assert not info["shield_guaranteed"]

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from benchmarks.random_plants import badly_scaled_plant
 from benchmarks.synthesis import outcome
 from ncs_gym import Channel, ChannelContract, certified_error_set
-from ncs_gym.envs.env import NCSEnv
-from shields import Infeasible, SafetyShield, synthesize
+from shields import Infeasible
 from tests.fuzz import examples, plants
+from tests.product import loop_env, safety_shield, synthesize
 from tests.verdicts import verified
 
 SIZES = [
@@ -84,7 +84,7 @@ def test_many_random_plants_under_contracts_get_a_certificate_or_a_reason(plant,
 def test_a_shield_holds_in_whatever_units(seed):
     plant = badly_scaled_plant(seed, 3, 2, 6.0, 0.99)
     certificate = judged(plant)
-    env = SafetyShield(NCSEnv(plant, Channel(0.5), disturbance="adversarial"), certificate)
+    env = safety_shield(loop_env(plant, Channel(0.5), disturbance="adversarial"), certificate)
     env.reset(seed=seed)
     rng, interventions = np.random.default_rng(seed), 0
     for _ in range(150):

@@ -20,10 +20,11 @@ import pytest
 
 import ncs_gym
 from agents import Agent
-from ncs_gym import ChannelContract, LinearPlant
-from shields import Certificate, SafetyFilter, verify
+from ncs_gym import ChannelContract
+from shields import Certificate, verify
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.certificates import ROOT, certificate_of
+from tests.product import altered, family_of, linear_plant, safety_filter, sampled_plant, synthesize
 from tests.second_verifier.verify import verify_again
 
 on_x86 = pytest.mark.skipif(
@@ -53,7 +54,7 @@ def random_plant(index):
         A = A - 0.5 * float(np.abs(A).sum(axis=1).max()) * np.eye(n)
     bounds = {"disturbance_bound": 0.004 * np.ones(n), "sensor_bound": 0.003 * np.ones(n), "initial_bound": 0.003}
     model = (A, B, np.eye(n), np.zeros((n, m)))
-    plant = LinearPlant.from_statespace(model, 0.1, box=np.ones(n), u_max=np.full(m, 2.0), **bounds)
+    plant = sampled_plant(model, 0.1, box=np.ones(n), u_max=np.full(m, 2.0), **bounds)
     return plant, ChannelContract(1 + index % 3) if index % 2 or not is_stable else None
 
 
@@ -78,11 +79,11 @@ def plants_around_points():
         bounds = {"disturbance_bound": (np.eye(3), *ends), "sensor_bound": 0.01, "initial_bound": 0.01}
         rests = {"operating_state": [0.3, 0.7, 33.3], "operating_input": [0.1, 30.1]}
         B = [[0.2 * k, 0.01], [0.0, 0.03], [0.1, 0.5]]
-        return LinearPlant(A=A, B=B, dt=0.1, **limits, **bounds, **rests, **more)
+        return linear_plant(A=A, B=B, dt=0.1, **limits, **bounds, **rests, **more)
 
     for index in rng.integers(0, 99, 3).tolist():
         found[f"point {index}"] = of(index)
-        found[f"family {index}"] = LinearPlant.family([of(index), of(index, 1.01)], at_rest=True)
+        found[f"family {index}"] = family_of([of(index), of(index, 1.01)], at_rest=True)
     return found
 
 
@@ -116,7 +117,7 @@ def print_plants_and_verdicts(folder):
 
 def make_certificates(folder):
     """Saves a certificate of every plant that has one."""
-    from shields import Infeasible, synthesize
+    from shields import Infeasible
 
     for name, (plant, contract) in all_plants().items():
         try:
@@ -206,7 +207,7 @@ def test_verdicts_are_true_in_any_order_of_summation(name):
     certificate = certificate_of(plant, env.certificate_contract)
     shape = certificate.error_shapes[0]
     orders = [np.arange(plant.n), np.arange(plant.n)[::-1], rng.permutation(plant.n)]
-    filters = [SafetyFilter(*reordered(certificate, plant, order)) for order in orders]
+    filters = [safety_filter(*reordered(certificate, plant, order)) for order in orders]
     passed = 0
     for _ in range(60):
         direction = rng.standard_normal(plant.n)
@@ -233,7 +234,7 @@ def reordered(certificate, plant, order):
         for name, bound in (("disturbance_bound", plant.disturbance_bound), ("initial_bound", plant.initial_bound))
     }
     names = {name: [getattr(plant, name)[i] for i in order] for name in ("state_names", "state_units")}
-    turned = replace(
+    turned = altered(
         plant,
         A=plant.A[square],
         B=plant.B[order],

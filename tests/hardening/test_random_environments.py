@@ -8,9 +8,9 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, ChannelContract, ErrorSetError, LinearPlant, NCSVectorEnv
-from ncs_gym.envs.env import NCSEnv
+from ncs_gym import Channel, ChannelContract, ErrorSetError
 from tests.fuzz import environment_settings, examples, plants
+from tests.product import linear_plant, loop_env, vector_env
 
 # A plant so strongly coupled that float64 holds no error set is refused by name.
 REFUSED = (ErrorSetError,)
@@ -34,7 +34,7 @@ def made(kind, *arguments, **settings):
 
 
 def run_scalar(settings, seed, steps):
-    env = made(NCSEnv, **settings)
+    env = made(loop_env, **settings)
     if env is None:
         return
     observation, info = env.reset(seed=seed)
@@ -60,7 +60,7 @@ def not_square(error, info):
 
 
 def run_vector(settings, seed, steps, mode):
-    env = made(NCSVectorEnv, 3, max_episode_steps=7, autoreset_mode=mode, **settings)
+    env = made(vector_env, 3, max_episode_steps=7, autoreset_mode=mode, **settings)
     if env is None:
         return
     observation, info = env.reset(seed=seed)
@@ -89,7 +89,7 @@ def test_random_vector_environments_run(settings, seed, mode):
 @given(settings=environment_settings(most_states=3, units=3.0), seed=st.integers(0, 1000))
 @examples(8)
 def test_random_environments_pass_the_checks_of_gymnasium(settings, seed):
-    env = made(NCSEnv, **settings)
+    env = made(loop_env, **settings)
     if env is not None:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -109,7 +109,7 @@ def test_many_random_environments_run(settings, seed, mode):
 def test_unstable_plants_are_refused_or_stay_finite_when_their_contract_is_broken(plant, age, seed):
     contract = ChannelContract(age, quantization_step=0.05)
     settings = {"plant": plant, "channel": Channel(1.0), "contract": contract}
-    env, many = made(NCSEnv, **settings), made(NCSVectorEnv, 2, **settings)
+    env, many = made(loop_env, **settings), made(vector_env, 2, **settings)
     assert (env is None) == (many is None)
     if env is not None:
         run_away(env, seed, 200)
@@ -130,8 +130,8 @@ def run_away(env, seed, steps):
 @pytest.mark.parametrize("many", [False, True])
 def test_an_unstable_plant_left_alone_stays_finite_for_ever(many):
     # What doubles at every step is larger than the largest float after 1,100 of them.
-    plant = LinearPlant(A=[[2.0]], B=[[1.0]], box=[1.0], u_max=3.0, dt=0.1, gamma=1e-6, sensor_bound=1e-3,
+    plant = linear_plant(A=[[2.0]], B=[[1.0]], box=[1.0], u_max=3.0, dt=0.1, gamma=1e-6, sensor_bound=1e-3,
                         initial_bound=1e-3)  # fmt: skip
     settings = {"plant": plant, "channel": Channel(1.0), "contract": ChannelContract(1)}
-    env = NCSVectorEnv(2, **settings) if many else NCSEnv(**settings)
+    env = vector_env(2, **settings) if many else loop_env(**settings)
     run_away(env, 0, 1200)

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, Estimator, NCSEnv, NCSVectorEnv, Packet, certified_error_set
+from ncs_gym import Channel, Estimator, NCSEnv, Packet, certified_error_set
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
 from ncs_gym.estimation.estimator import Estimate
 from ncs_gym.estimation.vector_estimator import VectorEstimator
+from tests.product import loop_env, vector_env
 from tests.shields.attacks.adversary import Traffic
 
 EPISODE = 300
@@ -41,7 +42,7 @@ def growth(env, steps, warm_up):
 
 
 def many(plant, count):
-    return NCSVectorEnv(count, plant=plant, channel=CHANNEL, max_episode_steps=EPISODE)
+    return vector_env(count, plant=plant, channel=CHANNEL, max_episode_steps=EPISODE)
 
 
 def run_estimators(plant, count, episodes):
@@ -95,7 +96,7 @@ def forgotten(monkeypatch):
 
 def test_a_long_run_does_not_grow(loaded):
     assert growth(many(loaded, 64), 800, 500) < MOST_GROWTH
-    assert growth(NCSEnv(loaded, CHANNEL), 1500, 700) < MOST_GROWTH
+    assert growth(loop_env(loaded, CHANNEL), 1500, 700) < MOST_GROWTH
 
 
 @pytest.mark.slow
@@ -112,10 +113,8 @@ def test_long_runs_of_estimators_do_not_drift(loaded):
 
 @pytest.mark.slow
 def test_ten_million_steps_do_not_grow(loaded):
-    assert (
-        growth(NCSVectorEnv(1024, plant=loaded, channel=CHANNEL, max_episode_steps=EPISODE), 9800, 2000) < MOST_GROWTH
-    )
-    assert growth(NCSEnv(loaded, CHANNEL), 1_000_000, 20_000) < MOST_GROWTH
+    assert growth(vector_env(1024, plant=loaded, channel=CHANNEL, max_episode_steps=EPISODE), 9800, 2000) < MOST_GROWTH
+    assert growth(loop_env(loaded, CHANNEL), 1_000_000, 20_000) < MOST_GROWTH
 
 
 @pytest.mark.slow
@@ -124,6 +123,6 @@ def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, forgotten, mo
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 4000)
     # Where many samples are late, histories hardly recur: the graph is full again and again.
     settings = {"plant": loaded, "channel": Channel(0.5, jitter=4)}
-    env = NCSEnv(**settings) if size == 1 else NCSVectorEnv(size, max_episode_steps=EPISODE, **settings)
+    env = loop_env(**settings) if size == 1 else vector_env(size, max_episode_steps=EPISODE, **settings)
     assert growth(env, 1_000_000 // size, 400_000 // size) < MOST_GROWTH
     assert len(forgotten) > 3

@@ -18,6 +18,7 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
+from tests.product import loop_env
 
 ID = "ncs_gym/TruckTrailerCruise-v0"
 DOWNLINK = {"downlink": Channel(delay=1), "downlink_contract": ChannelContract(2)}
@@ -50,8 +51,8 @@ def test_settings_of_an_estimator_and_those_behind_wrappers_are_not_set():
 def test_contract_of_the_downlink_is_the_one_given_or_what_its_settings_guarantee(make):
     env = make().unwrapped
     assert env.downlink_contract == ChannelContract(2)
-    assert NCSEnv(env.plant, downlink=Channel(delay=1)).downlink_contract == ChannelContract(1)
-    assert NCSEnv(env.plant).downlink_contract is None
+    assert loop_env(env.plant, downlink=Channel(delay=1)).downlink_contract == ChannelContract(1)
+    assert loop_env(env.plant).downlink_contract is None
 
 
 def test_what_estimators_share_cannot_be_written_to():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import gymnasium as gym
@@ -10,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Channel, ChannelContract, LinearPlant, Packet, truck_trailer
+from ncs_gym import Channel, ChannelContract, Packet, truck_trailer
 from ncs_gym.network import downlink_protocol
-from shields import Certificate, Infeasible, SafeLoop, SafetyFilter, synthesize, verify
+from shields import Certificate, Infeasible, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
@@ -21,6 +20,7 @@ from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import servo, swinging, with_radii
+from tests.product import altered, library_plant, safe_loop, safety_filter, sampled_plant, synthesize
 from tests.second_verifier.verify import verify_again
 from tests.shields.runtime.batches import decided_alike
 from tests.verdicts import verified
@@ -33,7 +33,7 @@ FINE = 200
 def found(name, points=None):
     """Plant and certificates, with ellipsoid and with polytope, of a registered environment."""
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    plant = replace(env.plant, between_samples=points)
+    plant = altered(env.plant, between_samples=points)
     wide = certificate_of(plant, env.certificate_contract, "polytope")
     return plant, wide.without_polytope(), wide
 
@@ -79,7 +79,7 @@ def test_no_state_between_samples_is_outside_and_without_it_some_are(name, kind,
     for points in (None, IDS[name]):
         loop = found(name, points)
         plant, certificate = loop[0], loop[kind]
-        shield, most = SafetyFilter(certificate, plant, mode=mode), 0.0
+        shield, most = safety_filter(certificate, plant, mode=mode), 0.0
         for shape in certificate.error_shapes[[0, -1]]:
             x = certificate.safe_set.sample_boundary(rng, 3000).T * rng.choice([1.0, 1.0, 0.9], 3000)
             e = rng.standard_normal((plant.n, 3000))
@@ -99,7 +99,7 @@ def test_no_state_between_samples_is_outside_and_without_it_some_are(name, kind,
 def test_single_decisions_are_those_of_many(mode, kind):
     loop = found("TruckTrailerCruise", 8)
     plant, certificate = loop[0], loop[kind]
-    shield, rng = SafetyFilter(certificate, plant, mode=mode), np.random.default_rng(0)
+    shield, rng = safety_filter(certificate, plant, mode=mode), np.random.default_rng(0)
     shapes = np.tile(certificate.error_shapes[0], (300, 1, 1))
     decided_alike(shield, rng.uniform(-2.0, 2.0, (300, 2)), shapes, rng.uniform(-4.0, 4.0, (300, 1)))
 
@@ -126,10 +126,10 @@ def test_certificate_says_when_its_claim_holds_and_its_file_keeps_it(tmp_path):
 @pytest.mark.slow
 def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_certificate():
     env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
-    plant = replace(env.plant, gamma=0.43)
+    plant = altered(env.plant, gamma=0.43)
     synthesize(plant, safe_set="ellipsoid")
     with feasible_age_not_sought(), pytest.raises(Infeasible, match="between"):
-        synthesize(replace(plant, between_samples=2))
+        synthesize(altered(plant, between_samples=2))
 
 
 @pytest.mark.slow
@@ -180,7 +180,7 @@ def test_plans_are_certified_only_if_every_time_between_samples_is_inside(horizo
 
 def test_before_the_first_decision_behind_a_downlink_times_between_samples_count():
     plant, _, wide = found("BatchReactor", 4)
-    shield, zero = SafetyFilter(wide, plant), np.zeros((2, 1))
+    shield, zero = safety_filter(wide, plant), np.zeros((2, 1))
     assert all(known.in_safe_set for known in starts_known(shield, np.zeros(4), 1))
     counts = {True: 0, False: 0}
     for x in 0.9999 * wide.polytope.sample_boundary(np.random.default_rng(0), 300):
@@ -206,7 +206,7 @@ def test_at_all_times_assumes_that_disturbances_within_a_step_respect_its_bound(
     A, B, dt, torque = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.0], [1.0]]), 3.1, 0.3
     G = np.pad(np.hstack([A, B]), ((0, 1), (0, 0)))
     times = [expm(G * tau)[:2] for tau in np.linspace(0.0, dt, 60)]
-    plant = LinearPlant.from_statespace(
+    plant = sampled_plant(
         (A, B, np.eye(2), np.zeros((2, 1))),
         dt=dt,
         box=[1.5, 1.0],
@@ -217,7 +217,7 @@ def test_at_all_times_assumes_that_disturbances_within_a_step_respect_its_bound(
         between_samples=32,
     )
     assert "by any time within a step" in " ".join(plant.assumptions)
-    loop, x = SafeLoop(certificate_of(plant, safe_set="polytope"), plant, Channel(), on_unproved="ignore"), np.zeros(2)
+    loop, x = safe_loop(certificate_of(plant, safe_set="polytope"), plant, Channel(), on_unproved="ignore"), np.zeros(2)
     rng, within, at_samples = np.random.default_rng(1), 0.0, 0.0
     loop.start(x)
     for step in range(800):
@@ -239,7 +239,7 @@ def test_inputs_on_their_way_at_a_start_in_the_middle_count_between_samples(mode
     times = [expm(np.pad(plant.continuous_model, ((0, 1), (0, 0))) * tau)[:2] for tau in np.linspace(0.0, 1.0, 201)]
     seen = 0
     for guess in np.linspace(0.0, 0.9, 10):
-        loop = SafeLoop(certificate, plant, Channel(), mode, downlink=Channel(delay=1), on_unproved="ignore")
+        loop = safe_loop(certificate, plant, Channel(), mode, downlink=Channel(delay=1), on_unproved="ignore")
         x, pending = np.zeros(2), [np.zeros(1)]
         loop.start(np.array([guess, 0.0]), known=False)
         for step in range(4):
@@ -257,8 +257,8 @@ def test_inputs_on_their_way_at_a_start_in_the_middle_count_between_samples(mode
 def test_a_passed_test_does_not_prove_a_step_that_began_where_nothing_did():
     tiny = 1e-12 * np.eye(2)
     settings = {"process_noise_cov": 0.0 * tiny, "initial_cov": tiny, "measurement_noise_cov": tiny, "gamma": 1e-8}
-    plant = truck_trailer(mass=1000.0, dt=0.2, between_samples=2, **settings)
-    loop = SafeLoop(certificate_of(plant, safe_set="polytope"), plant, channel=Channel(), on_unproved="ignore")
+    plant = library_plant(truck_trailer, mass=1000.0, dt=0.2, between_samples=2, **settings)
+    loop = safe_loop(certificate_of(plant, safe_set="polytope"), plant, channel=Channel(), on_unproved="ignore")
     x = np.array([1.9999946541265599, 0.27376498913178876])  # in the box, out of what the proof begins with
     loop.start(x)
     loop.receive()
@@ -278,10 +278,10 @@ def test_a_passed_test_does_not_prove_a_step_that_began_where_nothing_did():
 
 def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
     plant = swinging(damping=0.4, u_max=0.95)
-    safety_filter = SafetyFilter(certificate_of(plant, safe_set="polytope"), plant, "switch")
-    monitor = GuaranteeMonitor(safety_filter, downlink_protocol(Channel(delay=1), None))
-    small = safety_filter.errors_of(plant.initial_error.shape_matrix)
-    large = safety_filter.errors_of(np.diag([0.16, 9.0]))
+    switch = safety_filter(certificate_of(plant, safe_set="polytope"), plant, "switch")
+    monitor = GuaranteeMonitor(switch, downlink_protocol(Channel(delay=1), None))
+    small = switch.errors_of(plant.initial_error.shape_matrix)
+    large = switch.errors_of(np.diag([0.16, 9.0]))
     seen = LoopObservation(np.zeros(2), small, False, stays=True)
     passed = Decision(np.zeros(1), False, True, False, 1.0, "", np.empty((0, 1)))
     fallback = passed._replace(proved=False, fallback=True)

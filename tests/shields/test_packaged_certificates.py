@@ -15,12 +15,13 @@ import shields.packaged_certificates
 from ncs_gym import ChannelContract, contract_of
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import ENVIRONMENTS
-from shields import CertificateError, SafetyShield, certificate_for, synthesize
+from shields import CertificateError, certificate_for
 from shields.packaged_certificates import certificate_of_package
 from shields.synthesis.invariant_polytope import share_in_polytope
 from shields.verification import require_valid, verifier
 from tests.certificates import certificate_of
 from tests.plants import named, small
+from tests.product import altered, safety_shield, synthesize
 from tests.verdicts import verified
 
 UNASKED = count(1)
@@ -99,7 +100,7 @@ def test_certificate_of_the_package_is_taken_and_nothing_synthesized(calls, unas
 
 
 def test_shield_of_a_registered_id_synthesizes_nothing(calls):
-    one, other = (SafetyShield(gym.make("ncs_gym/CartPole-v0")) for _ in range(2))
+    one, other = (safety_shield(gym.make("ncs_gym/CartPole-v0")) for _ in range(2))
     assert one.certificate is other.certificate
     assert not calls
 
@@ -108,7 +109,7 @@ def test_other_plants_and_contracts_are_synthesized_once_and_that_is_said(calls,
     plant, contract = plant_and_contract("ncs_gym/CartPole-v0")
     assert certificate_for(plant, contract).contract == contract
     assert capfd.readouterr().err == ""
-    unasked = replace(plant, delta=0.04 * (1.0 + 1e-6 * next(UNASKED)))
+    unasked = altered(plant, delta=0.04 * (1.0 + 1e-6 * next(UNASKED)))
     for changed in [(unasked, ChannelContract(2)), (unasked, contract), (unasked, None)]:
         assert certificate_for(*changed) is certificate_for(*changed)
         assert calls.pop() == changed[:1]
@@ -127,21 +128,21 @@ def test_damaged_file_of_the_package_is_refused(unasked):
 
 def test_what_has_verified_is_not_verified_again_and_what_is_changed_is(monkeypatch, unasked):
     plant, certificate, _ = unasked
-    plant = replace(plant, gamma=(1.0 - 1e-9) * plant.gamma)  # with which the certificate still verifies
+    plant = altered(plant, gamma=(1.0 - 1e-9) * plant.gamma)  # with which the certificate still verifies
     certificate = replace(certificate, fingerprint=plant.fingerprint)
     judged, verify = [], verifier.verify
     monkeypatch.setattr(verifier, "verify", lambda *given: judged.append(given) or verify(*given))
     for _ in range(3):
-        require_valid(certificate, replace(plant))
+        require_valid(certificate, altered(plant))
     assert len(judged) == 1
     larger = replace(certificate, L=1.01 * certificate.L)
     for _ in range(2):  # what does not verify is not remembered
         with pytest.raises(CertificateError, match="does not verify"):
             require_valid(larger, plant)
     with pytest.raises(CertificateError, match="another plant"):
-        require_valid(certificate, replace(plant, delta=0.04))
+        require_valid(certificate, altered(plant, delta=0.04))
     assert len(judged) == 4
-    worn = replace(plant)
+    worn = altered(plant)
     assert worn.fingerprint == plant.fingerprint
     object.__setattr__(
         worn, "input_ends", 0.01 * worn.input_ends

@@ -9,23 +9,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, truck_trailer
-from shields import (
-    Certificate,
-    CertificateError,
-    Infeasible,
-    requirements,
-    synthesize,
-    verify,
-)
+from ncs_gym import truck_trailer
+from shields import Certificate, CertificateError, Infeasible, requirements, verify
 from shields.certificate import Proof
 from shields.json_documents import document_of
-from shields.paper import synthesize as paper_synthesis
 from shields.paper.algorithm import kappa_rho_grid, search_grid
 from shields.paper.bounds import covariance_bound, safety_margin, state_error_bound, uplink_error_bound
 from shields.synthesis.ellipsoid_certificates import certify
 from tests.certificates import certificate_of
 from tests.plants import named, servo, small
+from tests.product import altered, library_plant, linear_plant, paper_synthesis, synthesize
 
 Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
 SHARES = {"shares": np.array([0.9, 0.05, 0.05]), "inputs": np.array([0.5])}
@@ -44,12 +37,12 @@ def kept(name="stable", safe_set="ellipsoid"):
 
 def synthesized(box, gamma=1e-4):
     noise = {"gamma": gamma, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
-    return synthesize(LinearPlant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
+    return synthesize(linear_plant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
 
 
 def free_plant():
     """One of two states has no limit."""
-    return LinearPlant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=[1.0, np.inf], u_max=1.0, dt=0.1, gamma=1e-4)
+    return linear_plant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=[1.0, np.inf], u_max=1.0, dt=0.1, gamma=1e-4)
 
 
 def with_proofs(name, **changes):
@@ -76,13 +69,13 @@ REFUSED = [
     (lambda: synthesize(plant(), safe_set=["polytope"]), ValueError, "safe_set must be"),
     *(
         (
-            lambda name=name: paper_synthesis(replace(plant(), **{name: 1e-4})),
+            lambda name=name: paper_synthesis(altered(plant(), **{name: 1e-4})),
             ValueError,
             f"the paper's method knows gamma and covariances alone, not {name}",
         )
         for name in ("disturbance_bound", "sensor_bound", "initial_bound")
     ),
-    (lambda: paper_synthesis(truck_trailer(box=[[0.5, 0.0]])), Infeasible, "unbounded"),
+    (lambda: paper_synthesis(library_plant(truck_trailer, box=[[0.5, 0.0]])), Infeasible, "unbounded"),
     (
         lambda: certify(free_plant(), np.eye(2), np.ones((1, 2))),
         Infeasible,

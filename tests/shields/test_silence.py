@@ -9,16 +9,17 @@ import pytest
 from scipy.optimize import linprog
 
 import shields
-from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, Packet, TraceChannel, certified_error_set
+from ncs_gym import Channel, ChannelContract, Packet, TraceChannel, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import in_time
-from shields import CertificateError, VectorSafetyShield, certificate_for
+from shields import CertificateError, certificate_for
 from shields.silence import MOST_STEPS, way_back
 from shields.synthesis.faces import Extremes, Faces
 from shields.synthesis.polytope_certificates import certify_polytope
 from tests.certificates import certificate_of
 from tests.plants import named, small
+from tests.product import altered, linear_plant, sampled_plant, vector_env, vector_shield
 
 CASES = ("CartPole", "CSTR", "Convoy", "Pendulum", "drifts", "open")
 HEARD, SILENT = 24, 80
@@ -35,7 +36,7 @@ def registered(name):
         limits = {"state_limits": ([-1.0, -1.5], [2.0, np.inf]), "input_limits": ([-2.0], [1.0])}
         given = {"A": [[1.03, 0.1], [0.0, 0.8]], "B": [[0.1], [0.2]], "dt": 0.1, "sensor_bound": 0.003}
         plant, wide = (
-            LinearPlant(**given, **limits, initial_bound=0.003, disturbance_bound=each) for each in (0.003, 0.008)
+            linear_plant(**given, **limits, initial_bound=0.003, disturbance_bound=each) for each in (0.003, 0.008)
         )
         certificate = certificate_of(wide, ChannelContract(3, 0.001), "polytope")
         certificate = replace(certificate, fingerprint=plant.fingerprint)
@@ -141,7 +142,7 @@ def test_box_is_kept_in_silence_under_the_worst_disturbances(name):
     env = gym.make_vec(
         f"ncs_gym/{name}-v0", 64, channel=channel, disturbance="adversarial", terminate_on_violation=False
     )
-    shield = VectorSafetyShield(env, certificate, mode="switch", on_unproved="ignore")
+    shield = vector_shield(env, certificate, mode="switch", on_unproved="ignore")
     rng = np.random.default_rng(0)
     directions = rng.standard_normal((64, plant.n))
     starts = 0.45 * directions / certificate.polytope.gauge(directions)[:, None]
@@ -165,7 +166,7 @@ def test_a_resting_point_that_is_no_equilibrium_moves_the_estimate():
     """A certificate of larger disturbances may have one: its own hold what it lacks."""
     bounds = {"sensor_bound": 0.003, "initial_bound": 0.003}
     given = {"A": [[1.02, 0.05], [0.0, 0.9]], "B": [[0.1], [0.2]], "box": np.eye(2), "dt": 0.1, "u_max": 2.0}
-    plant, wide = (LinearPlant(**given, **bounds, disturbance_bound=each) for each in (0.001, 0.005))
+    plant, wide = (linear_plant(**given, **bounds, disturbance_bound=each) for each in (0.001, 0.005))
     found, x_c = certify_polytope(wide, np.array([[-0.87, -0.75]]), ChannelContract(3)), np.array([0.1, 0.0])
     moved = replace(
         found,
@@ -188,10 +189,10 @@ def test_box_is_kept_in_silence_whatever_an_agent_does():
     assert shields.silence_of(certificate.without_polytope(), plant).anywhere >= found.anywhere
     trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * 200
     settings = {"disturbance": "adversarial", "terminate_on_violation": False, "max_episode_steps": 1000}
-    env = NCSVectorEnv(
+    env = vector_env(
         64, plant=plant, channel=TraceChannel(trace=tuple(trace)), contract=certificate.contract, **settings
     )
-    shield, rng = VectorSafetyShield(env, certificate, on_unproved="ignore"), np.random.default_rng(0)
+    shield, rng = vector_shield(env, certificate, on_unproved="ignore"), np.random.default_rng(0)
     shield.reset(seed=0)
     pushed, ages, outside = rng.choice([-1.0, 1.0], (64, 1)).astype(np.float32), [], []
     for _ in range(len(trace) - 1):
@@ -215,9 +216,9 @@ def test_limits_within_a_step_only_shorten_it():
     certificate = certificate_of(plant, contract, "polytope").without_polytope()
     found = shields.silence_of(certificate, plant)
     at_samples = replace(
-        certificate, between_samples=None, fingerprint=replace(plant, between_samples=None).fingerprint
+        certificate, between_samples=None, fingerprint=altered(plant, between_samples=None).fingerprint
     )
-    longer = shields.silence_of(at_samples, replace(plant, between_samples=None))
+    longer = shields.silence_of(at_samples, altered(plant, between_samples=None))
     assert 1 <= found.anywhere <= longer.anywhere
     assert 1 <= found.at_rest <= longer.at_rest
 
@@ -229,7 +230,7 @@ def test_the_numbers_do_not_depend_on_units():
         bounds = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.003)
         given = {"A": [[1.02, 0.05], [0.0, 0.9]], "B": np.array([[0.1], [0.2]]) / unit, "box": np.eye(2), "dt": 0.1}
         cases = (2.0, {"disturbance_bound": 0.01}), (1.7, {})
-        wide, plant = (LinearPlant(**given | bounds | more, u_max=most * unit) for most, more in cases)
+        wide, plant = (linear_plant(**given | bounds | more, u_max=most * unit) for most, more in cases)
         certificate = certificate_of(wide, ChannelContract(3), "polytope")
         found = shields.silence_of(replace(certificate, fingerprint=plant.fingerprint), plant)
         return found.anywhere, found.at_half, found.at_rest
@@ -278,7 +279,7 @@ def test_ways_back_are_those_of_an_estimator_with_as_few_samples_as_the_contract
 
 
 def test_way_back_from_an_outage_after_which_the_covariance_is_no_longer_positive():
-    plant = LinearPlant.from_statespace(
+    plant = sampled_plant(
         ([[0.0, 1.0], [12.0, -0.3]], [[0.0], [4.0]], [[1.0, 0.0]], [[0.0]]), dt=0.02, box=[0.2, 1.0], u_max=3.0,
         disturbance_bound=[2e-4, 3e-3], sensor_bound=5e-4, initial_bound=[2e-3, 1e-2],
     )  # fmt: skip

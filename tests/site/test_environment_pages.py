@@ -3,9 +3,9 @@
 import gymnasium as gym
 import pytest
 
-from ncs_gym import Channel, LinearPlant, register_plant
+from ncs_gym import Channel, register_plant
 from ncs_gym.registration import registered_ids
-from shields import SafetyShield
+from tests.product import linear_plant, safety_shield
 from tests.site.hooks import site_hook
 
 SECTIONS = ["Description", "Action space", "Observation space", "Rewards", "Starting state", "Episode end", "Info"]
@@ -39,7 +39,7 @@ def test_every_environment_has_a_page_with_its_own_figures(pages, env_id):
     inner = env.unwrapped
     assert words(inner.plant) in words(section(page, "Description"))
     assert section(page, "Observation space").count("\n| ") == 1 + env.observation_space.shape[0]
-    assert words(SafetyShield(env).certificate) in words(section(page, "Certificate"))
+    assert words(safety_shield(env).certificate) in words(section(page, "Certificate"))
     assert "hold in exact arithmetic" in section(page, "Certificate")
     ends = "ends the episode" if inner.terminate_on_violation else "does not end the episode"
     assert ends in section(page, "Episode end")
@@ -47,7 +47,7 @@ def test_every_environment_has_a_page_with_its_own_figures(pages, env_id):
 
 def test_plant_that_is_registered_gets_a_page(pages):
     bounds = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.01)
-    plant = LinearPlant(A=[[0.9]], B=[[0.1]], box=[1.0], u_max=2.0, dt=1.0, **bounds)
+    plant = linear_plant(A=[[0.9]], B=[[0.1]], box=[1.0], u_max=2.0, dt=1.0, **bounds)
     register_plant("Pages/Tank-v0", plant, channel=Channel(loss=0.25, delay=3), max_episode_steps=77)
     try:
         page = pages.environment_page("Pages/Tank-v0")

@@ -13,15 +13,16 @@ from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
-from ncs_gym import Channel, LinearPlant, bound_violation_probability, register_plant
+from ncs_gym import Channel, bound_violation_probability, register_plant
+from tests.product import linear_plant
 
 # Its safe box is 2 % wider than the bound of its noise: a draw that leaves its ellipsoid by more makes the state leave.
 DECLARED = {
     **{"A": 0.01 * np.eye(2), "B": [[1e-3], [0.0]], "u_max": 1.0, "dt": 0.1, "delta": 2e-3},
     **{"process_noise_cov": 0.1 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3},
 }
-RADIUS = np.sqrt(LinearPlant(box=[1.0, 1.0], **DECLARED).disturbance.shape_matrix[0, 0])
-PLANT, CHANNEL, STEPS = LinearPlant(box=2 * [1.02 * RADIUS], **DECLARED), Channel(loss=0.3), 60
+RADIUS = np.sqrt(linear_plant(box=[1.0, 1.0], **DECLARED).disturbance.shape_matrix[0, 0])
+PLANT, CHANNEL, STEPS = linear_plant(box=2 * [1.02 * RADIUS], **DECLARED), Channel(loss=0.3), 60
 register_plant("Tests/Tight-v0", PLANT, channel=CHANNEL, max_episode_steps=STEPS)
 
 

@@ -1,7 +1,5 @@
 """Linear controllers by name: what they do to the plants they are made for."""
 
-from dataclasses import replace
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,10 +8,11 @@ from scipy.linalg import solve_discrete_are
 from benchmarks.study import ENVS, REGULATED
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
-from ncs_gym import Channel, LinearPlant, NCSEnv, Regulation, SetpointTracking, Task
+from ncs_gym import Channel, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
 from tests.plants import small
+from tests.product import altered, linear_plant, loop_env, resampled
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
 
@@ -55,7 +54,7 @@ class Refined(Regulation):
 
 def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for():
     plant, target = env_of("ncs_gym/CartPole-v0").plant, Own(output=np.eye(4)[0], reach=0.1, width=0.1)
-    own, other, refined = (NCSEnv(plant=plant, task=task) for task in (target, Other(), Refined()))
+    own, other, refined = (loop_env(plant=plant, task=task) for task in (target, Other(), Refined()))
     rests = Fallback.of_gain(np.zeros((1, 4)))
     for name in ("lqr", "mpc", "mpc:10"):
         controller(name, own, rests, 0)
@@ -70,7 +69,7 @@ def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for(
 @pytest.mark.parametrize("costs", [{}, {"state_cost": [[1.0, 0.0], [0.0, 0.0]], "input_cost": [[1e-4]]}])
 def test_regulator_of_regulation_is_that_of_its_reward(costs):
     plant = small([[1.0, 0.1], [0.0, 0.95]], B=[[0.005], [0.1]], box=[1.0, 2.0], gamma=1e-6)
-    env = NCSEnv(plant=plant, task=Regulation(**costs), channel=Channel(max_consecutive_losses=1))
+    env = loop_env(plant=plant, task=Regulation(**costs), channel=Channel(max_consecutive_losses=1))
     Q, R = env.task.costs(plant)
     P = solve_discrete_are(plant.A, plant.B, Q, R)
     gain = -np.linalg.solve(R + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
@@ -118,7 +117,7 @@ def test_fallback_applies_its_gain_and_zero_nothing():
 @pytest.mark.parametrize("name", ["lqr", "mpc", "mpc:20"])
 def test_plant_of_one_state_and_one_limit_is_regulated(name):
     bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.02}
-    env = NCSEnv(LinearPlant(A=[[0.8]], B=[[0.4]], dt=1.0, box=[1.0], u_max=0.1, **bounds))
+    env = loop_env(linear_plant(A=[[0.8]], B=[[0.4]], dt=1.0, box=[1.0], u_max=0.1, **bounds))
     policy = controller(name, env, Fallback.of_gain(np.zeros((1, 1))), 0)
     (u,) = policy(np.array([[0.9]]), {"estimate": np.array([[0.9]])})
     assert -1.0 <= u[0] < -0.5
@@ -152,7 +151,7 @@ def nominal(env, name, weights, steps=150, times=1):
     Looked at that many times per step.
     """
     policy, plant = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), env.plant
-    part = plant if times == 1 else replace(plant, between_samples=None).resampled(plant.dt / times)
+    part = plant if times == 1 else resampled(altered(plant, between_samples=None), plant.dt / times)
     x, applied, reached = np.zeros(plant.n), [np.zeros(plant.m)], 0.0
     targets = np.full(1 + env.task.preview, env.task.reach)
     for _ in range(steps):
@@ -222,12 +221,12 @@ def test_every_arm_of_the_study_has_weights_of_its_own():
 
 def two_ended(task=None):
     """A tank above another one, whose levels and valve have limits that are not symmetric about their rest."""
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, disturbance_bound=0.01, sensor_bound=0.01,
         initial_bound=0.05, operating_state=[3.0, 3.5], operating_input=[2.6],
         state_limits=([0.5, 0.5], [4.0, 6.0]), input_limits=(0.0, 8.0),
     )  # fmt: skip
-    return NCSEnv(plant=plant, channel=Channel(), task=task)
+    return loop_env(plant=plant, channel=Channel(), task=task)
 
 
 def inputs_of(plant, actions):

@@ -12,9 +12,9 @@ from experiments.baselines import FILTERS, EstimateFilterSettings, controller
 from experiments.baselines.filters import CertaintyEquivalentFilter, PredictiveFilter
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
-from shields import SafetyFilter, synthesize
 from tests.certificates import certificate_of
 from tests.plants import delayed
+from tests.product import altered, resampled, safety_filter, synthesize
 from tests.shields.polytope.limits import PLANTS
 from tests.shields.polytope.limits import certificate as limited
 
@@ -137,7 +137,7 @@ def test_no_filter_speaks_of_a_guarantee(name, certificate):
 
 
 def test_trusting_filter_decides_as_the_shield_without_an_error(certificate, loaded, trusting, cases):
-    shield, nothing = SafetyFilter(certificate, loaded), np.zeros((2, 2))
+    shield, nothing = safety_filter(certificate, loaded), np.zeros((2, 2))
     applied = trusting(*cases, np.zeros(400, np.bool_))
     for estimate, proposed, chosen in zip(*cases, applied, strict=True):
         np.testing.assert_array_equal(chosen, shield.decide(estimate, nothing, proposed).input)
@@ -230,7 +230,7 @@ def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificat
 
 @pytest.mark.slow
 def test_predictive_filter_keeps_the_box_between_samples_where_it_counts_there(loaded):
-    part, rng = loaded.resampled(loaded.dt / 20), np.random.default_rng(1)
+    part, rng = resampled(loaded, loaded.dt / 20), np.random.default_rng(1)
     proposals = loaded.u_max * np.sign(np.repeat(rng.standard_normal(30), 10))[:, None]
 
     def largest(plant, **settings):
@@ -243,7 +243,7 @@ def test_predictive_filter_keeps_the_box_between_samples_where_it_counts_there(l
                 reached = max(reached, np.abs(loaded.box_rows @ state).max())
         return reached
 
-    on_grid = replace(loaded, between_samples=8)
+    on_grid = altered(loaded, between_samples=8)
     assert largest(loaded) > 1.01
     assert 0.95 < largest(on_grid) <= 1.0
     assert 0.75 < largest(on_grid, margin=0.2) <= 0.8

@@ -19,9 +19,9 @@ from experiments.baselines.requests import (
     with_rule,
 )
 from ncs_gym import Channel, ChannelContract, VectorRequestActions
-from shields import VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.command import environment
+from tests.product import vector_shield
 
 ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 16, 60
 
@@ -29,7 +29,7 @@ ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 16, 60
 def environments(cost=0.1, **settings):
     envs = gym.make_vec(ID, num_envs=COUNT, max_episode_steps=STEPS, **settings)
     inner = envs.unwrapped
-    shield = VectorSafetyShield(envs, certificate_of(inner.plant, inner.certificate_contract))
+    shield = vector_shield(envs, certificate_of(inner.plant, inner.certificate_contract))
     return VectorRequestActions(shield, cost)
 
 

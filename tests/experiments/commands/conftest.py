@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant
 from tests.command import SMOKE, Run, ncs
+from tests.product import linear_plant
 from tests.workers import no_worker_processes
 
 
@@ -30,7 +30,7 @@ def _made(name: str, command: tuple, made_once: Callable) -> tuple[Path, Run]:
 def plant_file(tmp_path: Path) -> Path:
     """An unstable plant of one state, of which searches take no time."""
     bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.01}
-    LinearPlant(A=[[1.2]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds).save(tmp_path / "plant.json")
+    linear_plant(A=[[1.2]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds).save(tmp_path / "plant.json")
     return tmp_path / "plant.json"
 
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from experiments.commands.attack import attacked, channels_of, hostile_agents, starts, worst_case
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSVectorEnv
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import needing_extras
 from shields import VectorSafetyShield, certificate_for
 from tests.certificates import certificate_of
 from tests.command import ncs, succeeded
+from tests.product import linear_plant, vector_env, vector_shield
 
 CRUISE, CART, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
 
@@ -22,7 +23,7 @@ def shield_of(env_id, count, mode="project", **changed):
     env = ncs_env(gym.make(env_id))
     certificate = certificate_for(env.plant, env.certificate_contract)
     vector = gym.make_vec(env_id, num_envs=count, **(worst_case(certificate, mode) | changed))
-    return VectorSafetyShield(vector, certificate, mode, on_unproved="ignore")
+    return vector_shield(vector, certificate, mode, on_unproved="ignore")
 
 
 def counts_of(shield, seed=0):
@@ -156,7 +157,7 @@ ACROSS, ALONG = np.array([[1.0], [2.0]]), np.array([[1.0, 0.0], [1.0, 1.0]])
 
 def plant_with(**first_error) -> LinearPlant:
     """A plant in the unit box whose first error is bounded in the way given."""
-    return LinearPlant(
+    return linear_plant(
         A=[[0.9, 0.1], [0.0, 0.8]],
         B=[[0.0], [0.1]],
         H=[[1.0, 0.0]],
@@ -172,8 +173,8 @@ def plant_with(**first_error) -> LinearPlant:
 def first_errors(plant: LinearPlant) -> np.ndarray:
     """First errors of the attack, shape (COUNT, n); no step of it breaks an assumption."""
     certificate = certificate_of(plant)
-    many = NCSVectorEnv(COUNT, plant=plant, channel=Channel(), **worst_case(certificate))
-    env = VectorSafetyShield(many, certificate)
+    many = vector_env(COUNT, plant=plant, channel=Channel(), **worst_case(certificate))
+    env = vector_shield(many, certificate)
     _, info = env.reset(seed=0, options={"state": starts(certificate, np.random.default_rng(0), COUNT)})
     errors = info["estimation_error"]
     for _ in range(20):

@@ -21,6 +21,7 @@ from ncs_gym import truck_trailer
 from shields import Certificate, certify
 from tests.certificates import feasible_age_not_sought
 from tests.command import SMOKE, assert_one_sentence, killed, ncs, ncs_process, succeeded, without_pictures
+from tests.product import library_plant
 from tests.verdicts import verified
 from tests.workers import no_worker_processes
 
@@ -414,7 +415,7 @@ def test_errors_of_the_disk_say_what_to_do(number, remedy, certificate, monkeypa
 
 
 def test_infeasible_problem_is_one_sentence(tmp_path):
-    truck_trailer(disturbance_bound=3.0).save(tmp_path / "plant.json")
+    library_plant(truck_trailer, disturbance_bound=3.0).save(tmp_path / "plant.json")
     with feasible_age_not_sought():
         run = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
     assert run.returncode == 2

@@ -15,8 +15,8 @@ from experiments.runs.policies import policy_by_name
 from experiments.settings import RenderSettings
 from ncs_gym import Channel, truck_trailer
 from ncs_gym.rendering import theme
-from shields import SafetyShield, synthesize
 from tests.command import assert_one_sentence, ncs, succeeded
+from tests.product import safety_shield, synthesize
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -117,7 +117,7 @@ def violations_of_lqr(env_id, certificate=None, shielded=False):
     env = gym.make(env_id)
     inner = env.unwrapped
     if shielded:
-        env = SafetyShield(env, certificate)
+        env = safety_shield(env, certificate)
     policy, (observation, info) = policy_by_name("lqr", env_id, inner, 0), env.reset(seed=0)
     for _ in range(60):
         action = policy(observation, info)

@@ -10,8 +10,9 @@ from agents import Agent, SafetyCallback
 from experiments.__main__ import parse
 from experiments.errors import RunStopped
 from experiments.runs.output_folder import claim_folder
-from shields import Certificate, CertificateError, SafetyShield
+from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs, succeeded
+from tests.product import safety_shield
 
 SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
 HINT = "This training had no violation and no override"
@@ -87,6 +88,6 @@ def test_agents_are_trained_and_evaluated_where_the_box_counts_at_all_times(tmp_
     assert ncs("evaluate", model, "--episodes", "2", *at_all_times).returncode == 0
     assert ncs("evaluate", model, "--episodes", "2").returncode == 0  # files of agents keep it
     with pytest.raises(CertificateError, match="or for a box that counts at all times"):
-        SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
+        safety_shield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
     succeeded("synthesize", "--out", tmp_path / "c.json", "--safe-set", "ellipsoid", *at_all_times)
     assert Certificate.load(tmp_path / "c.json") == certificate

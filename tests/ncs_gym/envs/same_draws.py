@@ -14,9 +14,10 @@ from ncs_gym.network.downlink import no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.processes.plant_step import PlantSimulation
-from shields import Certificate, SafeLoop, SafetyShield, VectorSafetyShield
+from shields import Certificate, SafetyShield
 from shields.runtime.guarantee import OUTSIDE_BOUND
 from tests import arrays
+from tests.product import safe_loop, safety_shield, vector_shield
 
 
 class RecordingGenerator:
@@ -174,7 +175,7 @@ class LoopBeside:
             behind = {"downlink": env.downlink, "downlink_contract": env.downlink_contract, "on_unproved": "ignore"}
             made = self.shield.filter
             given = self.shield.certificate, env.plant, channel, made.mode, made.horizon
-            self.loops[channel] = SafeLoop(*given, **behind)
+            self.loops[channel] = safe_loop(*given, **behind)
         self.loop, estimator = self.loops[channel], env.estimator
         vars(estimator).pop("advance", None)
         advance = estimator.advance
@@ -266,10 +267,10 @@ def compare(
     """
     shielded = certificate is not None
     settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore"}
-    outer = VectorSafetyShield(many, certificate, **settings) if shielded else many
+    outer = vector_shield(many, certificate, **settings) if shielded else many
     _, infos = outer.reset(seed=3, options=options)
     singles = scalar_versions(many)
-    outers = [SafetyShield(each, certificate, **settings) if shielded else each for each in singles]
+    outers = [safety_shield(each, certificate, **settings) if shielded else each for each in singles]
     loops = [LoopBeside(each) for each in outers] if shielded else []
     rng, gain, seen = np.random.default_rng(0), holding_gain(many.plant), Seen()
     seen.note(infos)

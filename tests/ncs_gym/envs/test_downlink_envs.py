@@ -4,18 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Actuator,
-    Channel,
-    ChannelContract,
-    Command,
-    GilbertElliott,
-    NCSEnv,
-    NCSVectorEnv,
-    SpeedTracking,
-    truck_trailer,
-)
+from ncs_gym import Actuator, Channel, ChannelContract, Command, GilbertElliott, SpeedTracking, truck_trailer
 from tests.ncs_gym.envs.same_draws import compare
+from tests.product import loop_env, vector_env
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
 DOWNLINKS = {
@@ -32,14 +23,14 @@ UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 @pytest.mark.cases(3)
 @pytest.mark.parametrize("name", DOWNLINKS)
 def test_vector_equals_scalar_environment(name):
-    compare(NCSVectorEnv(3, channel=UPLINK, downlink=DOWNLINKS[name], **CRUISE), 100)
+    compare(vector_env(3, channel=UPLINK, downlink=DOWNLINKS[name], **CRUISE), 100)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_vector_episodes_that_begin_anew_equal_scalar_ones(mode):
     channel = Channel(loss=0.2, quantization_step=0.02, delay=1, jitter=4)
     settings = CRUISE | {"channel": channel, "downlink": DOWNLINKS["bursts"], "terminate_on_violation": True}
-    env = NCSVectorEnv(4, max_episode_steps=41, autoreset_mode=mode, **settings)
+    env = vector_env(4, max_episode_steps=41, autoreset_mode=mode, **settings)
     compare(env, 150)
     assert env.episodes.min() >= 3
 
@@ -51,7 +42,7 @@ def test_vector_equals_scalar_environment_of_an_unstable_plant():
 
 @pytest.mark.parametrize("name", DOWNLINKS)
 def test_actuator_applies_what_was_committed_and_zero_only_when_the_downlink_is_broken(name):
-    env = NCSEnv(downlink=DOWNLINKS[name], **CRUISE)
+    env = loop_env(downlink=DOWNLINKS[name], **CRUISE)
     input_delay = env.downlink_protocol.input_delay
     _, info = env.reset(seed=0)
     committed, missing = [], 0
@@ -66,7 +57,7 @@ def test_actuator_applies_what_was_committed_and_zero_only_when_the_downlink_is_
 
 
 def test_estimate_is_the_prediction_with_the_committed_inputs_and_its_error_stays_in_its_shape():
-    env = NCSEnv(channel=UPLINK, downlink=DOWNLINKS["overtaking"], disturbance="sphere", **CRUISE)
+    env = loop_env(channel=UPLINK, downlink=DOWNLINKS["overtaking"], disturbance="sphere", **CRUISE)
     input_delay, plant = env.downlink_protocol.input_delay, env.plant
     _, info = env.reset(seed=0)
     rng, infos, committed, worst = np.random.default_rng(1), [info], [np.zeros(1)] * input_delay, 0.0
@@ -85,7 +76,7 @@ def test_estimate_is_the_prediction_with_the_committed_inputs_and_its_error_stay
 
 
 def test_observation_holds_the_prediction_and_what_is_known_of_the_task_by_then():
-    env = NCSEnv(downlink=Channel(delay=2), **(CRUISE | {"task": SpeedTracking(change_probability=0.0)}))
+    env = loop_env(downlink=Channel(delay=2), **(CRUISE | {"task": SpeedTracking(change_probability=0.0)}))
     before, _ = env.reset(seed=0)
     for action in (1.0, -0.5, 0.25, 0.75, 0.0, 0.0):
         observation, *_, info = env.step(np.array([action]))
@@ -96,7 +87,7 @@ def test_observation_holds_the_prediction_and_what_is_known_of_the_task_by_then(
 
 
 def test_a_perfect_downlink_changes_nothing_but_the_draws():
-    one, other = (NCSVectorEnv(3, downlink=each, **CRUISE) for each in (None, Channel()))
+    one, other = (vector_env(3, downlink=each, **CRUISE) for each in (None, Channel()))
     for env in (one, other):
         env.reset(seed=0)
     assert other.downlink_protocol.input_delay == 0
@@ -112,11 +103,11 @@ def test_certificates_rest_on_both_contracts():
     assert env.contract == ChannelContract(4, 1e-4)
     assert env.downlink_protocol.contract == ChannelContract(2)
     assert env.certificate_contract == env.error_set.contract == ChannelContract(6, 1e-4)
-    assert NCSEnv(downlink=Channel(delay=2), **CRUISE).certificate_contract is None
+    assert loop_env(downlink=Channel(delay=2), **CRUISE).certificate_contract is None
 
 
 def test_a_contract_that_the_downlink_may_break_is_kept_until_it_does():
-    env = NCSEnv(downlink=Channel(loss=0.5), downlink_contract=ChannelContract(2), **CRUISE)
+    env = loop_env(downlink=Channel(loss=0.5), downlink_contract=ChannelContract(2), **CRUISE)
     assert env.downlink_protocol.input_delay == 2
     env.reset(seed=0)
     broken = [env.step(np.ones(1))[4]["downlink_broken"] for _ in range(200)]

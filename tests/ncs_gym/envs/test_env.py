@@ -11,6 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 import ncs_gym
 from ncs_gym import Channel, Ellipsoid, GilbertElliott, NCSEnv, Regulation
 from tests.plants import random_plant
+from tests.product import library_plant
 
 IDS = ["ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"]
 
@@ -113,7 +114,8 @@ def test_start_state_can_be_chosen():
 
 
 def test_observation_box_leaves_room_for_the_disturbance():
-    quiet = make(IDS[0], plant=ncs_gym.truck_trailer(gamma=0.0, process_noise_cov=np.zeros((2, 2))), disturbance="ball")
+    plant = library_plant(ncs_gym.truck_trailer, gamma=0.0, process_noise_cov=np.zeros((2, 2)))
+    quiet = make(IDS[0], plant=plant, disturbance="ball")
     assert (make(IDS[0]).observation_space.high > quiet.observation_space.high + 0.05).all()
 
 

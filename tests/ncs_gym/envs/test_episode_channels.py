@@ -12,8 +12,6 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     GilbertElliott,
-    NCSEnv,
-    NCSVectorEnv,
     Networked,
     RandomChannel,
     SpeedTracking,
@@ -24,6 +22,7 @@ from ncs_gym import (
 )
 from tests.ncs_gym.envs.same_draws import compare
 from tests.ncs_gym.networked.environments import Sampled
+from tests.product import loop_env, vector_env
 
 PLANT = truck_trailer(mass=4000.0)
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.3)
@@ -34,7 +33,7 @@ JITTERY = [Channel(loss=BURSTS, delay=1, jitter=2), Channel(loss=BURSTS, jitter=
 
 def both(steps=40, **settings):
     """Estimates of an episode with the same action throughout."""
-    env = NCSEnv(PLANT, **settings)
+    env = loop_env(PLANT, **settings)
 
     def estimates(**options):
         infos = [env.reset(seed=1, options=options)[1]] + [env.step([0.3])[4] for _ in range(steps)]
@@ -61,14 +60,14 @@ def test_downlink_of_an_episode_is_as_if_the_environment_were_made_with_it():
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_vector_with_a_channel_for_each_environment_equals_scalar_ones(channels, mode):
     settings = {"terminate_on_violation": True, "autoreset_mode": mode, "max_episode_steps": 31}
-    env = NCSVectorEnv(len(channels), plant=PLANT, channel=channels, task=SpeedTracking(), **settings)
+    env = vector_env(len(channels), plant=PLANT, channel=channels, task=SpeedTracking(), **settings)
     compare(env, 90)
     assert env.episodes.min() > 1
     assert env.episode_channels == tuple(channels)
 
 
 def test_channels_of_a_reset_equal_scalar_ones_and_last_for_one_episode():
-    env = NCSVectorEnv(3, plant=PLANT, channel=Channel(quantization_step=0.02), max_episode_steps=31)
+    env = vector_env(3, plant=PLANT, channel=Channel(quantization_step=0.02), max_episode_steps=31)
     compare(env, 90, {"channel": LATE})
     assert set(env.episode_channels) == {env.channel}
     env.reset(seed=0, options={"channel": LATE})
@@ -81,7 +80,7 @@ def test_channels_of_a_reset_equal_scalar_ones_and_last_for_one_episode():
 @pytest.mark.parametrize("kind", [Channel, VectorNetworked])
 def test_what_is_drawn_and_does_not_fit_moves_nothing(kind):
     if kind is Channel:
-        envs, wrong = NCSVectorEnv(2, plant=PLANT, channel=Channel(delay=1)), Channel(quantization_step=9.0)
+        envs, wrong = vector_env(2, plant=PLANT, channel=Channel(delay=1)), Channel(quantization_step=9.0)
     else:
         envs, wrong = VectorNetworked(gym.make_vec("Pendulum-v1", num_envs=2), Channel(delay=1)), 3.0
     actions = np.zeros((2, 1), np.float32)
@@ -113,7 +112,7 @@ def losses(envs, steps=9, length=3):
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_channel_of_an_option_lasts_one_episode_in_every_mode_of_autoreset(mode):
     loop = {"channel": Channel(loss=0.3), "downlink": Channel(delay=2)}
-    envs = NCSVectorEnv(2, plant=PLANT, max_episode_steps=3, autoreset_mode=mode, **loop)
+    envs = vector_env(2, plant=PLANT, max_episode_steps=3, autoreset_mode=mode, **loop)
     first, *others = losses(envs)
     assert first.tolist() == [0.5, 0.5]
     assert len(others) > 1
@@ -148,14 +147,14 @@ def test_infos_say_which_channel_an_episode_has():
 
 def test_downlinks_for_each_environment_equal_scalar_ones():
     downlinks = [Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(loss=0.2, max_consecutive_losses=1)]
-    env = NCSVectorEnv(2, plant=PLANT, channel=Channel(delay=1), downlink=downlinks, max_episode_steps=31)
+    env = vector_env(2, plant=PLANT, channel=Channel(delay=1), downlink=downlinks, max_episode_steps=31)
     assert env.downlink_protocol.input_delay == 3
     compare(env, 90)
 
 
 def test_other_environments_go_on_when_a_longer_delay_joins_in_the_middle_of_their_episodes():
     def estimates(delay):
-        env = NCSVectorEnv(2, plant=PLANT, channel=Channel(delay=1), disturbance="ball")
+        env = vector_env(2, plant=PLANT, channel=Channel(delay=1), disturbance="ball")
         env.reset(seed=0)
         found = []
         for step in range(60):
@@ -176,7 +175,7 @@ def test_errors_stay_in_their_ellipsoids_whatever_channels_are_drawn():
         return Channel(loss, delay=int(rng.integers(6)), jitter=int(rng.integers(4)), **loop)
 
     coarse = Channel(quantization_step=0.05)
-    env = VectorRandomChannel(NCSVectorEnv(32, plant=PLANT, channel=coarse, max_episode_steps=13), draw)
+    env = VectorRandomChannel(vector_env(32, plant=PLANT, channel=coarse, max_episode_steps=13), draw)
     _, info = env.reset(seed=2)
     seen = set()
     for _ in range(150):
@@ -203,9 +202,9 @@ def test_draws_follow_from_the_seed_and_pickled_wrappers_draw_the_same():
 
 def test_space_and_contract_are_those_of_the_widest_channel():
     channels = [Channel(), Channel(loss=0.3, delay=2, max_consecutive_losses=1), Channel(delay=1)]
-    env = NCSVectorEnv(3, plant=cart_pole(), channel=channels)
+    env = vector_env(3, plant=cart_pole(), channel=channels)
     assert env.contract == ChannelContract(3)
-    widest = NCSVectorEnv(3, plant=cart_pole(), channel=channels[1])
+    widest = vector_env(3, plant=cart_pole(), channel=channels[1])
     assert env.single_observation_space == widest.single_observation_space
 
 

@@ -8,21 +8,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ncs_gym import (
-    Channel,
-    ChannelContract,
-    ClippedObservationWarning,
-    LinearPlant,
-    NCSEnv,
-    NCSVectorEnv,
-    Task,
-    cart_pole,
-)
-from shields import SafetyShield
+from ncs_gym import Channel, ChannelContract, ClippedObservationWarning, Task, cart_pole
 from tests.certificates import certificate_of
+from tests.product import linear_plant, loop_env, safety_shield, vector_env
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
-PLANT = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4, sensor_bound=0, initial_bound=0)
+PLANT = linear_plant(A=[[0.5]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4, sensor_bound=0, initial_bound=0)
 
 
 class Far(Task):
@@ -62,7 +53,7 @@ def play(env, steps):
     return [env.step(zero)[0] for _ in range(steps)]
 
 
-@pytest.mark.parametrize("make", [NCSEnv, lambda **settings: NCSVectorEnv(2, **settings)])
+@pytest.mark.parametrize("make", [loop_env, lambda **settings: vector_env(2, **settings)])
 def test_entries_beyond_their_bound_are_told_of_once(make):
     env = make(plant=PLANT, task=Far(0.1), horizon=100)
     with pytest.warns(ClippedObservationWarning, match="entry 0 of Far is beyond .* of 10.1") as caught:
@@ -83,17 +74,17 @@ def test_longer_vector_episodes_have_a_longer_horizon_and_longer_scalar_ones_a_w
         long = gym.make("Test/Far-v0", plant=PLANT, task=Far(), max_episode_steps=300, horizon=300)
     finally:
         del gym.registry["Test/Far-v0"]
-    many = NCSVectorEnv(2, plant=PLANT, task=Far(), max_episode_steps=300)
+    many = vector_env(2, plant=PLANT, task=Far(), max_episode_steps=300)
     assert many.single_observation_space == long.observation_space
     assert many.horizon == 300
-    assert NCSVectorEnv(2, plant=PLANT, task=Far(), max_episode_steps=20).horizon == 200
+    assert vector_env(2, plant=PLANT, task=Far(), max_episode_steps=20).horizon == 200
 
 
 def test_task_without_bounds_of_what_it_observes_is_refused_by_name():
     with pytest.raises(ValueError, match="Boundless: observe is defined, observation_bound is not"):
-        NCSEnv(PLANT, task=Boundless())
+        loop_env(PLANT, task=Boundless())
     with pytest.raises(ValueError, match="Wrong: observe returns 1 entries, observation_bound the bounds of 3"):
-        NCSEnv(PLANT, task=Wrong()).reset()
+        loop_env(PLANT, task=Wrong()).reset()
 
 
 @pytest.mark.parametrize(
@@ -125,7 +116,7 @@ def test_rescaled_observations_of_an_unstable_plant_say_something():
 
 
 def test_runaway_states_are_clipped_in_observations_and_not_in_infos():
-    env = NCSEnv(cart_pole(), Channel())
+    env = loop_env(cart_pole(), Channel())
     env.reset(seed=0)
     for _ in range(100):
         observation, *_, info = env.step([1.0])
@@ -136,7 +127,7 @@ def test_runaway_states_are_clipped_in_observations_and_not_in_infos():
 @pytest.mark.parametrize("share", [-1.0, 0.0, np.nan, np.inf])
 def test_bounds_that_bound_nothing_are_refused_by_name(share):
     with pytest.raises(ValueError, match="Far: observation_bound must be finite numbers > 0"):
-        NCSEnv(plant=PLANT, task=Far(share))
+        loop_env(plant=PLANT, task=Far(share))
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0"])
@@ -169,15 +160,15 @@ def test_spec_with_a_certificate_and_observations_is_json(tmp_path):
     certificate = certificate_of(env.unwrapped.plant)
     certificate.save(tmp_path / "certificate.json")
     for given in (certificate, certificate.document, tmp_path / "certificate.json", str(tmp_path / "certificate.json")):
-        shield = SafetyShield(env, given)
+        shield = safety_shield(env, given)
         again = gym.make(gym.envs.registration.EnvSpec.from_json(shield.spec.to_json()))
         assert shield.certificate.checksum == again.certificate.checksum == certificate.checksum
         np.testing.assert_array_equal(shield.reset(seed=1)[0], again.reset(seed=1)[0])
     altered = certificate.document | {"certificate": certificate.document["certificate"] | {"kappa": 0.5}}
     with pytest.raises(ValueError, match="certificate document was altered"):
-        SafetyShield(env, altered)
+        safety_shield(env, altered)
     with pytest.raises(ValueError, match="certificate must be a Certificate, its document or path"):
-        SafetyShield(env, 3)
+        safety_shield(env, 3)
 
 
 @pytest.mark.parametrize(
@@ -191,8 +182,8 @@ def test_spec_with_a_certificate_and_observations_is_json(tmp_path):
 )
 def test_estimates_in_the_safe_box_and_one_step_out_of_it_are_observed_as_they_are(growth, limits):
     quiet = {"disturbance_bound": 0.01, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[growth * 1.02, 0.1], [0.0, growth * 1.01]], B=[[0.5], [0.2]], dt=1.0, **limits, **quiet)
-    env = NCSEnv(plant=plant, channel=Channel(), contract=ChannelContract(0))
+    plant = linear_plant(A=[[growth * 1.02, 0.1], [0.0, growth * 1.01]], B=[[0.5], [0.2]], dt=1.0, **limits, **quiet)
+    env = loop_env(plant=plant, channel=Channel(), contract=ChannelContract(0))
     for ends in product(*plant.box_ends.T):
         corner = np.linalg.solve(plant.box, ends)
         observation, _ = env.reset(seed=0, options={"state": corner})

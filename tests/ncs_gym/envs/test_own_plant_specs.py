@@ -17,7 +17,6 @@ from ncs_gym import (
     ChannelContract,
     Ellipsoid,
     GilbertElliott,
-    LinearPlant,
     LinearProcess,
     NCSVectorEnv,
     RandomChannel,
@@ -32,6 +31,7 @@ from ncs_gym.processes import CartPoleProcess, nonlinear_cart_pole
 from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from tests.certificates import certificate_of
+from tests.product import linear_plant, safety_shield
 
 LINEAR = "ncs_gym/LinearNCS-v0"
 TRUCK = "ncs_gym/TruckTrailer-v0"
@@ -76,7 +76,7 @@ OF_TRUCKS = [
 
 def own_plant():
     """A plant that no module registers."""
-    return LinearPlant(
+    return linear_plant(
         A=[[0.9, 0.1], [0.0, 0.8]],
         B=[[0.0], [0.1]],
         box=[1.0, 2.0],
@@ -178,7 +178,7 @@ def test_shielded_and_randomized_environment_is_made_again_from_its_spec(registe
     register("Plants/Own-v0", own_plant(), max_episode_steps=20)
     channels = [Channel(loss=0.2), TraceChannel(trace=(0, -1))]
     certificate = certificate_of(own_plant())
-    made = SafetyShield(RandomChannel(gym.make("Plants/Own-v0"), channel=channels), certificate)
+    made = safety_shield(RandomChannel(gym.make("Plants/Own-v0"), channel=channels), certificate)
     again = gym.make(EnvSpec.from_json(made.spec.to_json()))
     assert isinstance(again, SafetyShield)
     assert_moves_alike(made, again)
@@ -217,7 +217,7 @@ def test_what_holds_functions_stays_what_it_is():
 
 @pytest.mark.parametrize("limits", [{"box": [5.0, np.inf]}, {"box": [[0.2, 0.0], [0.4, 0.0]]}, {"box": [[1.0, -1.0]]}])
 def test_states_without_a_limit_start_at_the_operating_point(limits):
-    plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=1.0, gamma=1e-4, **limits)
+    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=1.0, gamma=1e-4, **limits)
     env, free = gym.make(LINEAR, plant=plant), np.linalg.svd(plant.box)[2][-1]
     starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(50)])
     np.testing.assert_allclose(starts @ free, 0.0, atol=1e-12)
@@ -227,7 +227,7 @@ def test_states_without_a_limit_start_at_the_operating_point(limits):
 def test_past_inputs_cost_nothing_but_what_inputs_do():
     settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "box": 1.0, "u_max": 1.0, "gamma": 0.0}
     quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
-    plain, limited = (LinearPlant(**settings, **quiet, **each) for each in ({}, {"du_max": 1.9}))
+    plain, limited = (linear_plant(**settings, **quiet, **each) for each in ({}, {"du_max": 1.9}))
     returns = []
     for plant in (plain, limited):
         env, total = gym.make(LINEAR, plant=plant, channel=Channel()), 0.0
@@ -248,6 +248,6 @@ def test_past_inputs_cost_nothing_but_what_inputs_do():
 )
 def test_speeds_are_those_of_inputs_that_act_at_once_from_zero(changes, words):
     settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "box": 1.0, "u_max": 4.0, "gamma": 1e-4}
-    gym.make(LINEAR, plant=LinearPlant(**settings, du_max=1.0), task=SpeedTracking())
+    gym.make(LINEAR, plant=linear_plant(**settings, du_max=1.0), task=SpeedTracking())
     with pytest.raises(ValueError, match=words):
-        gym.make(LINEAR, plant=LinearPlant(**settings, **changes), task=SpeedTracking())
+        gym.make(LINEAR, plant=linear_plant(**settings, **changes), task=SpeedTracking())

@@ -6,8 +6,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ncs_gym import Channel, ChannelContract, RequestActions, VectorRequestActions, cart_pole
-from shields import SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
+from tests.product import safety_shield, vector_shield
 
 ID, COST = "ncs_gym/CartPole-v0", 0.25
 CHANNEL = Channel(0.5, delay=1, max_consecutive_losses=1, quantization_step=1e-4, on_request=True)
@@ -16,7 +16,7 @@ SETTINGS = {"channel": CHANNEL, "contract": CONTRACT, "terminate_on_violation": 
 
 
 def shielded():
-    return RequestActions(SafetyShield(gym.make(ID, **SETTINGS), certificate_of(cart_pole(), CONTRACT)), COST)
+    return RequestActions(safety_shield(gym.make(ID, **SETTINGS), certificate_of(cart_pole(), CONTRACT)), COST)
 
 
 def test_gymnasiums_checker_accepts_it():
@@ -47,7 +47,7 @@ def test_last_entry_asks_and_every_packet_costs():
 
 def test_vector_wrapper_does_what_the_scalar_one_does():
     envs = gym.make_vec(ID, num_envs=6, max_episode_steps=20, **SETTINGS)
-    envs = VectorRequestActions(VectorSafetyShield(envs, certificate_of(cart_pole(), CONTRACT)), COST)
+    envs = VectorRequestActions(vector_shield(envs, certificate_of(cart_pole(), CONTRACT)), COST)
     observations, _ = envs.reset(seed=0)
     assert envs.observation_space.contains(observations)
     rng, before = np.random.default_rng(0), np.zeros(6)

@@ -3,14 +3,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from ncs_gym import (
-    BallDisturbance,
-    Ellipsoid,
-    NCSVectorEnv,
-    SetpointTracking,
-    SpeedTracking,
-    truck_trailer,
-)
+from ncs_gym import BallDisturbance, Ellipsoid, SetpointTracking, SpeedTracking, truck_trailer
+from tests.product import library_plant, vector_env
 
 
 def make(name, count, **settings):
@@ -131,8 +125,8 @@ def test_what_a_users_subclass_changes_counts():
         def draw(self, rng, plant, nominal_next, step, memory):
             return np.full(plant.n, 1e-3)
 
-    plant = truck_trailer(process_noise_cov=np.zeros((2, 2)))
-    env = NCSVectorEnv(4, plant=plant, task=Fixed(), disturbance=Quiet(), max_episode_steps=3)
+    plant = library_plant(truck_trailer, process_noise_cov=np.zeros((2, 2)))
+    env = vector_env(4, plant=plant, task=Fixed(), disturbance=Quiet(), max_episode_steps=3)
     _, info = env.reset(seed=0)
     for step in range(1, 10):
         before = info["state"]
@@ -140,7 +134,7 @@ def test_what_a_users_subclass_changes_counts():
         if step % 4:
             assert (reward >= 42.0).all()
             np.testing.assert_allclose(info["state"], before @ plant.A.T + 1e-3)
-    env = NCSVectorEnv(3, plant=plant, task=Odd(output=(1.0, 0.0), reach=0.8, width=2.0, change_probability=0.0))
+    env = vector_env(3, plant=plant, task=Odd(output=(1.0, 0.0), reach=0.8, width=2.0, change_probability=0.0))
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(observation[:, -1], 0.25)
 
@@ -153,7 +147,7 @@ def test_gymnasiums_sync_vector_env_of_scalar_ones_is_still_available():
 def test_an_episode_that_begins_outside_the_box_does_not_end_before_its_first_step():
     far = Ellipsoid(25.0 * np.eye(2))
     settings = {"plant": truck_trailer(), "initial_set": far, "terminate_on_violation": True, "max_episode_steps": 1}
-    env, ended = NCSVectorEnv(40, **settings), []
+    env, ended = vector_env(40, **settings), []
     env.reset(seed=0)
     for _ in range(6):
         _, _, terminated, truncated, info = env.step(np.zeros((40, 1), np.float32))

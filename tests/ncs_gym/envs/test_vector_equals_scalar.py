@@ -16,9 +16,6 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     GilbertElliott,
-    LinearPlant,
-    NCSEnv,
-    NCSVectorEnv,
     SetpointTracking,
     SpeedTracking,
     batch_reactor,
@@ -29,6 +26,7 @@ from ncs_gym.estimation import arrival_histories
 from tests import arrays
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant
+from tests.product import family_of, library_plant, loop_env, vector_env
 
 IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor")
 BURSTS = GilbertElliott(p_good_to_bad=0.15, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
@@ -51,20 +49,20 @@ def make(name, count, **settings):
 ASKED = Channel(loss=0.6, delay=1, jitter=1, max_consecutive_losses=2, on_request=True)
 ENDLESS = {"max_episode_steps": -1, "terminate_on_violation": False}
 TRUCK, SPEED = truck_trailer(mass=4000.0), SpeedTracking(change_probability=0.2)
-BETWEEN = truck_trailer(mass=4000.0, between_samples=8)
-FAMILY = LinearPlant.family([truck_trailer(mass=mass) for mass in (3000.0, 4000.0, 5000.0)])
+BETWEEN = library_plant(truck_trailer, mass=4000.0, between_samples=8)
+FAMILY = family_of([truck_trailer(mass=mass) for mass in (3000.0, 4000.0, 5000.0)])
 SETPOINT = SetpointTracking(output=(1.0, 0.5), reach=0.8, width=0.3, change_probability=0.3)
 
 
 def custom(plant, channel, **settings):
-    return lambda: NCSVectorEnv(2, plant=plant, channel=channel, **settings)
+    return lambda: vector_env(2, plant=plant, channel=channel, **settings)
 
 
 def ending(channel, mode, **settings):
     """Episodes that end at different times, so that some environments send while others do not."""
     settings = {"plant": TRUCK, "max_episode_steps": 13} | settings
     settings |= {"autoreset_mode": mode, "terminate_on_violation": True}
-    return lambda: NCSVectorEnv(3, channel=channel, task=SpeedTracking(), **settings)
+    return lambda: vector_env(3, channel=channel, task=SpeedTracking(), **settings)
 
 
 def gust(rng, plant, nominal):
@@ -116,7 +114,9 @@ ENVIRONMENTS = (
         "a broken contract": custom(batch_reactor(), Channel(loss=0.5, jitter=3), contract=ChannelContract(3)),
         "n=3 m=2 p=1": custom(random_plant(5, 3, 2, p=1), Channel(loss=0.4, delay=1, jitter=2)),
         "n=5 m=3 p=2": custom(random_plant(6, 5, 3, p=2), Channel(loss=BURSTS, send_period=2)),
-        "alarms of Gaussian noise": custom(truck_trailer(delta=0.9), CHANNELS["overtaking"], noise="gaussian"),
+        "alarms of Gaussian noise": custom(
+            library_plant(truck_trailer, delta=0.9), CHANNELS["overtaking"], noise="gaussian"
+        ),
         # A disturbance half as large again as allowed, now and then, which the simulation sees at once.
         "alarms of gusts": custom(
             truck_trailer(),
@@ -165,8 +165,8 @@ def assert_equal(some, others):
 
 
 KINDS = {
-    "scalar": lambda: NCSEnv(**OVERTAKING),
-    "vector": lambda: NCSVectorEnv(3, max_episode_steps=17, **OVERTAKING),
+    "scalar": lambda: loop_env(**OVERTAKING),
+    "vector": lambda: vector_env(3, max_episode_steps=17, **OVERTAKING),
 }
 
 
@@ -204,7 +204,7 @@ def test_threads_share_a_graph(most, monkeypatch):
     settings = {"plant": truck_trailer(), "channel": Channel(loss=0.3, jitter=3, delay=1)}
 
     def run(seed, returned):
-        env = NCSVectorEnv(8, **settings)
+        env = vector_env(8, **settings)
         env.reset(seed=seed)
         returned[seed] = list(steps_of(env, 100))
 
@@ -238,7 +238,7 @@ def test_threads_share_a_graph(most, monkeypatch):
 def test_graphs_of_long_buffers_and_large_plants_hold_fewer_histories(plant, channel, most, monkeypatch):
     monkeypatch.setattr(arrival_histories, "_shared", {})
     monkeypatch.setattr(arrival_histories, "MAX_BYTES", most)
-    env = NCSEnv(plant, channel)
+    env = loop_env(plant, channel)
     env.reset(seed=0)
     sizes, graphs, action = [], set(), np.zeros(plant.m, np.float32)
     tracemalloc.start()
@@ -258,7 +258,7 @@ def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
     # The environment for one that a vector environment holds is never stepped: it stays in the first graph.
     monkeypatch.setattr(arrival_histories, "_shared", {})
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 100)
-    env, graphs = NCSVectorEnv(3, **OVERTAKING), weakref.WeakSet()
+    env, graphs = vector_env(3, **OVERTAKING), weakref.WeakSet()
     env.reset(seed=0)
     for _ in steps_of(env, 500):
         graphs.add(env._estimator.histories)
@@ -282,7 +282,7 @@ def test_a_graph_has_room_for_many_environments(monkeypatch):
     # With fewer histories than environments it would be forgotten at every step.
     monkeypatch.setattr(arrival_histories, "_shared", {})
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 20)
-    env = NCSVectorEnv(100, plant=truck_trailer(), channel=Channel(loss=0.3, jitter=3))
+    env = vector_env(100, plant=truck_trailer(), channel=Channel(loss=0.3, jitter=3))
     env.reset(seed=0)
     graphs = []
     for _ in range(100):
@@ -292,7 +292,7 @@ def test_a_graph_has_room_for_many_environments(monkeypatch):
 
 
 def test_a_damaged_measurement_is_not_used_and_harms_no_other():
-    env = NCSVectorEnv(3, plant=truck_trailer(), channel=Channel(jitter=3))
+    env = vector_env(3, plant=truck_trailer(), channel=Channel(jitter=3))
     env.reset(seed=0)
     measure, count = env._process.measure, 0
 

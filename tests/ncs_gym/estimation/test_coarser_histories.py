@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, LinearPlant
+from ncs_gym import Channel, ChannelContract
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.set_membership import COARSEST_STEP, SHAPE_STEP, SetMembership
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.uncertainty.shape_matrices import is_inside
+from tests.product import linear_plant, rate_limited, sampled_plant
 
 # A motor whose speed is not measured, with sensors that are worth averaging over many samples.
-PLANT = LinearPlant(
+PLANT = linear_plant(
     A=[[1.0, 0.0099, 0.0010], [0.0, 0.98, 0.19], [0.0, -0.0047, 0.90]],
     B=[[0.0], [0.01], [0.095]],
     H=[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
@@ -71,15 +72,15 @@ def spring(**changes):
     """A mass on a spring, position and speed measured; both are disturbed."""
     given = {"state_limits": ([-2.0, -2.0], [2.0, 2.0]), "input_limits": ([-1.0], [1.0]), "disturbance_bound": 0.01}
     model = [[0.0, 1.0], [-1.0, -0.7]], [[0.0], [1.0]], np.eye(2), 0
-    return LinearPlant.from_statespace(model, 0.1, sensor_bound=0.01, initial_bound=0.01, **(given | changes))
+    return sampled_plant(model, 0.1, sensor_bound=0.01, initial_bound=0.01, **(given | changes))
 
 
 # What is known exactly: inputs under way, past inputs; what soon is known nearly so: the speed of who drives ahead.
 KNOWN = {
     "input delay": (spring(input_delay=2), None, [2, 3]),
-    "rate limit": (spring().with_rate_limits(0.2), None, [2]),
+    "rate limit": (rate_limited(spring(), 0.2), None, [2]),
     "undisturbed state": (
-        LinearPlant(
+        linear_plant(
             A=[[1.0, -0.085], [0.0, 0.7165]],
             B=[[0.1], [0.0]],
             box=np.eye(2),

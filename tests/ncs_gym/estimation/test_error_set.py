@@ -3,24 +3,18 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Ellipsoid,
-    ErrorSetError,
-    LinearPlant,
-    UnstablePlantError,
-    certified_error_set,
-    truck_trailer,
-)
+from ncs_gym import Ellipsoid, ErrorSetError, UnstablePlantError, certified_error_set, truck_trailer
 from ncs_gym.estimation.error_bound import require_error_set
 from ncs_gym.estimation.error_sets import InvariantErrorSet
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
+from tests.product import library_plant, linear_plant
 
 
 @pytest.mark.parametrize(
     ("plant", "radius"),
     [
-        (truck_trailer(process_noise_cov=np.zeros((2, 2))), 0.0801),
+        (library_plant(truck_trailer, process_noise_cov=np.zeros((2, 2))), 0.0801),
         (truck_trailer(), 0.168),
         (truck_trailer(mass=4000.0), 0.262),
     ],
@@ -47,11 +41,11 @@ def test_error_never_leaves_the_set_without_any_packet(seed):
 
 
 KNOWN = {"gamma": 0.0, **dict.fromkeys(("measurement_noise_cov", "initial_cov"), np.zeros((2, 2)))}
-PERFECT = truck_trailer(process_noise_cov=np.zeros((2, 2)), **KNOWN)
-FLAT = truck_trailer(process_noise_cov=np.diag([0.0, 1e-4]), **KNOWN)
+PERFECT = library_plant(truck_trailer, process_noise_cov=np.zeros((2, 2)), **KNOWN)
+FLAT = library_plant(truck_trailer, process_noise_cov=np.diag([0.0, 1e-4]), **KNOWN)
 
 
-@pytest.mark.parametrize("plant", [truck_trailer(initial_cov=0.2 * np.eye(2)), FLAT, PERFECT])
+@pytest.mark.parametrize("plant", [library_plant(truck_trailer, initial_cov=0.2 * np.eye(2)), FLAT, PERFECT])
 def test_set_covers_a_bad_first_estimate_and_leaves_slack_in_every_direction(plant):
     errors = certified_error_set(plant)
     assert plant is not PERFECT or np.linalg.eigvalsh(errors.Sigma)[1] < 1e-9
@@ -62,7 +56,7 @@ def test_set_covers_a_bad_first_estimate_and_leaves_slack_in_every_direction(pla
 
 
 def test_covering_a_bad_first_estimate_costs_less_than_scaling_would():
-    plant = truck_trailer(mass=4000.0, initial_cov=np.diag([0.0, 0.05]))
+    plant = library_plant(truck_trailer, mass=4000.0, initial_cov=np.diag([0.0, 0.05]))
     errors, plain = certified_error_set(plant), certified_error_set(truck_trailer(mass=4000.0))
     factor = plant.initial_error.shape_matrix[0, 0] / np.linalg.eigvalsh(plain.Sigma / 1.1)[0]
     assert factor > 1.0
@@ -73,11 +67,11 @@ def test_units_do_not_change_the_set():
     units = np.diag([1e-3, 1e4])
     base = truck_trailer()
     inverse = np.linalg.inv(units)
-    scaled = LinearPlant(
+    scaled = linear_plant(
         A=units @ base.A @ inverse, B=units @ base.B, box=base.box_rows @ inverse, u_max=4.0, dt=0.5, gamma=0.0,
         process_noise_cov=units @ (1e-4 * np.eye(2)) @ units, measurement_noise_cov=np.eye(2),
     )  # fmt: skip
-    same = truck_trailer(gamma=0.0, initial_cov=np.zeros((2, 2)))
+    same = library_plant(truck_trailer, gamma=0.0, initial_cov=np.zeros((2, 2)))
     expected = units @ certified_error_set(same).Sigma @ units
     np.testing.assert_allclose(
         certified_error_set(scaled).Sigma,
@@ -94,7 +88,7 @@ def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):
     rng = np.random.default_rng(seed)
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
     A = basis @ np.triu(3.0 * rng.standard_normal((n, n)), 1) @ basis.T + radius * np.eye(n)
-    plant = LinearPlant(A=A, B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
+    plant = linear_plant(A=A, B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
     try:
         errors = certified_error_set(plant)
     except (ErrorSetError, UnstablePlantError):
@@ -109,7 +103,7 @@ def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):
 def test_set_that_holds_by_no_more_than_rounding_is_an_error(growth):
     # As below; without a first error (E1) alone decides.
     settings = {"disturbance_bound": 0.1, "sensor_bound": 0.1, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+    plant = linear_plant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
     Sigma = growth * 4.0 * plant.disturbance.shape_matrix
     errors = InvariantErrorSet(Sigma=Sigma, rate=0.5)
     if growth > 1.0 + 1e-12:
@@ -125,7 +119,9 @@ def test_set_that_fails_a_condition_in_one_direction_is_an_error():
 
     def check(Sigma, first):
         initial = Ellipsoid(np.diag(first))
-        plant = LinearPlant(A=0.5 * np.eye(2), B=np.eye(2), box=1.0, u_max=1.0, dt=0.1, initial_bound=initial, **bounds)
+        plant = linear_plant(
+            A=0.5 * np.eye(2), B=np.eye(2), box=1.0, u_max=1.0, dt=0.1, initial_bound=initial, **bounds
+        )
         require_error_set(InvariantErrorSet(Sigma=Sigma, rate=0.5), plant)
 
     check(4.01 * np.eye(2), [2.0, 1.0])

@@ -1,5 +1,4 @@
 import copy
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +12,6 @@ from ncs_gym import (
     ChannelContract,
     Ellipsoid,
     Estimator,
-    LinearPlant,
     Packet,
     batch_reactor,
     cart_pole,
@@ -30,6 +28,7 @@ from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
+from tests.product import altered, library_plant, linear_plant, sampled_plant
 
 # So fine that rounding of covariances and shapes does not show.
 FINE = {"covariance_bits": 45, "shape_step": 2.0**-45}
@@ -74,7 +73,7 @@ def batch_estimate(plant, first, inputs, packets, noise_cov):
 def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(seed, p):
     plant = random_plant(seed, 3, 1, p)
     # Good sensors, so that every Kalman update also shrinks the hard ellipsoid and none is turned down.
-    plant = replace(plant, measurement_noise_cov=1e-7 * np.eye(plant.p))
+    plant = altered(plant, measurement_noise_cov=1e-7 * np.eye(plant.p))
     channel = Channel(loss=0.3, quantization_step=0.001, delay=1, jitter=3)
     rng = np.random.default_rng(seed)
     estimator = Estimator(plant, channel, histories=histories_of(plant, channel, roomy(plant), **FINE))
@@ -157,7 +156,7 @@ def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, s
 
 
 def test_partial_measurements_keep_being_used():
-    plant = truck_trailer(H=np.array([[1.0, 0.0]]))
+    plant = library_plant(truck_trailer, H=np.array([[1.0, 0.0]]))
     channel = Channel(quantization_step=0.05)
     ages = [estimator.age for estimator, _ in drive(plant, channel, 0, 200, lambda rng: np.eye(2))]
     assert np.mean(np.array(ages) == 0) > 0.99
@@ -168,7 +167,7 @@ def test_partial_measurements_keep_being_used():
 @pytest.mark.parametrize("channel", [Channel(), CHANNELS[1]])
 def test_samples_are_used_however_wide_the_box_of_another_state_is(current, channel):
     """The trace-optimal gain counts in half-widths of the box, and would leave the set where one is very wide."""
-    plant = LinearPlant.from_statespace(
+    plant = sampled_plant(
         ([[-1.0, 10.0], [-2.0, -20.0]], [[0.0], [20.0]], [[1.0, 0.0]], [[0.0]]),
         dt=0.02, box=[5.0, current], u_max=12.0,
         disturbance_bound=[0.02, 0.01], sensor_bound=0.02, initial_bound=[0.05, 0.05],
@@ -188,7 +187,7 @@ def test_samples_are_used_however_wide_the_box_of_another_state_is(current, chan
 
 def test_an_update_may_enlarge_what_later_steps_shrink():
     """Where the trace decided at the step of the sample, late ones were skipped: 1.48 in place of .22."""
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.02, 0.63], [-1.1, -0.07]], B=[[1.0], [1.0]], H=[[0.05, 1.4]], box=[0.5, 650.0], u_max=1.0, dt=0.1,
         disturbance_bound=[0.076, 0.001], sensor_bound=[0.007], initial_bound=[0.8, 0.2],
     )  # fmt: skip
@@ -221,7 +220,7 @@ def test_updates_shrink_the_running_ellipsoid():
 def test_two_sensors_that_contradict_each_other_raise_the_alarm_where_one_of_them_says_what_was_predicted():
     """So exact, and so alike, that no inverse vouches for a residual: infinite weights times zero are no number."""
     settings = {"disturbance_bound": 0.1, "sensor_bound": 1e-9, "initial_bound": 0.1}
-    plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=[[1.0], [1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+    plant = linear_plant(A=[[0.5]], B=[[1.0]], H=[[1.0], [1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
     for off, alarm in ((0.0, False), (0.01, True)):
         estimator = Estimator(plant, Channel())
         estimator.reset(np.zeros(1))
@@ -292,7 +291,7 @@ def test_a_shape_outside_the_certified_one_of_its_age_is_not_brought_back_by_a_p
 @pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
 def test_a_long_thin_shape_is_moved_without_loss(size):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    plant = linear_plant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
     sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=1e2 * np.eye(2), rate=0.9), shape_step=2.0**-90)
     rng = np.random.default_rng(0)
     for _ in range(60):
@@ -304,7 +303,7 @@ def test_a_long_thin_shape_is_moved_without_loss(size):
 
 def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_their_differences():
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=np.diag([1.5, 1.1]), B=np.ones((2, 1)), box=[1.0, 3.0], **settings)
+    plant = linear_plant(A=np.diag([1.5, 1.1]), B=np.ones((2, 1)), box=[1.0, 3.0], **settings)
     sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.eye(2), rate=0.5))
     farthest = 2.0 * plant.state_limit  # between states at opposite ends of where a simulation stops them
     for grown in (np.diag([9.0 * farthest[0] ** 2, 1.0]), np.diag([1.0, 9.0 * farthest[1] ** 2])):
@@ -320,7 +319,7 @@ def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditione
     """Coordinates of its unit ball and back are not the identity: the inverse of its factor has entries of 2^(n-2)."""
     n, rng = 44, np.random.default_rng(0)
     factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
-    plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
+    plant = linear_plant(A=0.5 * np.eye(n), B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
     sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=factor @ factor.T, rate=0.5))
     for root in rng.standard_normal((8, n, n)):
         shape = size * factor @ root @ root.T @ factor.T
@@ -374,7 +373,9 @@ def test_covariances_and_gains_are_those_of_filterpy(plant):
 @pytest.mark.parametrize("perfect", [(True, True), (True, False)])
 def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
     # Otherwise a filter that knows the state has a singular innovation covariance.
-    plant = truck_trailer(H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4)))
+    plant = library_plant(
+        truck_trailer, H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4))
+    )
     noise = ErrorRecursion(plant, 0.0, certified_error_set(plant)).R - plant.measurement_noise_cov
     np.testing.assert_allclose(noise, FLAT_INFLATION * np.diag((plant.half_widths * [2.0, 3.0]) ** 2), rtol=1e-6)
 
@@ -382,7 +383,7 @@ def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
 @pytest.mark.parametrize("condition", [1e4, 1e8, 1e12, 1e16])
 def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bound_is(condition):
     rng = np.random.default_rng(0)
-    plant = replace(truck_trailer(), measurement_noise_cov=np.eye(2))
+    plant = altered(truck_trailer(), measurement_noise_cov=np.eye(2))
     assumed, noise = sets_of(plant).noise, plant.sensor_noise.bound.shape_matrix
     passed = np.zeros(2, dtype=int)
     for _ in range(60):

@@ -1,18 +1,18 @@
 """The room that error sets by age have for the rounding of an estimate that is updated with a certified gain."""
 
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, certified_error_set
+from ncs_gym import Channel, ChannelContract, Ellipsoid, certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSetsByAge, InvariantErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields.verification.rational_matrix import congruence, rational
+from tests.product import altered, linear_plant
 
 # Radius of Sigma_0 in half-widths of the box: of sensors so fine that the rounding of an estimate far out counts.
 RADIUS, GAIN, RATE = 1e-8, 0.9, 1.02
@@ -21,7 +21,7 @@ SLACK = 1e-12
 
 
 def plant_with(sensor_radius):
-    return LinearPlant(
+    return linear_plant(
         A=[[RATE]],
         B=[[1.0]],
         box=[1.0],
@@ -102,7 +102,7 @@ def test_with_room_an_updated_estimate_stays_in_its_set():
 @pytest.mark.parametrize(("radius", "gain"), [(1e-8, 0.9), (4e-3, 0.5)])
 def test_a_gain_chosen_at_run_time_has_the_room_where_shapes_are_hardly_rounded_up(radius, gain):
     """The inflation covers what rounding takes of a large error, and what the plant adds that of a small one."""
-    plant, rng, largest, H = replace(plant_with(radius), H=np.array([[0.9]])), np.random.default_rng(0), 0.0, 0.9
+    plant, rng, largest, H = altered(plant_with(radius), H=np.array([[0.9]])), np.random.default_rng(0), 0.0, 0.9
     sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
     error, noise = Fraction(radius), Fraction(float(sets.noise[0, 0] ** 0.5)) * (1 - Fraction(1, 10**15))
     limit = sets.updated(np.array([[radius**2]]), np.array([[gain]])).item() ** 0.5
@@ -122,7 +122,7 @@ def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
     for _ in range(30):
         noise = Ellipsoid(1e4 * rng.uniform(0.5, 1.0) * np.array([[1.0, 0.7], [0.7, 0.49]]) + 1e-12 * np.eye(2))
         settings = {"disturbance_bound": 0.0, "sensor_bound": noise, "initial_bound": 0.0}
-        plant = LinearPlant(A=[[RATE]], B=[[1.0]], H=[[1.0], [0.7]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+        plant = linear_plant(A=[[RATE]], B=[[1.0]], H=[[1.0], [0.7]], box=[1.0], u_max=1.0, dt=0.1, **settings)
         sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
         gain, shape = np.array([[70.0, -100.0]]) * rng.uniform(0.5, 1.0), np.array([[1e-26]])
         N = congruence(rational(gain), rational(sets.noise))
@@ -142,7 +142,7 @@ def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_infla
 def test_sets_that_are_found_have_the_room():
     """Fine sensors and an unmeasured state: without it what an update leaves is as large as the set."""
     for pole, gamma, sensor in ((0.9, 1e-16, 1e-10), (1.01, 1e-12, 1e-7), (0.9, 1e-12, 1e-6)):
-        plant = LinearPlant(
+        plant = linear_plant(
             A=[[1.02, 0.1], [0.0, pole]],
             B=[[0.0], [1.0]],
             H=[[1.0, 0.0]],
@@ -168,7 +168,7 @@ def sets_of_two_sensors_whose_noise_is_nearly_common():
     def plant_of(initial):
         noise = Ellipsoid(common**2 * np.ones((2, 2)) + own**2 * np.eye(2))
         settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0}
-        return LinearPlant(A=[[rate]], B=[[1.0]], H=matched, sensor_bound=noise, initial_bound=initial, **settings)
+        return linear_plant(A=[[rate]], B=[[1.0]], H=matched, sensor_bound=noise, initial_bound=initial, **settings)
 
     plain = plant_of(0.0)
     push, room = plain.disturbance.shape_matrix[0, 0] ** 0.5, plain.estimate_rounding[0, 0]
@@ -213,7 +213,7 @@ def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(
     gain = np.array([[1.0, 0.0]]) if error > noise else np.array([[7.0, -10.0]])
     own = Ellipsoid(noise**2 * matched @ matched.T + 1e-12 * np.eye(2))  # the gain does not see what is common to both
     settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)
+    plant = linear_plant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)
     sets = sets_for_age_zero(plant, 1.0, error**2, 0.5, gain, 0.5)
     rng, moved = np.random.default_rng(0), 0.0
     for _ in range(300):

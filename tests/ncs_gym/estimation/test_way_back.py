@@ -1,7 +1,5 @@
 """After an outage of any length a kept contract brings the error back into its certified set, in a few periods."""
 
-from dataclasses import replace
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from tests.plants import random_plant
+from tests.product import altered
 
 IDS = ("CartPole", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping", "Pendulum")
 
@@ -23,7 +22,7 @@ def registered(name):
 def unstable(seed):
     """A random plant whose eigenvalues reach beyond the circle."""
     plant = random_plant(seed, *[(2, 1), (3, 2, 1), (4, 2, 2), (4, 1, 3)][seed % 4])
-    return replace(plant, A=plant.A * (1.0 + 0.04 * (seed % 3)) / plant.spectral_radius), ChannelContract(1 + seed % 3)
+    return altered(plant, A=plant.A * (1.0 + 0.04 * (seed % 3)) / plant.spectral_radius), ChannelContract(1 + seed % 3)
 
 
 def steps_back(plant, contract, outage, period):

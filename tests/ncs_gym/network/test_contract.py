@@ -11,8 +11,6 @@ from ncs_gym import (
     Ellipsoid,
     ErrorSetError,
     GilbertElliott,
-    LinearPlant,
-    NCSEnv,
     Packet,
     batch_reactor,
     cart_pole,
@@ -37,13 +35,14 @@ from shields.verification.rational_matrix import (
     scale,
     subtract,
 )
+from tests.product import altered, linear_plant, loop_env
 
 PLANTS = {
     "cart-pole": (cart_pole(), ChannelContract(4, 1e-4)),
     "cart-pole, position and angle": (cart_pole(full_state=False), ChannelContract(3)),
     "batch reactor": (batch_reactor(), ChannelContract(3, 1e-3)),
     "truck-trailer": (truck_trailer(), ChannelContract(5, 0.05)),
-    "scalar": (LinearPlant(A=[[1.2]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4), ChannelContract(0)),
+    "scalar": (linear_plant(A=[[1.2]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4), ChannelContract(0)),
 }
 CHANNELS = [
     Channel(loss=0.5, max_consecutive_losses=2),
@@ -107,9 +106,9 @@ def test_contract_makes_the_error_set_of_a_stable_plant_smaller():
 
 
 def test_unstable_plant_needs_a_promise():
-    assert NCSEnv(cart_pole(), Channel(delay=1)).contract == ChannelContract(1)
-    assert NCSEnv(cart_pole(), Channel(loss=0.1), contract=ChannelContract(4)).contract == ChannelContract(4)
-    assert NCSEnv(truck_trailer(), Channel()).contract is None
+    assert loop_env(cart_pole(), Channel(delay=1)).contract == ChannelContract(1)
+    assert loop_env(cart_pole(), Channel(loss=0.1), contract=ChannelContract(4)).contract == ChannelContract(4)
+    assert loop_env(truck_trailer(), Channel()).contract is None
 
 
 def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
@@ -178,7 +177,7 @@ def test_one_step_beyond_the_contract_the_error_can_leave_the_certified_set():
 
 @pytest.mark.parametrize("outage", [150, pytest.param(1500, marks=pytest.mark.slow)])
 def test_long_outages_end_no_episode_with_an_exception(outage):
-    twice = LinearPlant(
+    twice = linear_plant(
         A=[[1.2]],
         B=[[1.0]],
         box=[[1.0]],
@@ -247,7 +246,7 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
 
 def test_sets_by_age_that_fail_a_condition_are_an_error():
     plant, contract = PLANTS["cart-pole"]
-    plant = replace(plant, initial_cov=np.zeros((4, 4)))
+    plant = altered(plant, initial_cov=np.zeros((4, 4)))
     errors = certified_error_set(plant, contract)
     require_error_set(errors, plant)
     # The first set would hold no update, and the last not what the one before it moves into.
@@ -256,7 +255,7 @@ def test_sets_by_age_that_fail_a_condition_are_an_error():
         shapes[age] *= 0.5
         with pytest.raises(ErrorSetError, match=name):
             require_error_set(replace(errors, shapes=shapes), plant)
-    worse = replace(plant, initial_cov=np.eye(4))
+    worse = altered(plant, initial_cov=np.eye(4))
     with pytest.raises(ErrorSetError, match=r"\(C0\)"):
         require_error_set(errors, worse)
 

@@ -19,7 +19,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import NCSEnv, PacketLog, contract_of, truck_trailer
+from ncs_gym import PacketLog, contract_of, truck_trailer
+from tests.product import loop_env
 
 PAGE = Path(__file__).parents[3] / "docs" / "requirements.md"
 
@@ -302,7 +303,7 @@ def test_replay_in_an_environment_has_the_ages_of_the_record(record):
     assert ages.tolist() == ages_by_clock(list(zip(sent, received, strict=True)), "1")
     promised = contract_of(log.channel(1.0))
     assert promised is None or ages.max() <= promised.max_age
-    env = NCSEnv(PLANT, channel=log.channel(1.0), terminate_on_violation=False)
+    env = loop_env(PLANT, channel=log.channel(1.0), terminate_on_violation=False)
     replayed = set()
     for seed in range(200):  # the replay begins with a random sample
         env.reset(seed=seed)

@@ -5,8 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, NCSEnv, NCSVectorEnv, TraceChannel, cart_pole, truck_trailer
+from ncs_gym import Channel, ChannelContract, TraceChannel, cart_pole, truck_trailer
 from ncs_gym.network.requests import Requests, spare_samples
+from tests.product import loop_env, vector_env
 
 # Longest runs of losses, shortest and longest delays, steps that a contract allows beyond what they need, and leads.
 SETTINGS = [
@@ -73,7 +74,7 @@ def cart_pole_loop(kind, *count, **settings):
 
 
 def test_samples_are_taken_only_where_asked_or_forced():
-    env = cart_pole_loop(NCSEnv)
+    env = cart_pole_loop(loop_env)
     _, info = env.reset(seed=0)
     assert (info["requested"], info["request_forced"], info["packets"]) == (False, False, 0)
     ages, packets = [], 0
@@ -91,8 +92,8 @@ def test_samples_are_taken_only_where_asked_or_forced():
 
 
 def test_first_sample_that_is_needed_is_that_after_the_spare_ones():
-    own = NCSEnv(plant=cart_pole(), channel=Channel(0.5, delay=1, max_consecutive_losses=2, on_request=True))
-    for env, spare in ((cart_pole_loop(NCSEnv), 5), (own, 0)):
+    own = loop_env(plant=cart_pole(), channel=Channel(0.5, delay=1, max_consecutive_losses=2, on_request=True))
+    for env, spare in ((cart_pole_loop(loop_env), 5), (own, 0)):
         env.reset(seed=0)
         forced = [env.step(np.zeros(1, np.float32))[-1]["request_forced"] for _ in range(6)]
         assert forced == [False] * spare + [True] * (1 if spare else 6)
@@ -100,7 +101,7 @@ def test_first_sample_that_is_needed_is_that_after_the_spare_ones():
 
 
 def test_outstanding_samples_are_those_requested_and_newer_than_the_newest():
-    env = cart_pole_loop(NCSEnv)
+    env = cart_pole_loop(loop_env)
     env.reset(seed=0)
     stamps = []
     for step in range(1, 200):
@@ -113,7 +114,7 @@ def test_outstanding_samples_are_those_requested_and_newer_than_the_newest():
 
 @pytest.mark.parametrize("delay", [0, 2])
 def test_outstanding_samples_without_a_contract_are_those_that_may_still_arrive(delay):
-    env = NCSEnv(plant=truck_trailer(), channel=Channel(loss=1.0, delay=delay, on_request=True))
+    env = loop_env(plant=truck_trailer(), channel=Channel(loss=1.0, delay=delay, on_request=True))
     env.reset(seed=0)
     for step in range(1, 9):
         env.request()
@@ -122,7 +123,7 @@ def test_outstanding_samples_without_a_contract_are_those_that_may_still_arrive(
 
 
 def test_stable_plant_without_a_contract_is_never_forced_to_a_sample():
-    env = NCSVectorEnv(3, plant=truck_trailer(), channel=Channel(0.3, delay=2, on_request=True))
+    env = vector_env(3, plant=truck_trailer(), channel=Channel(0.3, delay=2, on_request=True))
     env.reset(seed=0)
     for _ in range(60):
         *_, info = env.step(np.zeros((3, 1), np.float32))
@@ -136,7 +137,7 @@ def test_stable_plant_without_a_contract_is_never_forced_to_a_sample():
 
 
 def test_broken_contract_forces_a_request_in_every_step():
-    env = cart_pole_loop(NCSEnv)
+    env = cart_pole_loop(loop_env)
     dead = Channel(1.0, delay=1, jitter=1, quantization_step=1e-4, on_request=True)
     env.reset(seed=0, options={"channel": dead})
     infos = [env.step(np.zeros(1, np.float32))[-1] for _ in range(40)]
@@ -144,11 +145,11 @@ def test_broken_contract_forces_a_request_in_every_step():
     assert infos[-1]["contract_broken"]
 
 
-@pytest.mark.parametrize("kind", [NCSEnv, NCSVectorEnv])
+@pytest.mark.parametrize("kind", [loop_env, vector_env])
 def test_contract_is_kept_over_an_episode_channel_that_loses_and_delays_more(kind):
     settings = {"loss": 0.9, "quantization_step": 1e-4, "on_request": True}
     narrow, wide = Channel(max_consecutive_losses=0, **settings), Channel(delay=3, max_consecutive_losses=3, **settings)
-    many = kind is NCSVectorEnv
+    many = kind is vector_env
     env = kind(*[4] * many, plant=cart_pole(), channel=narrow, contract=ChannelContract(9, 1e-4))
     assert env.contract.is_kept_by(wide)
     actions = np.zeros((4, 1) if many else 1, np.float32)
@@ -162,7 +163,7 @@ def test_contract_is_kept_over_an_episode_channel_that_loses_and_delays_more(kin
 
 def test_samples_are_sent_where_the_downlink_broke_its_contract():
     downlink = Channel(loss=1.0, delay=1)
-    env = cart_pole_loop(NCSEnv, downlink=downlink, downlink_contract=ChannelContract(2))
+    env = cart_pole_loop(loop_env, downlink=downlink, downlink_contract=ChannelContract(2))
     env.reset(seed=0)
     infos = [env.step(np.zeros(1, np.float32))[-1] for _ in range(8)]
     assert [info["downlink_broken"] for info in infos] == [False] * 2 + [True] * 6
@@ -170,7 +171,7 @@ def test_samples_are_sent_where_the_downlink_broke_its_contract():
 
 
 def test_requests_behind_a_downlink_take_effect_when_the_input_does():
-    env = cart_pole_loop(NCSEnv, downlink=Channel(delay=3))
+    env = cart_pole_loop(loop_env, downlink=Channel(delay=3))
     env.reset(seed=0)
     env.request()
     packets = [env.step(np.zeros(1, np.float32))[-1]["packets"] for _ in range(5)]
@@ -180,7 +181,7 @@ def test_requests_behind_a_downlink_take_effect_when_the_input_does():
 def test_trace_on_request_keeps_the_contract():
     channel = TraceChannel(trace=(1, -1, 2, -1, -1, 2), on_request=True, quantization_step=1e-4)
     settings = {"plant": cart_pole(), "channel": channel, "contract": ChannelContract(8, 1e-4)}
-    env, rng = NCSVectorEnv(50, **settings), np.random.default_rng(0)
+    env, rng = vector_env(50, **settings), np.random.default_rng(0)
     env.reset(seed=0)
     ages = []
     for _ in range(300):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from ncs_gym import Channel, LinearPlant, batch_reactor, cart_pole, register_plant, truck_trailer
+from tests.product import altered, gym_env, gym_vector_env, resampled, sampled_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANTS = {
@@ -34,14 +33,12 @@ def random_model(seed, n, m, k):
     rows = np.concatenate([np.eye(n) * rng.uniform(0.3, 3.0, n), rng.standard_normal((k, n))])
     model = (2.0 * rng.standard_normal((n, n)), rng.standard_normal((n, m)), np.eye(n), np.zeros((n, m)))
     bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    return LinearPlant.from_statespace(
-        model, 0.2, box=rows, u_max=rng.uniform(0.2, 5.0, m), between_samples=5, **bounds
-    )
+    return sampled_plant(model, 0.2, box=rows, u_max=rng.uniform(0.2, 5.0, m), between_samples=5, **bounds)
 
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_grid_is_that_of_the_model_and_begins_with_the_box(name):
-    plant = replace(PLANTS[name](), between_samples=6)
+    plant = altered(PLANTS[name](), between_samples=6)
     grid = plant.grid_rows
     assert not any(array.flags.writeable for array in grid)
     np.testing.assert_array_equal(grid.state[0], plant.box_rows)
@@ -70,7 +67,7 @@ def test_bound_that_is_out_of_reach_says_so():
     model = ([[0.0, 1.0], [-1e7, -2.0]], [[0.0], [2.0]], np.eye(2), np.zeros((2, 1)))
     bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
     box = np.c_[np.cos(angles), np.sin(angles) / 2]
-    plant = LinearPlant.from_statespace(model, 0.1, box=box, u_max=1.0, between_samples=64, **bounds)
+    plant = sampled_plant(model, 0.1, box=box, u_max=1.0, between_samples=64, **bounds)
     for asked in (
         lambda: plant.grid_rows,
         lambda: plant.worst_constraint_values(np.zeros(2), np.zeros(1), np.zeros(2)),
@@ -82,12 +79,12 @@ def test_bound_that_is_out_of_reach_says_so():
 
 
 def test_bound_is_no_larger_than_it_needs_to_be():
-    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
     # The worst second derivative at the beginning of a step, by hand: x2' of the first row, x2'' of the second.
     stretch = (4.5 / 4.0 * 2.0 + 4.6 / 4.0 * 2.0 + 4.0) / 2.0
     h = 0.5 / 8
     assert h**2 / 8 * stretch <= plant.grid_rows.remainder[0] <= 1.2 * h**2 / 8 * stretch
-    finer = replace(plant, between_samples=32).grid_rows.remainder
+    finer = altered(plant, between_samples=32).grid_rows.remainder
     assert (finer < plant.grid_rows.remainder / 12.0).all()
 
 
@@ -101,7 +98,7 @@ def fine_values(plant, x, u, x_next):
 
 
 def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
-    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
     env = gym.make(CRUISE, plant=plant, disturbance="sphere")
     rng, between_alone, total = np.random.default_rng(0), 0, 0.0
     for episode in range(12):
@@ -121,7 +118,7 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
 
 
 def test_violation_between_samples_ends_an_episode_if_violations_do():
-    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
     env = gym.make(CRUISE, plant=plant, terminate_on_violation=True)
     for seed in range(5):
         env.reset(seed=seed)
@@ -138,7 +135,7 @@ def test_without_the_setting_only_samples_count_and_everything_is_as_before():
     plant = truck_trailer(mass=4000.0)
     assert plant.between_samples is None
     assert plant.grid_rows is None
-    assert plant.fingerprint == replace(plant, continuous_model=None).fingerprint
+    assert plant.fingerprint == altered(plant, continuous_model=None).fingerprint
     env = gym.make(CRUISE)
     env.reset(seed=0)
     for _ in range(50):
@@ -148,17 +145,17 @@ def test_without_the_setting_only_samples_count_and_everything_is_as_before():
 
 
 def test_once_per_step_is_at_the_sampling_instants_alone():
-    plant = replace(truck_trailer(), between_samples=8)
+    plant = altered(truck_trailer(), between_samples=8)
     assert "by any time within a step" in " ".join(plant.assumptions)
     assert "at all times: at 8 of each step" in str(plant)
     assert "at all times" not in str(truck_trailer())
-    assert replace(plant, between_samples=1).between_samples is None
+    assert altered(plant, between_samples=1).between_samples is None
 
 
 @pytest.mark.parametrize("make", [gym.make, lambda env_id, **settings: gym.make_vec(env_id, num_envs=2, **settings)])
 def test_registered_environments_count_between_samples_if_they_are_told_so(make):
     env = make("ncs_gym/CSTR-v0", between_samples=4).unwrapped
-    own = replace(make("ncs_gym/CSTR-v0").unwrapped.plant, between_samples=4)
+    own = altered(make("ncs_gym/CSTR-v0").unwrapped.plant, between_samples=4)
     assert env.plant.fingerprint == own.fingerprint
     assert env.contract == make("ncs_gym/CSTR-v0").unwrapped.contract
     assert make("ncs_gym/CSTR-v0", between_samples=1).unwrapped.plant.between_samples is None
@@ -171,7 +168,7 @@ OSCILLATOR = ([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], np.eye(2), np.zeros((2,
 def pushed(**more):
     """An oscillator pushed to one side within each step, at rest under the middle of that."""
     bound = {"disturbance_bound": ([[0.0], [0.6]], [0.0], [1.0])}
-    return LinearPlant.from_statespace(OSCILLATOR, dt=1.5, **PUSHED | bound | more)
+    return sampled_plant(OSCILLATOR, dt=1.5, **PUSHED | bound | more)
 
 
 def held(**more):
@@ -179,7 +176,7 @@ def held(**more):
     A = exponentials(pushed(), [1.5])[0][:, :2]
     point = np.linalg.solve(np.eye(2) - A, [0.0, 0.3])
     bound = {"disturbance_bound": 0.05, "offset": [0.0, 0.3], "operating_state": point, "operating_input": 0.0}
-    return LinearPlant.from_statespace(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
+    return sampled_plant(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
 
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
@@ -193,13 +190,13 @@ def test_constant_disturbance_is_refused_beside_between_samples_at_every_entranc
     register_plant(env_id, plant, channel=Channel())
     entrances = [
         lambda: make(between_samples=8),
-        lambda: replace(plant, between_samples=8),
+        lambda: altered(plant, between_samples=8),
         lambda: LinearPlant.read(edited),
-        lambda: gym.make("ncs_gym/LinearNCS-v0", plant=plant, between_samples=8),
-        lambda: gym.make("ncs_gym/LinearNCS-v0", plant=edited),
-        lambda: gym.make_vec("ncs_gym/LinearNCS-v0", 2, plant=plant, between_samples=8),
+        lambda: gym_env(plant=plant, between_samples=8),
+        lambda: gym_env(plant=edited),
+        lambda: gym_vector_env(2, plant=plant, between_samples=8),
         lambda: gym.make(env_id, between_samples=24),
-        lambda: replace(plant.resampled(1.0), between_samples=8),
+        lambda: altered(resampled(plant, 1.0), between_samples=8),
     ]
     try:
         for entrance in entrances:
@@ -217,19 +214,19 @@ def test_constant_disturbances_that_cancel_at_the_samples_do_not_within_a_step()
     for plant in (held(**cancel), pushed(disturbance_bound=both)):
         assert plant.step_offset[1] > 0.5
         with pytest.raises(ValueError, match="rests without a constant disturbance"):
-            replace(plant, between_samples=8)
+            altered(plant, between_samples=8)
 
 
 def test_model_in_continuous_time_is_the_one_that_was_sampled():
     plant = truck_trailer()
     for change in ({"A": 0.9 * plant.A}, {"dt": 1.0}, {"continuous_model": 1.1 * plant.continuous_model}):
         with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
-            replace(plant, **change)
-    assert replace(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None
-    small = LinearPlant.from_statespace(  # a state in units in which its limit is tiny
+            altered(plant, **change)
+    assert altered(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None
+    small = sampled_plant(  # a state in units in which its limit is tiny
         ([[0.0, 1e9], [0.0, -1.0]], [[0.0], [1e-9]], np.eye(2), np.zeros((2, 1))),
         dt=0.1, box=[1e9, 1.0], u_max=1e9, disturbance_bound=0.0, sensor_bound=0.01, initial_bound=0.01,
     )  # fmt: skip
     wrong = small.A * [[1.0, 1.0], [1.0, 0.95]]
     with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
-        replace(small, A=wrong)
+        altered(small, A=wrong)

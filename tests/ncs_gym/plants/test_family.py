@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Ellipsoid, LinearPlant, NCSEnv, Remainder, cart_pole, truck_trailer
+from ncs_gym import Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
 from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.uncertainty.family import Family
 from tests.plants import varying_cart_pole, varying_truck
+from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, resampled, sampled_plant
 
 MASSES = {"mass": (3800.0, 4200.0)}
 POLE = {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}
 TRUCK, POLES = varying_truck(), varying_cart_pole()
 TRUCKS = [truck_trailer(mass=mass) for mass in (3800.0, 4000.0, 4300.0)]
-HULL = LinearPlant.family(TRUCKS)
+HULL = family_of(TRUCKS)
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 SMALL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 2.0], "u_max": 3.0, "dt": 0.1} | QUIET
 
@@ -75,7 +76,7 @@ def between(function, ranges, count, seed=0):
 
 
 def test_states_of_many_environments_are_moved_to_the_operating_point_and_back():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9]], B=[[0.1]], dt=0.1, state_limits=(1.0, 3.0), input_limits=(0.0, 1.0),
         operating_state=2.0, operating_input=0.4,
         disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
@@ -114,18 +115,18 @@ def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end(few
     def of(gain, **more):
         limits = {"state_limits": ([-1.0, -2.0], [0.5, 2.0]), "input_limits": (-1.0, 3.0)}
         model = (SMALL["A"], [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1)
-        return LinearPlant.from_statespace(model, **limits, **QUIET, **more)
+        return sampled_plant(model, **limits, **QUIET, **more)
 
-    plant = LinearPlant.family([of(0.3), of(0.5)])
+    plant = family_of([of(0.3), of(0.5)])
     np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.0, 0.3], rtol=1e-8)
     np.testing.assert_allclose(plant.reach, [1.0, 2.0, 3.0])
-    delayed = LinearPlant.family([of(0.3, input_delay=2), of(0.5, input_delay=2)])
+    delayed = family_of([of(0.3, input_delay=2), of(0.5, input_delay=2)])
     np.testing.assert_allclose(np.sqrt(np.diag(delayed.remainder.bound.shape_matrix)), [0, 0.3, 0, 0], rtol=1e-8)
     np.testing.assert_allclose(delayed.reach, [1.0, 2.0, 3.0, 3.0, 3.0])
-    limited = LinearPlant.family([of(0.3, du_max=0.5), of(0.5, du_max=0.5)])
+    limited = family_of([of(0.3, du_max=0.5), of(0.5, du_max=0.5)])
     np.testing.assert_allclose(np.sqrt(np.diag(limited.remainder.bound.shape_matrix)), [0, 0.3, 0], rtol=1e-8)
     for more in ({"input_delay": 2}, {"du_max": 0.5}):
-        given = LinearPlant.family(partial(of, **more), {"gain": (0.3, 0.5)}, monotone=True)
+        given = family_of(partial(of, **more), {"gain": (0.3, 0.5)}, monotone=True)
         wanted = delayed if "input_delay" in more else limited
         assert inputs_under_way(given) == len(given.A) - 2
         np.testing.assert_allclose(given.A, wanted.A, rtol=0, atol=1e-15)
@@ -136,33 +137,33 @@ def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end(few
 def test_input_that_is_disturbed_on_its_way_counts_by_the_limits_of_its_state():
     def of(gain, disturbance):
         model = {"A": [[0.9, gain], [0.0, 0.0]], "B": [[0.0], [1.0]], "box": [1.0, 2.0], "u_max": 1.0, "dt": 0.1}
-        return LinearPlant(**model | QUIET | {"disturbance_bound": disturbance})
+        return linear_plant(**model | QUIET | {"disturbance_bound": disturbance})
 
     for disturbance, reached in (([0.01, 0.0], 1.0), ([0.01, 0.5], 2.0)):
-        plant = LinearPlant.family([of(0.1, disturbance), of(0.3, disturbance)])
+        plant = family_of([of(0.1, disturbance), of(0.3, disturbance)])
         assert inputs_under_way(plant) == (reached == 1.0)
         np.testing.assert_allclose(plant.reach, [1.0, reached, 1.0])
         np.testing.assert_allclose(
             np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.1 * reached, 0.0], rtol=1e-8
         )
         # Only what is known without an error is the last input of limits of rates.
-        assert of(0.1, disturbance).with_rate_limits(0.5).n == (2 if reached == 1.0 else 3)
-    quiet = LinearPlant.family([of(0.1, 0.0), of(0.3, 0.0)])
-    assert replace(quiet, disturbance_bound=[0.02, 0.0]).reach[1] == 1.0
-    disturbed = replace(quiet, disturbance_bound=[0.01, 0.5])  # on its way, and so is its bound
+        assert rate_limited(of(0.1, disturbance), 0.5).n == (2 if reached == 1.0 else 3)
+    quiet = family_of([of(0.1, 0.0), of(0.3, 0.0)])
+    assert altered(quiet, disturbance_bound=[0.02, 0.0]).reach[1] == 1.0
+    disturbed = altered(quiet, disturbance_bound=[0.01, 0.5])  # on its way, and so is its bound
     np.testing.assert_allclose(np.sqrt(np.diag(disturbed.remainder.bound.shape_matrix)), [0.2, 0.0], rtol=1e-8)
 
 
 def test_a_state_counts_as_a_past_input_only_if_it_is_that_for_every_member():
     def of(leak):
         model = {"A": [[0.5, 0.1 + 0.2 * leak], [0.0, leak]], "B": [[0.0], [1.0]], "box": [2.0, 12.0], "u_max": 1.0}
-        return LinearPlant(**model | {"dt": 1.0} | QUIET | {"disturbance_bound": [0.01, 0.0]})
+        return linear_plant(**model | {"dt": 1.0} | QUIET | {"disturbance_bound": [0.01, 0.0]})
 
     found = [
-        LinearPlant.family([of(0.0), of(0.9)]),
-        LinearPlant.family([of(0.9), of(0.0)]),
-        LinearPlant.family([of(-0.9), of(0.9)]),
-        LinearPlant.family(of, {"leak": (0.0, 0.9)}, monotone=True),
+        family_of([of(0.0), of(0.9)]),
+        family_of([of(0.9), of(0.0)]),
+        family_of([of(-0.9), of(0.9)]),
+        family_of(of, {"leak": (0.0, 0.9)}, monotone=True),
     ]
     wanted = [[0.09 * 12.0, 0.45 * 12.0]] * 2 + [[0.18 * 12.0, 0.9 * 12.0], [0.09 * 12.0, 0.45 * 12.0]]
     for plant, (first, second) in zip(found, wanted, strict=True):
@@ -177,28 +178,28 @@ def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_membe
     def of(entry, column=0, **more):
         A = np.array(SMALL["A"])
         A[0, column] = entry
-        return LinearPlant(**SMALL | {"A": A} | more)
+        return linear_plant(**SMALL | {"A": A} | more)
 
     sums = {"box": np.array([[1.0, 1.0], [1.0, -1.0]])}
-    plant = LinearPlant.family([of(0.8, **sums), of(0.9, **sums)])
+    plant = family_of([of(0.8, **sums), of(0.9, **sums)])
     np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.05, 0.0], rtol=1e-8)
     free = {"box": [np.inf, 2.0]}
-    plant = LinearPlant.family([of(0.1, 1, **free), of(0.2, 1, **free)])
+    plant = family_of([of(0.1, 1, **free), of(0.2, 1, **free)])
     np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.1, 0.0], rtol=1e-8)
     with pytest.raises(ValueError, match="differ in what x1 does"):
-        LinearPlant.family([of(0.8, **free), of(0.9, **free)])
+        family_of([of(0.8, **free), of(0.9, **free)])
     alone = {"box": np.array([[1.0, 1.0]])}
     with pytest.raises(ValueError, match="differ in what x1 does"):
-        LinearPlant.family([of(0.8, **alone), of(0.9, **alone)])
+        family_of([of(0.8, **alone), of(0.9, **alone)])
 
 
 def test_middle_is_the_middle_of_the_entries_and_all_else_that_of_the_members():
     ends = [truck_trailer(mass=mass) for mass in MASSES["mass"]]
     np.testing.assert_allclose(TRUCK.A, 0.5 * (ends[0].A + ends[1].A), rtol=1e-12)
     np.testing.assert_allclose(TRUCK.B, 0.5 * (ends[0].B + ends[1].B), rtol=1e-12)
-    same = replace(TRUCK, A=ends[0].A, B=ends[0].B, remainder=None)
+    same = altered(TRUCK, A=ends[0].A, B=ends[0].B, remainder=None)
     assert same.fingerprint == ends[0].fingerprint
-    assert TRUCK.fingerprint != replace(TRUCK, remainder=None).fingerprint
+    assert TRUCK.fingerprint != altered(TRUCK, remainder=None).fingerprint
 
 
 def test_what_is_proved_stands_in_the_sentence_of_a_certificate():
@@ -218,7 +219,7 @@ def test_file_holds_the_members_listed_of_a_function_the_corners(tmp_path):
         np.testing.assert_array_equal(family.members, own.members)
         np.testing.assert_array_equal(family.parameters, own.parameters)
         assert (family.names, family.function, len(family.members)) == (own.names, None, count)
-        drawn = {tuple(NCSEnv(read, **_contract(read)).reset(seed=seed)[1]["parameters"]) for seed in range(30)}
+        drawn = {tuple(loop_env(read, **_contract(read)).reset(seed=seed)[1]["parameters"]) for seed in range(30)}
         assert drawn == set(map(tuple, own.parameters.tolist()))
 
 
@@ -242,7 +243,7 @@ def tank(k, delay=0, level=None, **more):
     settings |= {"operating_state": [0.4 / k if level is None else level], "operating_input": [0.8]}
     decay = np.exp(-0.5 * k)
     model = ([[decay]], [[0.5 * (1.0 - decay) / k]], np.eye(1), np.zeros((1, 1)), 0.5)
-    return LinearPlant.from_statespace(model, **settings | QUIET | more)
+    return sampled_plant(model, **settings | QUIET | more)
 
 
 @pytest.mark.parametrize("delay", [0, 1])
@@ -253,7 +254,7 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
 
     values = (0.19, 0.2, 0.21)
     given = (of, {"k": (0.19, 0.21)}) if kind == "function" else ([of(k) for k in values],)
-    plant = LinearPlant.family(*given, monotone=kind == "function", at_rest=True)
+    plant = family_of(*given, monotone=kind == "function", at_rest=True)
     assert "at rest at its operating point (given)" in plant.remainder.sentence
     np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [0.0, 2.0], atol=1e-15)
     np.testing.assert_allclose(plant.operating_state[0] + plant.box_ends[:, 0] / plant.box[0, 0], [1.5, 2.5])
@@ -269,7 +270,7 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
             np.testing.assert_allclose(left_out[1:], 0.0, atol=1e-15)
             largest = max(largest, abs(left_out[0]))
     assert 0.5 * size < largest <= size
-    env = NCSEnv(plant, initial_set=Ellipsoid(1e-6 * np.eye(plant.n)))
+    env = loop_env(plant, initial_set=Ellipsoid(1e-6 * np.eye(plant.n)))
     for k in (0.19, 0.21):
         parameters = {"k": k} if kind == "function" else {"member": values.index(k)}
         info = env.reset(seed=0, options={"parameters": parameters})[1]
@@ -286,14 +287,14 @@ def test_members_are_at_rest_where_somebody_says_so(few_points):
     ranges, sentence = {"k": (0.19, 0.21)}, "say at_rest=True if each is at rest"
     for members in ((at_two, ranges), ([at_two(0.19), at_two(0.21)],)):
         with pytest.raises(ValueError, match=sentence):
-            LinearPlant.family(*members, monotone=len(members) > 1)
-    stays = LinearPlant.family(at_two, ranges, monotone=True, at_rest=True)
+            family_of(*members, monotone=len(members) > 1)
+    stays = family_of(at_two, ranges, monotone=True, at_rest=True)
     assert not stays.remainder.family.members[..., -1].any()
     assert stays.operating_state == 2.0
     # What differs acts on a state that rests at zero.
     one, other = (np.array([[entry, 0.1], [0.0, 0.8]]) for entry in (0.8, 0.9))
     limits = {"box": None, "state_limits": ([-1.0, 0.0], [1.0, 2.0]), "operating_state": [0.0, 1.0]}
-    plant = LinearPlant.family([LinearPlant(**SMALL | limits | {"A": each}) for each in (one, other)])
+    plant = family_of([linear_plant(**SMALL | limits | {"A": each}) for each in (one, other)])
     assert "given" not in plant.remainder.sentence
 
 
@@ -303,9 +304,9 @@ def test_members_may_rest_with_other_inputs(more, few_points):
         model = ([[0.0, 1.0], [0.0, -0.5 / mass]], [[0.0], [1.0 / mass]], [[1.0, 0.0]], [[0.0]])
         limits = {"state_limits": ([0.0, -2.0], [2.0, 2.0]), "input_limits": (-2.0, 2.0)}
         rests = {"operating_state": [1.0, 0.0], "operating_input": [0.3 * mass]}
-        return LinearPlant.from_statespace(model, dt=0.1, **limits, **rests, **QUIET, **more)
+        return sampled_plant(model, dt=0.1, **limits, **rests, **QUIET, **more)
 
-    plant = LinearPlant.family(cart, {"mass": (0.95, 1.05)}, monotone=True, at_rest=True)
+    plant = family_of(cart, {"mass": (0.95, 1.05)}, monotone=True, at_rest=True)
     np.testing.assert_allclose(plant.operating_input, 0.3)
     np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [-2.0, 2.0])
     past = inputs_under_way(plant)
@@ -319,9 +320,9 @@ def test_rounding_of_operating_points_is_no_step(few_points):
         decay = np.exp(-0.5 * k)
         model = {"A": [[decay, 0.0], [0.0, 1.0]], "B": [[0.5 * (1.0 - decay) / k], [0.1]], "dt": 0.5}
         bounds = {"disturbance_bound": (np.eye(2), [-0.01, 0.0], [0.03, 0.02]), "sensor_bound": 0.02}
-        return LinearPlant(**model, box=[1.0, 1.0], u_max=1.0, initial_bound=0.02, **bounds)
+        return linear_plant(**model, box=[1.0, 1.0], u_max=1.0, initial_bound=0.02, **bounds)
 
-    plant = LinearPlant.family(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    plant = family_of(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
     assert np.sqrt(plant.remainder.bound.shape_matrix[1, 1]) < 1e-5  # of a limit of 1
 
 
@@ -342,9 +343,9 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
     assert largest_gauge(read, read.members.members, (2.0, 2.0, 4.0)) <= 1
     assert read.remainder.bound.shape_matrix[1, 1] > 4.0 * HULL.remainder.bound.shape_matrix[1, 1]
     smaller = Remainder(Ellipsoid(np.zeros((2, 2))), True, "nothing is left out", HULL.members)
-    wider = replace(HULL, box=[4.0, 4.0], remainder=smaller)
+    wider = altered(HULL, box=[4.0, 4.0], remainder=smaller)
     assert largest_gauge(wider, wider.members.members, (4.0, 4.0, 4.0)) <= 1
-    assert replace(HULL, remainder=smaller).fingerprint == HULL.fingerprint
+    assert altered(HULL, remainder=smaller).fingerprint == HULL.fingerprint
     for changes in ({"interval": None}, {"check": None}, {"function": None, "interval": None}):
         with pytest.raises(ValueError, match="needs"):
             replace(TRUCK.members, **changes)
@@ -370,13 +371,13 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
 def test_what_members_share_is_compared_inside_the_ranges(changed, name):
     def of(angle):
         model = {"A": [[0.9, 0.1 * (angle + 2.0)], [0.0, 0.8]]} | {"disturbance_bound": 0.02}
-        return LinearPlant(**SMALL | model | (changed if abs(angle) < where else {}))
+        return linear_plant(**SMALL | model | (changed if abs(angle) < where else {}))
 
     where = 0.6  # on the grid
     with pytest.raises(ValueError, match=f"another one has another {name}"):
-        LinearPlant.family(of, {"angle": (-1.16, 1.16)}, monotone=True)
+        family_of(of, {"angle": (-1.16, 1.16)}, monotone=True)
     where = 1e-3  # between its points
-    env = NCSEnv(LinearPlant.family(of, {"angle": (-1.16, 1.16)}, monotone=True))
+    env = loop_env(family_of(of, {"angle": (-1.16, 1.16)}, monotone=True))
     env.reset(options={"parameters": {"angle": 0.5}})
     with pytest.raises(ValueError, match=f"another one has another {name}"):
         env.reset(options={"parameters": {"angle": 0.0}})
@@ -386,7 +387,7 @@ def test_two_ended_disturbances_move_each_member(few_points):
     def pushed(k):
         return tank(k, disturbance_bound=([[1.0]], [-0.01], [0.03]))
 
-    plant = LinearPlant.family(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    plant = family_of(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
     assert plant.remainder.family.members[..., -1].all()
     width = np.sqrt(plant.disturbance_bound.shape_matrix.item())
     assert 0.02 <= width <= 0.02 + 5e-8  # what the members' rest lacks of an equilibrium by rounding is inside
@@ -397,64 +398,64 @@ def test_two_ended_disturbances_move_each_member(few_points):
 def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low, few_points):
     def of(a):
         model = {"A": [[a]], "B": [[0.5]], "dt": 1.0, "box": [1.0], "u_max": 0.9, "sensor_bound": 0.01}
-        return LinearPlant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))
+        return linear_plant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))
 
-    family = LinearPlant.family(of, {"a": (low, low + 0.25)}, monotone=True, at_rest=True).members
+    family = family_of(of, {"a": (low, low + 0.25)}, monotone=True, at_rest=True).members
     for value in np.linspace(low, low + 0.25, 77):
         assert family.member(np.array([value]))[0, 0] == value
 
 
 def bent(mass):
     """Its gain rises and falls again."""
-    return LinearPlant(**SMALL | {"B": [[0.0], [0.3 + 0.01 * mass * (1.0 - mass)]]})
+    return linear_plant(**SMALL | {"B": [[0.0], [0.3 + 0.01 * mass * (1.0 - mass)]]})
 
 
 def spiked(mass):
     """Monotone at every point of the grid, not between two of them."""
-    return LinearPlant(**SMALL | {"B": [[0.0], [0.3 + 0.1 * mass + (0.4 < 255 * mass % 1 < 0.6)]]})
+    return linear_plant(**SMALL | {"B": [[0.0], [0.3 + 0.1 * mass + (0.4 < 255 * mass % 1 < 0.6)]]})
 
 
 def test_entries_that_are_not_monotone_are_found_on_the_grid_or_when_they_are_drawn():
     with pytest.raises(ValueError, match=r"B\[1, 0\] is not monotone in mass from 0 to 1"):
-        LinearPlant.family(bent, {"mass": (0.0, 1.0)}, monotone=True)
-    half = LinearPlant.family(bent, {"mass": (0.0, 0.5)}, monotone=True)
+        family_of(bent, {"mass": (0.0, 1.0)}, monotone=True)
+    half = family_of(bent, {"mass": (0.0, 0.5)}, monotone=True)
     assert half.remainder.bound.shape_matrix[1, 1] > 0.0
-    env = NCSEnv(LinearPlant.family(spiked, {"mass": (0.0, 1.0)}, monotone=True))
+    env = loop_env(family_of(spiked, {"mass": (0.0, 1.0)}, monotone=True))
     env.reset(options={"parameters": {"mass": 1.0 / 255}})
     with pytest.raises(ValueError, match=r"B\[1, 0\] at .* is not between those at the ends"):
         env.reset(options={"parameters": {"mass": 0.5 / 255}})
 
 
 def two(**changes):
-    return [LinearPlant(**SMALL), LinearPlant(**SMALL | changes)]
+    return [linear_plant(**SMALL), linear_plant(**SMALL | changes)]
 
 
 MODEL = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1)))
-SAMPLED = LinearPlant.from_statespace(MODEL, dt=0.1, box=[1.0, 2.0], u_max=1.0, between_samples=4, **QUIET)
+SAMPLED = sampled_plant(MODEL, dt=0.1, box=[1.0, 2.0], u_max=1.0, between_samples=4, **QUIET)
 LEFT_OUT = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
 REFUSED = {
-    "nothing between the ends": (lambda: LinearPlant.family(truck_trailer, MASSES), "say monotone=True if"),
-    "no ranges": (lambda: LinearPlant.family(truck_trailer), "ranges must be a dictionary of 1 to 6"),
-    "no range": (lambda: LinearPlant.family(truck_trailer, {"mass": 4000.0}, monotone=True), "must be a pair"),
-    "ends": (lambda: LinearPlant.family(truck_trailer, {"mass": (4.0, 3.0)}, monotone=True), "low < high"),
-    "ranges of plants": (lambda: LinearPlant.family(TRUCKS, MASSES), "about a function"),
-    "one plant": (lambda: LinearPlant.family(TRUCKS[:1]), "two plants or more"),
-    "no truth value": (lambda: LinearPlant.family(TRUCKS, at_rest="no"), "at_rest must be"),
-    "no plant": (lambda: LinearPlant.family([*TRUCKS, 3]), "must be of type LinearPlant"),
-    "another box": (lambda: LinearPlant.family(two(box=[1.0, 1.0])), "member 1 has another box"),
-    "another noise": (lambda: LinearPlant.family(two(disturbance_bound=0.1)), "another disturbance_bound"),
-    "a step": (lambda: LinearPlant.family(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "another dt"),
-    "a remainder": (lambda: LinearPlant.family(two(remainder=LEFT_OUT)), "a remainder of its own"),
-    "between samples": (lambda: LinearPlant.family([SAMPLED, SAMPLED]), "between_samples is not proved for a family"),
-    "between samples later": (lambda: replace(HULL, between_samples=4), "between_samples"),
+    "nothing between the ends": (lambda: family_of(truck_trailer, MASSES), "say monotone=True if"),
+    "no ranges": (lambda: family_of(truck_trailer), "ranges must be a dictionary of 1 to 6"),
+    "no range": (lambda: family_of(truck_trailer, {"mass": 4000.0}, monotone=True), "must be a pair"),
+    "ends": (lambda: family_of(truck_trailer, {"mass": (4.0, 3.0)}, monotone=True), "low < high"),
+    "ranges of plants": (lambda: family_of(TRUCKS, MASSES), "about a function"),
+    "one plant": (lambda: family_of(TRUCKS[:1]), "two plants or more"),
+    "no truth value": (lambda: family_of(TRUCKS, at_rest="no"), "at_rest must be"),
+    "no plant": (lambda: family_of([*TRUCKS, 3]), "must be of type LinearPlant"),
+    "another box": (lambda: family_of(two(box=[1.0, 1.0])), "member 1 has another box"),
+    "another noise": (lambda: family_of(two(disturbance_bound=0.1)), "another disturbance_bound"),
+    "a step": (lambda: family_of(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "another dt"),
+    "a remainder": (lambda: family_of(two(remainder=LEFT_OUT)), "a remainder of its own"),
+    "between samples": (lambda: family_of([SAMPLED, SAMPLED]), "between_samples is not proved for a family"),
+    "between samples later": (lambda: altered(HULL, between_samples=4), "between_samples"),
     "rates later": (
-        lambda: LinearPlant.family(two(B=[[0.0], [0.4]])).with_rate_limits(0.5),
+        lambda: rate_limited(family_of(two(B=[[0.0], [0.4]])), 0.5),
         "give du_max to its members",
     ),
-    "another step later": (lambda: HULL.resampled(0.25), "without a remainder"),
-    "not a plant": (lambda: LinearPlant.family(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "type LinearPlant"),
+    "another step later": (lambda: resampled(HULL, 0.25), "without a remainder"),
+    "not a plant": (lambda: family_of(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "type LinearPlant"),
     "sizes": (
-        lambda: replace(
+        lambda: altered(
             HULL,
             remainder=Remainder(
                 HULL.remainder.bound,

@@ -1,7 +1,5 @@
 """The three plants at which the network decides: their equations, and certificates that are nearly used up."""
 
-from dataclasses import replace
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +10,8 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.stirred_tank import stirred_tank
-from shields import Infeasible, certificate_for, synthesize, verify
+from shields import Infeasible, certificate_for, verify
+from tests.product import altered, resampled, synthesize
 from tests.second_verifier.verify import verify_again
 
 IDS = ("CSTR", "Convoy", "LaneKeeping")
@@ -39,17 +38,17 @@ def test_car_moves_sideways_with_its_heading():
 @pytest.mark.parametrize("plant", [stirred_tank, convoy, lane_keeping])
 def test_their_model_in_continuous_time_is_the_one_that_was_sampled(plant):
     found, longer = plant(), 1.5 * plant().dt
-    assert replace(found, between_samples=4).grid_rows.state.shape == (4, 2, 2)
+    assert altered(found, between_samples=4).grid_rows.state.shape == (4, 2, 2)
     other = plant(dt=longer)
-    np.testing.assert_allclose(found.resampled(longer).A, other.A, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(found.resampled(longer).B, other.B, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(resampled(found, longer).A, other.A, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(resampled(found, longer).B, other.B, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", IDS)
 def test_certificate_at_all_times_exists_for_the_contract(name):
     env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
-    plant = replace(env.plant, between_samples=4)
+    plant = altered(env.plant, between_samples=4)
     certificate = synthesize(plant, contract=env.contract)
     assert certificate.polytope is not None
     assert "in the safe box at all times" in str(certificate)
@@ -68,7 +67,7 @@ def test_certificate_exists_for_the_contract_and_not_for_four_tenths_more_uncert
         return Ellipsoid(1.4**2 * bound.shape_matrix)
 
     plant = env.plant
-    more = replace(
+    more = altered(
         plant,
         disturbance_bound=grown(plant.disturbance_bound),
         sensor_bound=grown(plant.sensor_bound),

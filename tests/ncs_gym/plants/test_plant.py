@@ -1,7 +1,7 @@
 import ast
 import inspect
 import math
-from dataclasses import fields, replace
+from dataclasses import fields
 from decimal import Decimal, localcontext
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from ncs_gym import LinearPlant, truck_trailer
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
+from tests.product import altered, library_plant
 
 BOUNDS = ("disturbance_bound", "sensor_bound", "initial_bound")
 
@@ -90,27 +91,27 @@ def test_fingerprint_changes_with_every_number():
     base = truck_trailer()
     others = [
         truck_trailer(mass=1000.0001),
-        truck_trailer(gamma=5.0000001e-4),
-        truck_trailer(delta=0.051),
-        truck_trailer(u_max=4.0000001),
-        truck_trailer(initial_cov=2e-4 * np.eye(2)),
-        truck_trailer(H=np.array([[1.0, 0.0]])),
-        replace(base, A=0.9 * base.A, continuous_model=None),
-        replace(base, step_offset=[0.0, 0.1]),
-        replace(base, operating_state=[1.0, 0.0]),
-        replace(base, operating_input=[1.0]),
-        *(replace(base, between_samples=points) for points in (8, 9)),
-        *(replace(base, **{name: 0.04}) for name in BOUNDS),
-        (ends := replace(base, box_ends=-base.box_ends[::-1] * [1.0, 0.9])),
+        library_plant(truck_trailer, gamma=5.0000001e-4),
+        library_plant(truck_trailer, delta=0.051),
+        library_plant(truck_trailer, u_max=4.0000001),
+        library_plant(truck_trailer, initial_cov=2e-4 * np.eye(2)),
+        library_plant(truck_trailer, H=np.array([[1.0, 0.0]])),
+        altered(base, A=0.9 * base.A, continuous_model=None),
+        altered(base, step_offset=[0.0, 0.1]),
+        altered(base, operating_state=[1.0, 0.0]),
+        altered(base, operating_input=[1.0]),
+        *(altered(base, between_samples=points) for points in (8, 9)),
+        *(altered(base, **{name: 0.04}) for name in BOUNDS),
+        (ends := altered(base, box_ends=-base.box_ends[::-1] * [1.0, 0.9])),
     ]
     for name in ("box_ends", "input_ends"):
         for i in range(2):
             (moved := getattr(ends, name).copy())[i] *= 1.0 + 1e-12
-            others.append(replace(ends, **{name: moved}))
+            others.append(altered(ends, **{name: moved}))
     prints = {plant.fingerprint for plant in (base, *others)}
     assert len(prints) == 1 + len(others)
     zero = {"operating_state": [0.0, 0.0], "between_samples": 1} | dict.fromkeys(BOUNDS, 0.0)
-    for same in (truck_trailer(), replace(base), replace(base, A=base.A), replace(base, **zero)):
+    for same in (truck_trailer(), altered(base), altered(base, A=base.A), altered(base, **zero)):
         assert same.fingerprint == base.fingerprint
 
 

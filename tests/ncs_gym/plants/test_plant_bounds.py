@@ -1,17 +1,17 @@
 """Bounds of a plant: what is declared in plain terms adds to gamma and to the truncated covariances."""
 
 import warnings
-from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 import ncs_gym
-from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, LinearPlant, NoNoiseWarning, truck_trailer
+from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, NoNoiseWarning, truck_trailer
 from ncs_gym.processes import inverted_pendulum, nonlinear_cart_pole, pendulum
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
+from tests import product
+from tests.product import altered, gym_env, gym_vector_env, library_plant, linear_plant
 
 BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}
 SETS = {"disturbance_bound": "disturbance", "sensor_bound": "sensor_error", "initial_bound": "initial_error"}
@@ -25,7 +25,7 @@ KINDS = {
 
 def plain(**changes):
     settings = {"A": 0.5 * np.eye(2), "B": np.ones((2, 1)), "box": [1.0, 2.0], "u_max": 1.0, "dt": 0.1} | BOUNDS
-    return LinearPlant(**(settings | changes))
+    return linear_plant(**(settings | changes))
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -41,14 +41,14 @@ def test_declared_bound_alone_is_the_set_but_for_rounding(name, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_declared_bound_adds_to_what_covariances_and_gamma_bound(name, kind):
     base = truck_trailer()
-    plant = replace(base, **{name: KINDS[kind]})
+    plant = altered(base, **{name: KINDS[kind]})
     for direction in np.random.default_rng(0).standard_normal((200, 2)):
         need = getattr(base, SETS[name]).support(direction) + getattr(plant, name).support(direction)
         assert getattr(plant, SETS[name]).support(direction) >= need * (1 - 1e-8)
 
 
 def test_sensor_error_with_a_quantizer_holds_the_declared_noise_too():
-    plant = replace(truck_trailer(), sensor_bound=[0.1, 0.001])
+    plant = altered(truck_trailer(), sensor_bound=[0.1, 0.001])
     for direction in np.random.default_rng(0).standard_normal((200, 2)):
         parts = [0.05 / np.sqrt(2.0) * np.linalg.norm(direction)]
         parts += [plant.sensor_noise.bound.support(direction), plant.sensor_bound.support(direction)]
@@ -57,7 +57,7 @@ def test_sensor_error_with_a_quantizer_holds_the_declared_noise_too():
 
 def test_zero_bounds_change_neither_sets_nor_fingerprint():
     base = truck_trailer()
-    same = replace(base, **dict.fromkeys(BOUNDS, 0.0))
+    same = altered(base, **dict.fromkeys(BOUNDS, 0.0))
     assert same.fingerprint == base.fingerprint
     for name in SETS.values():
         np.testing.assert_array_equal(getattr(same, name).shape_matrix, getattr(base, name).shape_matrix)
@@ -79,7 +79,7 @@ REGISTERED = {
 def test_registered_plants_keep_their_fingerprints(make):
     plant = make()
     assert plant.fingerprint.startswith(REGISTERED[make])
-    assert replace(plant, dt=2.0 * plant.dt, continuous_model=None, remainder=None).fingerprint != plant.fingerprint
+    assert altered(plant, dt=2.0 * plant.dt, continuous_model=None, remainder=None).fingerprint != plant.fingerprint
 
 
 @pytest.mark.parametrize("name", BY_NAME)
@@ -107,10 +107,10 @@ def test_box_disturbance_of_the_declared_half_widths_is_accepted():
 @pytest.mark.parametrize("name", BY_NAME)
 def test_loop_keeps_every_error_in_its_set_and_raises_no_alarm(name):
     bounds = {"disturbance_bound": [0.02, 0.004], "sensor_bound": [0.05, 0.01], "initial_bound": [0.1, 0.01]}
-    plant = truck_trailer(4000.0, gamma=0.0, **bounds)
+    plant = library_plant(truck_trailer, 4000.0, gamma=0.0, **bounds)
     channel = ncs_gym.Channel(loss=0.3, quantization_step=0.02, delay=1)
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance=name)
-    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=20, plant=plant, channel=channel, disturbance=name)
+    env = gym_env(plant=plant, channel=channel, disturbance=name)
+    many = gym_vector_env(20, plant=plant, channel=channel, disturbance=name)
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=1)
     _, infos = many.reset(seed=1)
@@ -161,14 +161,14 @@ def test_nothing_given_for_an_uncertainty_is_said_in_one_warning(given, missing)
     text = str(warning.message)
     assert text.startswith(f"nothing is given for {' and '.join(missing)}: every certificate will assume")
     assert text.endswith("a bound of 0 says so on purpose")
-    assert warning.filename == __file__  # where the plant is made, not where it is checked
+    assert warning.filename == product.__file__  # where the plant is made, not where it is checked
 
 
 @pytest.mark.parametrize("bounds", [dict.fromkeys(BOUNDS, 0.0), BOUNDS])
 def test_zero_on_purpose_and_copies_are_silent(bounds):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        replace(plain(**bounds), u_max=2.0)
+        altered(plain(**bounds), u_max=2.0)
 
 
 def test_assumptions_name_what_is_zero_and_what_is_truncated():
@@ -177,7 +177,7 @@ def test_assumptions_name_what_is_zero_and_what_is_truncated():
     for words in ("no disturbance acts", "measure without noise", "the first estimate is exact"):
         assert f"It is assumed that {words}" in nothing or words in nothing
     assert "Gaussian" not in nothing
-    (sentence,) = truck_trailer(delta=0.01).assumptions
+    (sentence,) = library_plant(truck_trailer, delta=0.01).assumptions
     assert "99 % (delta = 0.01) of process_noise_cov, measurement_noise_cov, initial_cov, not the rest" in sentence
 
 

@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +9,9 @@ import pytest
 from ncs_gym import Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.processes import nonlinear_cart_pole
 from tests.plants import delayed
+from tests.product import altered, linear_plant
 
-ODD = LinearPlant(
+ODD = linear_plant(
     A=[[0.1 + 0.2, 1 / 3], [1e-300 + 1e-20, np.pi / 10]],
     B=[[0.0], [1e-7]],
     box=[[1 / 3, 0.1], [0.0, 7.0]],
@@ -32,11 +32,11 @@ PLANTS = {
     "pole": cart_pole(full_state=False),
     "reactor": batch_reactor(),
     "odd": ODD,
-    "between samples": replace(batch_reactor(), between_samples=4),
+    "between samples": altered(batch_reactor(), between_samples=4),
     "input delay": delayed(2),
     "remainder": nonlinear_cart_pole(),
-    "two ends, one open": LinearPlant(**STABLE, state_limits=([-1.0, -2.0], [3.0, np.inf]), input_limits=(-0.5, 2.0)),
-    "rows of any signs": LinearPlant(**STABLE, box=np.array([[-1.0, -2.0], [1.0, 3.0]]), u_max=1.0),
+    "two ends, one open": linear_plant(**STABLE, state_limits=([-1.0, -2.0], [3.0, np.inf]), input_limits=(-0.5, 2.0)),
+    "rows of any signs": linear_plant(**STABLE, box=np.array([[-1.0, -2.0], [1.0, 3.0]]), u_max=1.0),
 }
 
 
@@ -46,13 +46,13 @@ def test_short_form_has_no_numbers():
 
 
 def test_text_leaves_out_past_inputs():
-    delayed_by_two = LinearPlant(**STABLE, box=1.0, u_max=1.0, input_delay=2, input_names=("valve",))
+    delayed_by_two = linear_plant(**STABLE, box=1.0, u_max=1.0, input_delay=2, input_names=("valve",))
     assert " ago" not in str(delayed_by_two)
 
 
 def test_the_unit_1_is_no_unit():
-    valve = LinearPlant(**STABLE, box=1.0, input_limits=(0.0, 1.0), operating_input=[0.5], operating_state=[0.0, 0.0])
-    described = str(replace(valve, state_units=["1", "m"], input_units=("1",), input_names=("valve",)))
+    valve = linear_plant(**STABLE, box=1.0, input_limits=(0.0, 1.0), operating_input=[0.5], operating_state=[0.0, 0.0])
+    described = str(altered(valve, state_units=["1", "m"], input_units=("1",), input_names=("valve",)))
     assert "0 <= valve <= 1 (operating point 0.5)" in described
     assert "|x1| <= 1\n" in described
     assert "|x2| <= 1 m\n" in described
@@ -110,7 +110,7 @@ def test_text_shows_slanted_rows_and_the_operating_point():
 
 
 def test_limits_of_coupled_inputs_are_listed_where_inputs_take_effect_later():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=0.9 * np.eye(2), B=np.eye(2), dt=0.1, box=[1.0, 2.0], u_max=[1.0, 1.0],
         disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.01, input_delay=1,
         mixed_limits=[([0.0, 0.0], [1.0, 1.0], -0.5, 0.5)],

@@ -1,12 +1,12 @@
 """The safe box, and limits around an operating point."""
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ncs_gym import ChosenLimitsWarning, LinearPlant
+from ncs_gym import ChosenLimitsWarning
+from tests.product import altered, family_of, linear_plant
 
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
 MODEL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.5]], "u_max": 1.0, "dt": 0.1} | QUIET
@@ -14,33 +14,33 @@ ROOM = {"A": [[0.9]], "B": [[0.2]], "operating_state": [20.0], "operating_input"
 
 
 def test_half_widths_and_rows_say_the_same():
-    widths = LinearPlant(**MODEL, box=[2.0, 0.5])
-    rows = LinearPlant(**MODEL, box=[[0.5, 0.0], [0.0, 2.0]])
+    widths = linear_plant(**MODEL, box=[2.0, 0.5])
+    rows = linear_plant(**MODEL, box=[[0.5, 0.0], [0.0, 2.0]])
     np.testing.assert_array_equal(widths.box_rows, [[0.5, 0.0], [0.0, 2.0]])
     assert widths.fingerprint == rows.fingerprint
     np.testing.assert_allclose(widths.constraint_values(np.array([2.0, -0.25])), [0.0, -0.5])
 
 
 def test_number_limits_every_state_alike_and_infinity_none():
-    np.testing.assert_array_equal(LinearPlant(**MODEL, box=4.0).box_rows, 0.25 * np.eye(2))
-    np.testing.assert_array_equal(LinearPlant(**MODEL, box=[np.inf, 4.0]).box_rows, [[0.0, 0.25]])
+    np.testing.assert_array_equal(linear_plant(**MODEL, box=4.0).box_rows, 0.25 * np.eye(2))
+    np.testing.assert_array_equal(linear_plant(**MODEL, box=[np.inf, 4.0]).box_rows, [[0.0, 0.25]])
 
 
 def test_rows_stay_what_they_are_when_a_plant_is_replaced():
-    plant = LinearPlant(**MODEL, box=[2.0, 0.5])
-    np.testing.assert_array_equal(replace(plant, A=0.5 * np.eye(2)).box_rows, plant.box_rows)
+    plant = linear_plant(**MODEL, box=[2.0, 0.5])
+    np.testing.assert_array_equal(altered(plant, A=0.5 * np.eye(2)).box_rows, plant.box_rows)
     np.testing.assert_array_equal(plant.box, plant.box_rows)
 
 
 def test_empty_lists_of_limits_are_none():
-    plain, empty = LinearPlant(**MODEL, box=1.0), LinearPlant(**MODEL, box=1.0, output_limits=[], mixed_limits=[])
+    plain, empty = linear_plant(**MODEL, box=1.0), linear_plant(**MODEL, box=1.0, output_limits=[], mixed_limits=[])
     assert plain.fingerprint == empty.fingerprint
     with pytest.warns(ChosenLimitsWarning, match="no state has a limit"):
-        LinearPlant(**MODEL, output_limits=[])
+        linear_plant(**MODEL, output_limits=[])
 
 
 def test_limits_around_an_operating_point_keep_both_ends():
-    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
+    plant = linear_plant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
     np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-2.0, 5.0]])
     np.testing.assert_allclose(1.0 / plant.box, [[3.5]])
     np.testing.assert_allclose(plant.input_ends, [[-10.0], [2.0]])
@@ -55,17 +55,17 @@ def test_limits_around_an_operating_point_keep_both_ends():
 
 
 def test_largest_symmetric_limits_are_those_of_the_nearer_ends():
-    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0)).symmetric
+    plant = linear_plant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0)).symmetric
     np.testing.assert_allclose(1.0 / plant.box_rows, [[2.0]])
     np.testing.assert_allclose(plant.u_max, [2.0])
     assert plant.symmetric is plant
-    assert plant.fingerprint == LinearPlant(**ROOM, box=2.0, u_max=2.0).fingerprint
+    assert plant.fingerprint == linear_plant(**ROOM, box=2.0, u_max=2.0).fingerprint
 
 
 def test_symmetric_limits_inside_those_of_a_remainder_have_it_too():
     limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plants = [LinearPlant(**ROOM | limits | {"A": [[pole]]}) for pole in (0.8, 0.82)]
-    family = LinearPlant.family(plants, at_rest=True)
+    plants = [linear_plant(**ROOM | limits | {"A": [[pole]]}) for pole in (0.8, 0.82)]
+    family = family_of(plants, at_rest=True)
     assert not family.is_symmetric
     assert family.symmetric.is_symmetric
     half = np.sqrt(family.symmetric.remainder.bound.shape_matrix.item())
@@ -75,14 +75,14 @@ def test_symmetric_limits_inside_those_of_a_remainder_have_it_too():
 
 def test_limits_that_are_symmetric_but_for_rounding_are_the_short_form():
     point = {"operating_state": [0.1], "operating_input": [0.1]}
-    plant = LinearPlant(**ROOM | point, state_limits=(-0.1, 0.3), input_limits=(-0.2, 0.4))
+    plant = linear_plant(**ROOM | point, state_limits=(-0.1, 0.3), input_limits=(-0.2, 0.4))
     assert plant.is_symmetric
     np.testing.assert_allclose(plant.u_max, [0.3])
 
 
 def test_values_of_a_constraint_are_distances_beyond_the_nearer_end_in_units_of_half_the_range():
     limits = {"state_limits": ([-1.0, -2.0], [3.0, np.inf]), "u_max": 1.0}
-    plant = LinearPlant(**MODEL | limits, output_limits=[([1.0, 1.0], -np.inf, 4.0)])
+    plant = linear_plant(**MODEL | limits, output_limits=[([1.0, 1.0], -np.inf, 4.0)])
     for x, expected in (
         ([0.0, 0.0], [-0.5, -1.0, -1.0]),
         ([4.0, -3.0], [0.5, 0.5, -0.75]),
@@ -94,7 +94,7 @@ def test_values_of_a_constraint_are_distances_beyond_the_nearer_end_in_units_of_
 
 def test_actions_reach_both_ends_and_never_beyond():
     for low, high in ((-10.0, 2.0), (-0.3, 0.7), (-1e-3, 1e3), (-np.pi, 0.1)):
-        plant = LinearPlant(**ROOM | {"operating_input": [0.0]}, box=1.0, input_limits=(low, high))
+        plant = linear_plant(**ROOM | {"operating_input": [0.0]}, box=1.0, input_limits=(low, high))
         middle, half = plant.input_middle, plant.input_half
         assert low <= (half * -1.0 + middle).item() <= low + 1e-15 * (high - low)
         assert high - 1e-15 * (high - low) <= (half * 1.0 + middle).item() <= high
@@ -113,25 +113,25 @@ def test_actions_reach_both_ends_and_never_beyond():
     ],
 )
 def test_rows_of_two_states_that_cannot_be_limits_or_are_an_array_are_taken(rows):
-    np.testing.assert_array_equal(LinearPlant(**MODEL, box=rows).box_rows, np.asarray(rows, dtype=np.float64))
+    np.testing.assert_array_equal(linear_plant(**MODEL, box=rows).box_rows, np.asarray(rows, dtype=np.float64))
 
 
 def test_a_number_stands_for_a_vector_of_one_entry():
     limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = LinearPlant(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
-    assert plant.fingerprint == LinearPlant(**ROOM, **limits).fingerprint
+    plant = linear_plant(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
+    assert plant.fingerprint == linear_plant(**ROOM, **limits).fingerprint
     np.testing.assert_allclose(plant.to_deviation(21.5, "output"), [1.5])
     np.testing.assert_allclose(plant.from_deviation(2.0, "input"), [12.0])
 
 
 def test_output_is_converted_by_the_output_matrix():
-    plant = replace(LinearPlant(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
+    plant = altered(linear_plant(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
     np.testing.assert_allclose(plant.to_deviation([41.0], "output"), [1.0])
     np.testing.assert_allclose(plant.from_deviation([1.0], "output"), [41.0])
 
 
 def test_deviations_obey_the_equations_of_the_plant():
-    plant = LinearPlant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
+    plant = linear_plant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
     physical = plant.A @ [23.0] + plant.B @ [11.0]
     moved = plant.A @ plant.to_deviation([23.0]) + plant.B @ plant.to_deviation([11.0], "input")
     np.testing.assert_allclose(plant.from_deviation(moved), physical)
@@ -139,13 +139,13 @@ def test_deviations_obey_the_equations_of_the_plant():
 
 def test_constant_of_the_model_makes_a_point_an_equilibrium():
     settings = ROOM | {"operating_input": [4.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = LinearPlant(**settings, offset=[1.2])
+    plant = linear_plant(**settings, offset=[1.2])
     np.testing.assert_allclose(plant.input_ends, [[-4.0], [8.0]])
 
 
 def test_model_of_deviations_has_its_operating_point_wherever_it_was_linearized():
     settings = ROOM | {"operating_state": [21.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = LinearPlant(**settings)
+    plant = linear_plant(**settings)
     np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-3.0, 4.0]])
     np.testing.assert_allclose(plant.to_deviation([22.0]), [1.0])
 
@@ -153,7 +153,7 @@ def test_model_of_deviations_has_its_operating_point_wherever_it_was_linearized(
 def test_one_sided_limits_leave_the_other_side_free():
     settings = {"state_limits": ([0.0, -np.inf], [np.inf, 3.0]), "input_limits": (-1.0, 1.0)}
     point = {"operating_state": [1.0, 1.0], "operating_input": [0.4]}
-    plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
+    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
     np.testing.assert_allclose(plant.box, [[1.0, 0.0], [0.0, 0.5]])
     np.testing.assert_array_equal(plant.box_ends, [[-1.0, -np.inf], [np.inf, 1.0]])
     np.testing.assert_allclose(plant.input_ends, [[-1.4], [0.6]])
@@ -162,7 +162,7 @@ def test_one_sided_limits_leave_the_other_side_free():
 def test_own_limits_are_the_closest_of_each_state_alone():
     rows = [[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [0.0, 0.5, 0.5], [0.0, 0.0, 4.0]]
     limits = [(row, low, high) for row, low, high in zip(rows, (-1, -4, -1, -np.inf), (5, 6, 1, 2), strict=True)]
-    plant = LinearPlant(A=0.5 * np.eye(3), B=np.ones((3, 1)), u_max=1.0, dt=0.1, output_limits=limits, **QUIET)
+    plant = linear_plant(A=0.5 * np.eye(3), B=np.ones((3, 1)), u_max=1.0, dt=0.1, output_limits=limits, **QUIET)
     np.testing.assert_allclose(plant.own_limits, [[-1.0, -np.inf, -np.inf], [2.0, np.inf, 0.5]])
 
 
@@ -170,23 +170,23 @@ def test_half_widths_are_chosen_where_inputs_alone_are_limited():
     """What |u| <= 2 moves from rest in two steps is .4 and .2; a hundred times that is far beyond what counts."""
     model = {"A": [[1.0, 1.0], [0.0, 1.0]], "B": [[0.1], [0.05]], "dt": 0.1} | dict.fromkeys(QUIET, 0.0)
     with pytest.warns(ChosenLimitsWarning, match=r"half-widths \[50.0, 20.0\] were chosen"):
-        plant = LinearPlant(**model, u_max=2.0)
+        plant = linear_plant(**model, u_max=2.0)
     np.testing.assert_allclose(plant.box_rows, np.diag([1.0 / 50.0, 1.0 / 20.0]))
     with pytest.warns(ChosenLimitsWarning):
-        same = LinearPlant(**model, u_max=2.0, state_limits=(-np.inf, [np.inf, np.inf]))
+        same = linear_plant(**model, u_max=2.0, state_limits=(-np.inf, [np.inf, np.inf]))
     assert same.fingerprint == plant.fingerprint
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert replace(plant, dt=0.2).fingerprint != plant.fingerprint
+        assert altered(plant, dt=0.2).fingerprint != plant.fingerprint
 
 
 def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_it():
     """Not that of the limits of others: in micrometers the same state is a million times as large."""
     settings = {"dt": 0.1, "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     A, B = np.array([[0.9, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
-    in_meters = LinearPlant(A=A, B=B, box=[1.0, np.inf], **settings)
+    in_meters = linear_plant(A=A, B=B, box=[1.0, np.inf], **settings)
     units = np.array([1.0, 1e6])
-    in_micrometers = LinearPlant(A=A * units[:, None] / units, B=B * units[:, None], box=[1.0, np.inf], **settings)
+    in_micrometers = linear_plant(A=A * units[:, None] / units, B=B * units[:, None], box=[1.0, np.inf], **settings)
     np.testing.assert_allclose(in_micrometers.half_widths, in_meters.half_widths * units, rtol=1e-12)
 
 
@@ -201,14 +201,14 @@ def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_i
 def test_input_that_rests_at_its_end_is_told_from_one_that_nobody_gave(limits, message):
     model = {"A": [[0.9]], "B": [[0.1]], "dt": 1.0, "sensor_bound": 0.0, "initial_bound": 0.0, "disturbance_bound": 0.0}
     with pytest.raises(ValueError, match=message) as refused:
-        LinearPlant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
+        linear_plant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
     assert ("give operating" in str(refused.value)) == ("give operating" in message)
 
 
 def test_disturbance_may_act_in_some_directions_alone():
     model = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "box": 1.0, "u_max": 1.0}
-    some = LinearPlant(
+    some = linear_plant(
         **model, disturbance_bound=(np.eye(2), [-0.0, -0.1], [0.0, 0.1]), sensor_bound=0.0, initial_bound=0.0
     )
-    own = LinearPlant(**model, disturbance_bound=[0.0, 0.1], sensor_bound=0.0, initial_bound=0.0)
+    own = linear_plant(**model, disturbance_bound=[0.0, 0.1], sensor_bound=0.0, initial_bound=0.0)
     assert some.fingerprint == own.fingerprint

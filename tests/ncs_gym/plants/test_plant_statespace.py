@@ -7,8 +7,9 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
+from tests.product import sampled_plant
 
 A, B, C, D = np.array([[0.0, 1.0], [-2.0, -3.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
 REST = {"box": [1.0, 2.0], "u_max": 3.0, "disturbance_bound": 0.001, "sensor_bound": 0.001, "initial_bound": 0.01}
@@ -36,8 +37,8 @@ DISCRETE = {
 
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_continuous_model_is_sampled_exactly(name):
-    plant = LinearPlant.from_statespace(CONTINUOUS[name], dt=0.1, **REST)
-    assert LinearPlant.from_statespace(CONTINUOUS[name], 0.1, **REST).fingerprint == plant.fingerprint
+    plant = sampled_plant(CONTINUOUS[name], dt=0.1, **REST)
+    assert sampled_plant(CONTINUOUS[name], 0.1, **REST).fingerprint == plant.fingerprint
     assert plant.dt == 0.1
     model = SimpleNamespace(A=A, B=B, C=C)
     end = solve_ivp(lambda _, x: model.A @ x + model.B[:, 0] * 1.7, (0.0, 0.1), [0.4, -0.9], rtol=1e-11, atol=1e-12)
@@ -51,30 +52,30 @@ def test_continuous_model_is_sampled_exactly(name):
 def test_model_that_leaves_open_whether_it_is_in_discrete_time_is_refused(model, dt):
     """python-control answers True to both questions where dt is None."""
     with pytest.raises(ValueError, match="does not say whether it is in continuous or discrete time: make it with"):
-        LinearPlant.from_statespace(model, dt, **REST)
+        sampled_plant(model, dt, **REST)
 
 
 @pytest.mark.parametrize("kind", [signal.TransferFunction, lambda num, den: SimpleNamespace(num=num, den=den)])
 def test_transfer_functions_are_refused_since_limits_are_of_states(kind):
     with pytest.raises(ValueError, match="is a transfer function, whose states would be nobody's"):
-        LinearPlant.from_statespace(kind([100.0], [1.0, 5.0, 0.0]), dt=0.02, **REST)
+        sampled_plant(kind([100.0], [1.0, 5.0, 0.0]), dt=0.02, **REST)
     with pytest.raises(ValueError, match="is a transfer function"):
-        LinearPlant.from_statespace(signal.ZerosPolesGain([], [0.0, -5.0], 100.0), dt=0.02, **REST)
+        sampled_plant(signal.ZerosPolesGain([], [0.0, -5.0], 100.0), dt=0.02, **REST)
 
 
 @pytest.mark.parametrize("name", DISCRETE)
 def test_discrete_model_is_taken_as_it_is(name):
-    plant = LinearPlant.from_statespace(DISCRETE[name], dt=0.1, **REST)
+    plant = sampled_plant(DISCRETE[name], dt=0.1, **REST)
     np.testing.assert_array_equal(plant.A, SAMPLED[0])
     if name != "dt unknown":
-        assert LinearPlant.from_statespace(DISCRETE[name], **REST).fingerprint == plant.fingerprint
+        assert sampled_plant(DISCRETE[name], **REST).fingerprint == plant.fingerprint
 
 
 def test_model_takes_limits_around_an_operating_point():
     settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")}
     point = {"operating_state": [1.0, 0.0], "operating_input": [2.0]}
     limits = {"state_limits": ([0.0, -1.0], [3.0, 1.0]), "input_limits": (0.0, 3.0)}
-    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=1, **point, **limits, **settings)
+    plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=1, **point, **limits, **settings)
     np.testing.assert_allclose(plant.box[:2], [[1.0 / 1.5, 0.0, 0.0], [0.0, 1.0, 0.0]])
     np.testing.assert_allclose(plant.box_ends[:, :2] / [1.0 / 1.5, 1.0], [[-1.0, -1.0], [2.0, 1.0]])
     np.testing.assert_allclose(plant.input_ends, [[-2.0], [1.0]])
@@ -86,19 +87,16 @@ def test_model_takes_limits_around_an_operating_point():
 def test_limits_without_an_operating_point_are_around_zero():
     settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")} | {"dt": 0.1}
     limits = {"state_limits": ([-0.5, -1.0], [3.0, 1.0]), "input_limits": (-2.0, 3.0)}
-    plant = LinearPlant.from_statespace((A, B, C, D), **limits, **settings)
-    assert (
-        plant.symmetric.fingerprint
-        == LinearPlant.from_statespace((A, B, C, D), box=[0.5, 1.0], u_max=2.0, **settings).fingerprint
-    )
+    plant = sampled_plant((A, B, C, D), **limits, **settings)
+    assert plant.symmetric.fingerprint == sampled_plant((A, B, C, D), box=[0.5, 1.0], u_max=2.0, **settings).fingerprint
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])
 def test_delayed_input_acts_that_many_steps_later(delay):
     names = {"state_names": ["angle", "rate"], "input_names": ["torque"], "input_units": ["N m"]}
     settings = REST | names
-    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=delay, **settings)
-    plain = LinearPlant.from_statespace((A, B, C, D), dt=0.1, **settings)
+    plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=delay, **settings)
+    plain = sampled_plant((A, B, C, D), dt=0.1, **settings)
     inputs = np.random.default_rng(0).uniform(-3.0, 3.0, (30, 1))
     z, x = np.zeros(plant.n), np.zeros(2)
     for k, u in enumerate(inputs):
@@ -112,7 +110,7 @@ def test_delayed_input_acts_that_many_steps_later(delay):
 
 
 def test_delayed_inputs_are_limited_but_never_count_as_violated():
-    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=2, **(REST | {"u_max": 0.7}))
+    plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=2, **(REST | {"u_max": 0.7}))
     assert np.linalg.matrix_rank(plant.box_rows) == plant.n
     assert (plant.constraint_values(np.array([0.0, 0.0, 0.7, -0.7])) < -0.5).all()
 
@@ -120,7 +118,7 @@ def test_delayed_inputs_are_limited_but_never_count_as_violated():
 @pytest.mark.parametrize("name", BY_NAME)
 def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
     noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2)}
-    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=2, **(REST | noise))
+    plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=2, **(REST | noise))
     source, rng = as_disturbance(name, plant, False), np.random.default_rng(0)
     memory = source.begin(rng, plant)
     for k in range(50):
@@ -135,7 +133,7 @@ def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
 
 def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():
     noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2)}
-    plain, plant = (LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=d, **(REST | noise)) for d in (0, 1))
+    plain, plant = (sampled_plant((A, B, C, D), dt=0.1, input_delay=d, **(REST | noise)) for d in (0, 1))
     for direction in np.random.default_rng(0).standard_normal((100, 2)):
         assert plant.disturbance.support([*direction, 0.0]) >= (1 - 1e-9) * plain.disturbance.support(direction)
 
@@ -143,7 +141,7 @@ def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():
 def test_model_of_the_truck_is_the_registered_plant():
     rate = np.array([[0.0, 1.0], [-4.5, -4.6]])
     truck = truck_trailer()
-    plant = LinearPlant.from_statespace(
+    plant = sampled_plant(
         (rate, B, np.eye(2), np.zeros((2, 1))), dt=0.5, box=[2.0, 2.0], u_max=4.0, gamma=5e-4,
         **{name: 1e-4 * np.eye(2) for name in ("process_noise_cov", "measurement_noise_cov", "initial_cov")},
     )  # fmt: skip

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy import signal, sparse
 
-from ncs_gym import Ellipsoid, LinearPlant, Regulation
+from ncs_gym import Ellipsoid, Regulation
 from ncs_gym.validation import MOST_EXPANDED, as_numbers, as_setting
+from tests.product import linear_plant, sampled_plant
 
 A, B, C, D = np.array([[0.0, 1.0], [-2.0, -1.0]]), np.array([[0.0], [1.0]]), np.eye(2), np.zeros((2, 1))
 REST = {"box": 1.0, "u_max": 1.0, "disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
@@ -21,19 +22,19 @@ class Model:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sparse_state_space_model_is_the_dense_one(kind):
-    dense = LinearPlant.from_statespace((A, B, C, D), 0.1, **REST)
+    dense = sampled_plant((A, B, C, D), 0.1, **REST)
     for model in ((kind(A), kind(B), kind(C), kind(D)), Model(kind), (kind(A), B, C, kind(D))):
-        assert LinearPlant.from_statespace(model, 0.1, **REST).fingerprint == dense.fingerprint
+        assert sampled_plant(model, 0.1, **REST).fingerprint == dense.fingerprint
     discrete = signal.cont2discrete((A, B, C, D), 0.1)[:4]
-    made = LinearPlant.from_statespace((*map(kind, discrete), 0.1), **REST)
-    assert made.fingerprint == LinearPlant.from_statespace((*discrete, 0.1), **REST).fingerprint
+    made = sampled_plant((*map(kind, discrete), 0.1), **REST)
+    assert made.fingerprint == sampled_plant((*discrete, 0.1), **REST).fingerprint
 
 
 def test_sparse_feedthrough_is_told_of():
     with pytest.raises(ValueError, match=r"D of the model must be zero.* got \[\[0.0\], \[1.0\]\]"):
-        LinearPlant.from_statespace((A, B, C, sparse.csr_matrix([[0.0], [1.0]])), 0.1, **REST)
+        sampled_plant((A, B, C, sparse.csr_matrix([[0.0], [1.0]])), 0.1, **REST)
     with pytest.raises(ValueError, match=r"D of the model must be zero.* got 'no'"):
-        LinearPlant.from_statespace((A, B, C, "no"), 0.1, **REST)
+        sampled_plant((A, B, C, "no"), 0.1, **REST)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -41,8 +42,8 @@ def test_every_matrix_of_a_plant_may_be_sparse(kind):
     rows, covariance = np.array([[1.0, 0.0], [0.5, 1.0]]), np.diag([1e-4, 2e-4])
     given = {"A": 0.5 * np.eye(2), "B": B, "H": C, "box": rows, "process_noise_cov": covariance}
     rest = {"u_max": 1.0, "dt": 1.0, "measurement_noise_cov": covariance, "initial_bound": 0.0}
-    made = LinearPlant(**{name: kind(value) for name, value in given.items()}, **rest)
-    assert made.fingerprint == LinearPlant(**given, **rest).fingerprint
+    made = linear_plant(**{name: kind(value) for name, value in given.items()}, **rest)
+    assert made.fingerprint == linear_plant(**given, **rest).fingerprint
     np.testing.assert_array_equal(Ellipsoid(kind(covariance)).shape_matrix, covariance)
     np.testing.assert_array_equal(Regulation(state_cost=kind(covariance)).state_cost, covariance)
 
@@ -56,7 +57,7 @@ def test_sparse_matrix_that_is_too_large_is_not_expanded():
     size = int(MOST_EXPANDED**0.5) + 1
     too_large = {"A": sparse.identity(size, format="csr"), "B": np.ones((size, 1)), "box": np.ones(size)}
     with pytest.raises(ValueError, match=f"A is a sparse matrix of {size} x {size} entries, which is not expanded"):
-        LinearPlant(**too_large, u_max=1.0, dt=0.1)
+        linear_plant(**too_large, u_max=1.0, dt=0.1)
     with pytest.raises(ValueError, match=r"A of the model is a sparse matrix of .* reduce the model"):
-        LinearPlant.from_statespace((sparse.eye(size), sparse.eye(size), sparse.eye(size), 0.0), 0.1, **REST)
+        sampled_plant((sparse.eye(size), sparse.eye(size), sparse.eye(size), 0.0), 0.1, **REST)
     assert as_numbers(sparse.coo_array((10**9, 10**9))) is None

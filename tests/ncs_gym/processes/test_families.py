@@ -6,10 +6,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.linalg import expm
 
-from ncs_gym import Channel, FamilyProcess, LinearPlant, LinearProcess, NCSEnv, NCSVectorEnv, RandomChannel
+from ncs_gym import Channel, FamilyProcess, LinearProcess, RandomChannel
 from ncs_gym import truck_trailer as truck
 from ncs_gym.processes.process import own_process
 from tests.plants import varying_truck
+from tests.product import family_of, gym_env, loop_env, vector_env
 
 QUIET = {"gamma": 0.0, "process_noise_cov": np.zeros((2, 2))}
 
@@ -19,9 +20,9 @@ def quiet_truck(mass=4000.0, stiffness=4500.0):
 
 
 RANGES = {"mass": (3800.0, 4200.0), "stiffness": (4300.0, 4700.0)}
-FAMILY = LinearPlant.family(quiet_truck, RANGES, monotone=True)
+FAMILY = family_of(quiet_truck, RANGES, monotone=True)
 NOISY = varying_truck()
-TRUCKS = LinearPlant.family([truck(mass) for mass in (3800.0, 4000.0, 4200.0)])
+TRUCKS = family_of([truck(mass) for mass in (3800.0, 4000.0, 4200.0)])
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
@@ -33,7 +34,7 @@ def moved(parameters, x, u):
 
 
 def test_an_episode_moves_by_one_member_and_the_bound_is_not_drawn():
-    env, seen = NCSEnv(FAMILY), []
+    env, seen = loop_env(FAMILY), []
     for episode in range(20):
         _, info = env.reset(seed=3 if episode == 0 else None)
         seen.append(info["parameters"])
@@ -51,7 +52,7 @@ def test_an_episode_moves_by_one_member_and_the_bound_is_not_drawn():
 
 
 def test_what_the_members_declare_is_drawn_beside():
-    env = NCSEnv(NOISY, disturbance="sphere")
+    env = loop_env(NOISY, disturbance="sphere")
     _, info = env.reset(seed=0)
     declared, gauges = truck().disturbance, []
     for _ in range(100):
@@ -63,7 +64,7 @@ def test_what_the_members_declare_is_drawn_beside():
 
 def test_parameters_that_infos_have_are_options_again():
     for plant in (FAMILY, TRUCKS):
-        env, envs = NCSEnv(plant), NCSVectorEnv(3, plant=plant)
+        env, envs = loop_env(plant), vector_env(3, plant=plant)
         for each in (env, envs):
             met = each.reset(seed=1)[1]["parameters"]
             again = each.reset(seed=2, options={"parameters": met})[1]["parameters"]
@@ -75,7 +76,7 @@ def test_parameters_that_infos_have_are_options_again():
 
 
 def test_options_fix_some_parameters_or_all():
-    env = NCSEnv(FAMILY)
+    env = loop_env(FAMILY)
     _, info = env.reset(seed=0, options={"parameters": {"stiffness": 4400.0}})
     assert info["parameters"][1] == 4400.0
     assert info["parameters"][0] != env.reset(options={"parameters": {"stiffness": 4400.0}})[1]["parameters"][0]
@@ -100,7 +101,7 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_options_that_name_no_member_are_refused_before_anything_moves(name):
     given, sentence = REFUSED[name]
-    env, envs = NCSEnv(FAMILY), NCSVectorEnv(3, plant=FAMILY)
+    env, envs = loop_env(FAMILY), vector_env(3, plant=FAMILY)
     for each in (env, envs):
         each.reset(seed=0)
         with pytest.raises(ValueError, match=sentence):
@@ -110,25 +111,25 @@ def test_options_that_name_no_member_are_refused_before_anything_moves(name):
 
 def test_other_plants_have_no_parameters():
     for given in ({"plant": truck()}, {"plant": FAMILY, "process": LinearProcess()}):
-        env = NCSEnv(**given)
+        env = loop_env(**given)
         assert "parameters" not in env.reset(seed=0)[1]
         with pytest.raises(ValueError, match="the plant of a family"):
             env.reset(options={"parameters": {}})
     with pytest.raises(ValueError, match="FamilyProcess is for the plant of a family"):
-        NCSEnv(truck(), process=FamilyProcess())
+        loop_env(truck(), process=FamilyProcess())
     assert isinstance(own_process(truck()), LinearProcess)
-    assert isinstance(NCSEnv(FAMILY).process, FamilyProcess)
+    assert isinstance(loop_env(FAMILY).process, FamilyProcess)
 
 
 def test_a_member_that_is_not_listed_is_refused():
     with pytest.raises(ValueError, match=r"no member of the family has \{'member': 3.0\}"):
-        NCSEnv(TRUCKS).reset(options={"parameters": {"member": 3}})
+        loop_env(TRUCKS).reset(options={"parameters": {"member": 3}})
 
 
 def test_a_parameter_beyond_its_range_is_seen_where_the_step_leaves_the_bound():
     settings = {"plant": FAMILY, "allow_assumption_violation": True}
     for mass, is_seen in ((4200.0, False), (5000.0, True)):
-        env, envs = NCSEnv(**settings), NCSVectorEnv(2, **settings)
+        env, envs = loop_env(**settings), vector_env(2, **settings)
         env.reset(seed=0, options={"parameters": {"mass": mass}})
         envs.reset(seed=0, options={"parameters": {"mass": [4000.0, mass]}})
         for number in range(12):
@@ -142,7 +143,7 @@ def test_a_parameter_beyond_its_range_is_seen_where_the_step_leaves_the_bound():
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_environments_of_a_vector_have_members_of_their_own(mode):
-    envs = NCSVectorEnv(4, plant=FAMILY, max_episode_steps=3, autoreset_mode=mode)
+    envs = vector_env(4, plant=FAMILY, max_episode_steps=3, autoreset_mode=mode)
     _, infos = envs.reset(seed=0, options={"parameters": {"mass": [3800, 3900, 4000, 4100], "stiffness": 4500.0}})
     first = infos["parameters"]
     np.testing.assert_array_equal(first, [[mass, 4500.0] for mass in (3800.0, 3900.0, 4000.0, 4100.0)])
@@ -165,7 +166,7 @@ def test_environments_of_a_vector_have_members_of_their_own(mode):
 
 def test_same_seed_draws_the_same_members():
     for plant in (FAMILY, TRUCKS):
-        envs = [NCSVectorEnv(5, plant=plant) for _ in range(2)]
+        envs = [vector_env(5, plant=plant) for _ in range(2)]
         drawn = [each.reset(seed=7)[1]["parameters"] for each in envs]
         np.testing.assert_array_equal(*drawn)
         assert len(np.unique(drawn[0][:, 0])) > 1
@@ -184,4 +185,4 @@ def test_specs_hold_plants_that_are_listed_as_json_and_functions_as_they_are():
     env = gym.make(CRUISE, plant=NOISY)
     assert gym.make(env.spec).unwrapped.plant is NOISY
     process = {"type": "FamilyProcess"}
-    assert isinstance(gym.make("ncs_gym/LinearNCS-v0", plant=TRUCKS, process=process).unwrapped.process, FamilyProcess)
+    assert isinstance(gym_env(plant=TRUCKS, process=process).unwrapped.process, FamilyProcess)

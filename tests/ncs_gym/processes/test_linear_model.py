@@ -1,24 +1,16 @@
 """Linear models of processes: the fit, the bound on the remainder, and how it is known."""
 
 import warnings
-from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Channel,
-    Ellipsoid,
-    FunctionProcess,
-    MovedOperatingPointWarning,
-    NoEquilibriumWarning,
-    linear_model,
-)
+from ncs_gym import Channel, Ellipsoid, FunctionProcess, MovedOperatingPointWarning, NoEquilibriumWarning
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import surrounding_shape
-from shields import SafetyShield
 from tests.certificates import certificate_of
+from tests.product import altered, gym_env, linear_model, safety_shield
 
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05
@@ -164,7 +156,7 @@ def test_shielded_tank_stays_between_its_ends_whatever_disturbs_it():
     """The tank's own equations with a disturbance, in absolute levels, driven to both ends."""
     plant = linear_model(tank, **TANK)
     process, channel = FunctionProcess(tank), Channel(loss=0.3, max_consecutive_losses=2)
-    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=process, channel=channel))
+    env = safety_shield(gym_env(plant=plant, process=process, channel=channel))
     reached = []
     for seed in range(4):
         env.reset(seed=seed)
@@ -181,8 +173,8 @@ def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
     """What is left of a step of the tank, with the input that acts, is the declared disturbance."""
     plant = linear_model(tank, **TANK | past)
     channel = Channel(loss=0.3, max_consecutive_losses=2)
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=FunctionProcess(tank), channel=channel)
-    env = SafetyShield(env, certificate_of(plant, env.unwrapped.certificate_contract, "polytope"))
+    env = gym_env(plant=plant, process=FunctionProcess(tank), channel=channel)
+    env = safety_shield(env, certificate_of(plant, env.unwrapped.certificate_contract, "polytope"))
     rng, off, actions = np.random.default_rng(0), [], []
     _, info = env.reset(seed=0, options={"state": np.zeros(plant.n)})
     for step in range(150):
@@ -195,7 +187,7 @@ def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
         off.append(info["state"][0] - tank(before[:1], acting).item())
         np.testing.assert_array_equal(info["state"][1:], [*before[2:], *info["input"]])
     assert 0.004 < np.abs(off).max() <= 0.005
-    quiet = {"plant": replace(plant, disturbance_bound=0.0), "process": FunctionProcess(tank, vectorized=True)}
+    quiet = {"plant": altered(plant, disturbance_bound=0.0), "process": FunctionProcess(tank, vectorized=True)}
     loops = gym.make("ncs_gym/LinearNCS-v0", **quiet), gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, **quiet)
     for each in loops:
         each.reset(seed=0, options={"state": np.zeros(plant.n)})
@@ -209,7 +201,7 @@ def test_another_environment_moves_the_states_that_are_no_past_inputs():
     bounds = {"disturbance_bound": 0.0, "sensor_bound": [0.002, 0.01], "initial_bound": [0.005, 0.03]}
     plant = linear_model(PendulumProcess(), BOX, TORQUE, STEP, samples=2_000, du_max=1.5, **bounds)
     assert plant.n == 3
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, process=PendulumProcess())
+    env = gym_env(plant=plant, process=PendulumProcess())
     _, info = env.reset(seed=0, options={"state": [0.1, -0.2, 0.4]})
     for action in ([0.5], [-0.25], [0.125]):
         before = info["state"]
@@ -326,5 +318,5 @@ def test_remainder_is_not_sampled_where_limits_of_several_entries_forbid(limits)
     if "mixed_limits" in limits:
         fewer = {"mixed_rows": None, "mixed_ends": None}
         with pytest.raises(ValueError, match="another mixed_limits"):
-            replace(plant, **fewer)
-        assert replace(plant, mixed_limits=[([0.0, 0.0], [1.0, -1.0], -0.5, 0.5)]).remainder is plant.remainder
+            altered(plant, **fewer)
+        assert altered(plant, mixed_limits=[([0.0, 0.0], [1.0, -1.0], -0.5, 0.5)]).remainder is plant.remainder

@@ -14,13 +14,11 @@ from ncs_gym import (
     Ellipsoid,
     FunctionProcess,
     GymProcess,
-    LinearPlant,
     LinearProcess,
-    NCSEnv,
-    NCSVectorEnv,
     Process,
     Remainder,
 )
+from tests.product import gym_env, gym_vector_env, linear_plant, loop_env, vector_env
 
 QUIET = {"sensor_bound": 0.0, "initial_bound": 0.0}
 A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.1]])
@@ -28,7 +26,7 @@ A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.1]])
 
 def plant(**changes):
     settings = {"A": A, "B": B, "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.01} | QUIET
-    return LinearPlant(**settings | changes)
+    return linear_plant(**settings | changes)
 
 
 def linear(state, u):
@@ -86,7 +84,7 @@ def rollout(env, steps=30, seed=5):
 
 def test_linear_process_is_the_default():
     channel = Channel(loss=0.3)
-    for kind in (NCSEnv, lambda *given, **named: NCSVectorEnv(3, plant=given[0], channel=given[1], **named)):
+    for kind in (loop_env, lambda *given, **named: vector_env(3, plant=given[0], channel=given[1], **named)):
         np.testing.assert_array_equal(
             rollout(kind(plant(), channel)), rollout(kind(plant(), channel, process=LinearProcess()))
         )
@@ -95,13 +93,13 @@ def test_linear_process_is_the_default():
 @pytest.mark.parametrize("vectorized", [False, True])
 def test_function_with_the_plants_equations_moves_like_the_plant(vectorized):
     process = FunctionProcess(linear, vectorized)
-    np.testing.assert_allclose(rollout(NCSEnv(plant(), process=process)), rollout(NCSEnv(plant())), atol=1e-12)
-    many, own = NCSVectorEnv(3, plant=plant(), process=process), NCSVectorEnv(3, plant=plant())
+    np.testing.assert_allclose(rollout(loop_env(plant(), process=process)), rollout(loop_env(plant())), atol=1e-12)
+    many, own = vector_env(3, plant=plant(), process=process), vector_env(3, plant=plant())
     np.testing.assert_allclose(rollout(many), rollout(own), atol=1e-12)
 
 
 def test_inner_environment_is_started_where_the_loop_says():
-    env = NCSEnv(plant(disturbance_bound=0.0), process=INNER, initial_set=Ellipsoid(0.09 * np.eye(2)))
+    env = loop_env(plant(disturbance_bound=0.0), process=INNER, initial_set=Ellipsoid(0.09 * np.eye(2)))
     _, info = env.reset(seed=1)
     inner = Inner.made[-1]
     np.testing.assert_array_equal(inner.state, info["state"])
@@ -118,7 +116,7 @@ def test_inner_environment_is_started_where_the_loop_says():
 
 def test_inner_seeds_come_from_the_seed_of_the_loop():
     def seeds(seed):
-        env = NCSEnv(plant(), process=INNER)
+        env = loop_env(plant(), process=INNER)
         env.reset(seed=seed)
         env.reset()
         return Inner.made[-1].seeds
@@ -129,7 +127,7 @@ def test_inner_seeds_come_from_the_seed_of_the_loop():
 
 def test_without_write_state_episodes_start_where_the_inner_reset_leaves_it():
     process = GymProcess(Inner, read_state=read)
-    env = NCSEnv(plant(), process=process, initial_set=Ellipsoid(1e-4 * np.eye(2)))
+    env = loop_env(plant(), process=process, initial_set=Ellipsoid(1e-4 * np.eye(2)))
     known = set()
     for seed in range(20):
         _, info = env.reset(seed=seed)
@@ -139,7 +137,7 @@ def test_without_write_state_episodes_start_where_the_inner_reset_leaves_it():
         assert (env.start is env.initial_set) == inside
         assert inside or np.array_equal(env.start, info["state"])
     assert known == {True, False}
-    many = NCSVectorEnv(20, plant=plant(), process=process, initial_set=Ellipsoid(1e-4 * np.eye(2)))
+    many = vector_env(20, plant=plant(), process=process, initial_set=Ellipsoid(1e-4 * np.eye(2)))
     _, info = many.reset(seed=0)
     inside = many.single.initial_set.gauge(info["state"]) <= 1.0
     np.testing.assert_array_equal(np.isnan(many.starts[:, 0]), inside)
@@ -147,7 +145,7 @@ def test_without_write_state_episodes_start_where_the_inner_reset_leaves_it():
 
 
 def test_inner_end_of_an_episode_is_that_of_the_loop():
-    env = NCSEnv(plant(disturbance_bound=0.0), process=INNER)
+    env = loop_env(plant(disturbance_bound=0.0), process=INNER)
     env.reset(seed=0, options={"state": [0.0, 0.0]})
     ends = [env.step(np.zeros(1))[2:4] for _ in range(10)]
     assert ends == [(False, False)] * 9 + [(False, True)]
@@ -164,22 +162,22 @@ def test_time_limit_inside_is_not_that_of_the_loop():
         return OrderEnforcing(TimeLimit(OrderEnforcing(TimeLimit(Inner(), 3)), 4))
 
     process = GymProcess(make, read_state=lambda env: env.unwrapped.state)
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant(), process=process, max_episode_steps=7)
-    many = gym.make_vec("ncs_gym/LinearNCS-v0", 2, plant=plant(), process=process, max_episode_steps=7)
+    env = gym_env(plant=plant(), process=process, max_episode_steps=7)
+    many = gym_vector_env(2, plant=plant(), process=process, max_episode_steps=7)
     env.reset(seed=0)
     many.reset(seed=0)
     for k in range(7):
         assert env.step(np.zeros(1))[2:4] == (False, k == 6)
         assert many.step(np.zeros((2, 1)))[3].tolist() == [k == 6] * 2
     swinging = GymProcess(lambda: gym.make("Pendulum-v1"), read_state=lambda env: env.unwrapped.state)
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant(), process=swinging, max_episode_steps=450)
+    env = gym_env(plant=plant(), process=swinging, max_episode_steps=450)
     env.reset(seed=0)
     assert [env.step(np.zeros(1))[3] for _ in range(450)] == [False] * 449 + [True]
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_inner_ends_in_a_vector_restart_that_environment_alone(mode):
-    many = NCSVectorEnv(2, plant=plant(disturbance_bound=0.0), process=INNER, autoreset_mode=mode)
+    many = vector_env(2, plant=plant(disturbance_bound=0.0), process=INNER, autoreset_mode=mode)
     many.reset(seed=0, options={"state": np.array([[0.0, 0.0], [0.9, 0.9]])})
     *_, terminated, truncated, info = many.step(np.zeros((2, 1)))
     assert terminated.tolist() == [False, True]
@@ -195,7 +193,7 @@ def test_inner_ends_in_a_vector_restart_that_environment_alone(mode):
 
 
 def test_vector_of_inner_environments_moves_like_single_ones():
-    many = NCSVectorEnv(3, plant=plant(disturbance_bound=0.0), process=INNER)
+    many = vector_env(3, plant=plant(disturbance_bound=0.0), process=INNER)
     starts = 0.2 * np.random.default_rng(1).standard_normal((3, 2))
     many.reset(seed=0, options={"state": starts})
     rng, states = np.random.default_rng(2), starts
@@ -209,7 +207,7 @@ def test_vector_of_inner_environments_moves_like_single_ones():
 def test_disturbances_act_on_what_is_written_and_only_there():
     still = np.zeros(1, np.float32)
     for process, moves in ((INNER, True), (GymProcess(Inner, read_state=read), False)):
-        env = NCSEnv(plant(), process=process)
+        env = loop_env(plant(), process=process)
         _, info = env.reset(seed=0)
         before = info["state"]
         *_, info = env.step(still)
@@ -224,7 +222,7 @@ def test_remainder_is_left_to_the_process():
     np.testing.assert_allclose(whole.disturbance.shape_matrix, 0.01 * np.eye(2), rtol=1e-6)
     assert whole.without_remainder.fingerprint == plant(disturbance_bound=0.0).fingerprint != whole.fingerprint
     for process, moves in ((LinearProcess(), True), (FunctionProcess(linear), False)):
-        env = NCSEnv(whole, process=process, disturbance="sphere")
+        env = loop_env(whole, process=process, disturbance="sphere")
         _, info = env.reset(seed=0)
         before = info["state"]
         *_, info = env.step(np.zeros(1))
@@ -236,7 +234,7 @@ def test_remainder_is_left_to_the_process():
 def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many, loss):
     strong = GymProcess(lambda: Inner(gain=1.5), read_state=read, write_state=write)
     settings = {"plant": plant(), "process": strong, "channel": Channel(loss=loss)}
-    env = NCSVectorEnv(2, **settings, autoreset_mode="Disabled") if many else NCSEnv(**settings)
+    env = vector_env(2, **settings, autoreset_mode="Disabled") if many else loop_env(**settings)
     full = np.array([[1.0], [0.0]], np.float32) if many else np.ones(1, np.float32)
     env.reset(seed=0, options={"state": np.zeros(2)})
     *_, info = env.step(0.0 * full)
@@ -253,7 +251,7 @@ def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many, lo
 def test_a_step_too_large_for_float64_is_an_alarm(many):
     process = FunctionProcess(lambda state, u: np.array([1e308, -1e308]))
     settings = {"plant": plant(), "process": process, "channel": Channel(delay=3)}
-    env = NCSVectorEnv(2, **settings) if many else NCSEnv(**settings)
+    env = vector_env(2, **settings) if many else loop_env(**settings)
     env.reset(seed=0)
     *_, info = env.step(np.zeros((2, 1) if many else 1, np.float32))
     assert np.all(info["assumption_violated"])
@@ -279,7 +277,7 @@ class OneDrag(Drag):
 def test_process_that_declares_nothing_is_stepped_for_one_environment_after_the_other():
     starts = np.random.default_rng(0).uniform(-0.3, 0.3, (8, 2))
     settings = {"plant": plant(), "disturbance": lambda rng, plant, nominal: np.zeros(2), "process": OneDrag()}
-    many = NCSVectorEnv(8, **settings, allow_assumption_violation=True)
+    many = vector_env(8, **settings, allow_assumption_violation=True)
     many.reset(seed=0, options={"state": starts})
     *_, info = many.step(np.ones((8, 1), np.float32))
     wanted = [Drag().step(plant(), x, np.ones(1)) for x in starts]
@@ -292,7 +290,7 @@ def test_process_of_others_cannot_write_into_the_state():
         state *= 0.5
         return state
 
-    one = NCSEnv(plant=plant(), process=type("Writing", (Process,), {"step": lambda self, *given: written(*given)})())
+    one = loop_env(plant=plant(), process=type("Writing", (Process,), {"step": lambda self, *given: written(*given)})())
     one.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
         one.step(np.ones(1, np.float32))

@@ -20,15 +20,15 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from agents import SB3VecEnv
-from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, LinearPlant, SetpointTracking
+from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, SetpointTracking
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.phase_plane import PhasePlane, ends_of
-from shields import SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.product import linear_plant, safety_shield, vector_shield
 
 CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 DRAWN = [env_id for env_id in ENVIRONMENTS if env_id not in needing_extras()]
@@ -132,7 +132,7 @@ def test_numbers_around_an_operating_point_are_absolute(monkeypatch):
     limits = {"state_limits": ([0.2, -3.0], [2.0, 1.0]), "operating_state": [1.1587, -0.5]}
     limits |= {"input_limits": (0.0, 1.0), "operating_input": [0.25]}
     names = {"state_names": ("level", "heat"), "state_units": ("m", ""), "input_names": ("pump",)}
-    env = make("ncs_gym/LinearNCS-v0", plant=LinearPlant(**common, **limits, **names))
+    env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(**common, **limits, **names))
     written, draw = [], Canvas.text
 
     def text(canvas, words, *place, **style):
@@ -150,7 +150,7 @@ def test_numbers_around_an_operating_point_are_absolute(monkeypatch):
 def test_target_of_a_state_has_its_name_and_unit_and_is_absolute(factor, named):
     limits = {"state_limits": (0.2, 2.0), "operating_state": [1.0], "input_limits": (0.0, 1.0), "operating_input": 0.5}
     names = {"state_names": ("level",), "state_units": ("m",)}
-    plant = LinearPlant(A=[[0.8]], B=[[0.4]], dt=1.0, gamma=1e-4, **limits, **names)
+    plant = linear_plant(A=[[0.8]], B=[[0.4]], dt=1.0, gamma=1e-4, **limits, **names)
     own = SetpointTracking(output=[factor], reach=0.5 * abs(factor), width=0.1 * abs(factor))
     env = make("ncs_gym/LinearNCS-v0", plant=plant, task=own)
     observation, _ = env.reset(seed=0, options={"state": [0.26]})
@@ -161,7 +161,7 @@ def test_target_of_a_state_has_its_name_and_unit_and_is_absolute(factor, named):
 
 
 def test_axis_of_a_state_without_a_limit_reaches_as_far_as_inputs_do():
-    plant = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=2.0, gamma=1e-4, box=[5.0, np.inf])
+    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=2.0, gamma=1e-4, box=[5.0, np.inf])
     np.testing.assert_allclose(ends_of(plant, 1), [-1.0, 1.0], rtol=1e-3)  # 2 * 0.1 / (1 - 0.8)
     np.testing.assert_array_equal(ends_of(plant, 0), [-5.0, 5.0])
 
@@ -170,8 +170,8 @@ def test_axis_of_a_state_without_a_limit_reaches_as_far_as_inputs_do():
 def test_past_inputs_are_not_drawn(monkeypatch, states):
     limits = {"state_limits": (0.2, 2.0), "operating_state": np.ones(states), "input_limits": (0.0, 1.0)}
     own = {"A": 0.8 * np.eye(states), "B": np.full((states, 1), 0.4), "dt": 20.0, "gamma": 1e-4, "operating_input": 0.5}
-    plant = LinearPlant(**own, **limits, input_delay=1, du_max=0.6, input_names=("valve",))
-    env = SafetyShield(make("ncs_gym/LinearNCS-v0", plant=plant), certificate_of(plant, None, "polytope"))
+    plant = linear_plant(**own, **limits, input_delay=1, du_max=0.6, input_names=("valve",))
+    env = safety_shield(make("ncs_gym/LinearNCS-v0", plant=plant), certificate_of(plant, None, "polytope"))
     written, draw = [], Canvas.text
 
     def text(canvas, words, *place, **style):
@@ -202,7 +202,7 @@ def test_numbers_of_an_axis_have_the_digits_of_its_longest_one(value, half, text
 def test_long_names_keep_the_ends_that_tell_them_apart():
     common = {"A": 0.5 * np.eye(8), "B": np.eye(8)[:, :5], "dt": 1.0, "box": np.ones(8), "u_max": 1.0, "gamma": 1e-4}
     names = [f"temperature of the room with the number {zone}" for zone in range(8)]
-    env = make("ncs_gym/LinearNCS-v0", plant=LinearPlant(**common, state_names=names))
+    env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(**common, state_names=names))
     env.reset(seed=0)
     pixels = env.render()
     places = itertools.product((theme.PACKET_LINE + 33, theme.PACKET_LINE + 75), (16, 330))
@@ -301,7 +301,8 @@ def test_plane_shows_safe_set_error_plan_path_and_interventions_in_their_sizes_a
 
 
 def test_outline_of_a_set_is_around_its_projection_and_touches_it():
-    plant, polytope = (made := SafetyShield(gym.make("ncs_gym/CartPole-v0"))).unwrapped.plant, made.certificate.polytope
+    shield = safety_shield(gym.make("ncs_gym/CartPole-v0"))
+    plant, polytope = shield.unwrapped.plant, shield.certificate.polytope
     corners = PhasePlane(plant)._outline(polytope)
     directions = np.zeros((8, 4))
     directions[:, [2, 3]] = np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
@@ -369,7 +370,7 @@ def test_age_of_the_sample_in_use_stands_at_the_controller(written):
 
 def test_plant_whose_limits_are_on_sums_alone_is_drawn_without_bars():
     common = {"A": 0.5 * np.eye(2), "B": np.ones((2, 1)), "u_max": 1.0, "dt": 0.1, "gamma": 1e-4}
-    env = make("ncs_gym/LinearNCS-v0", plant=LinearPlant(box=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)).unwrapped
+    env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(box=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)).unwrapped
     env.reset(seed=0)
     assert count(env.render(), theme.PAPER, theme.PLANT_VIEW, off=0) < 1000
     assert count(env.render(), theme.PAPER, theme.PLANE, off=0) > 30_000
@@ -401,7 +402,7 @@ def test_arrivals_are_those_of_the_infos():
 
 def test_shield_tells_the_picture_what_it_has_in_store(loaded):
     certificate = certificate_of(loaded)  # in a polytope hardly a plan is needed
-    env = SafetyShield(make(), certificate, mode="lookahead", horizon=3)
+    env = safety_shield(make(), certificate, mode="lookahead", horizon=3)
     env.reset(seed=0)
     assert env.unwrapped.renderer.episode.annotation.plan.shape[0] == 0
     lengths = set()
@@ -411,7 +412,7 @@ def test_shield_tells_the_picture_what_it_has_in_store(loaded):
         assert len(record.annotation.plan) == info["shield_plan_length"]
         lengths.add(info["shield_plan_length"])
     assert max(lengths) > 0
-    other = SafetyShield(make())
+    other = safety_shield(make())
     other.reset(seed=0)
     assert other.unwrapped.renderer.episode.annotation.plan is None
 
@@ -480,8 +481,8 @@ def test_recorders_of_gymnasium_and_stable_baselines3_write_files(tmp_path):
 def test_chosen_environment_of_a_vector_is_drawn_as_a_single_one_would_be(mode):
     settings = {"rendered_env": 2, "max_episode_steps": 11, "autoreset_mode": mode}
     env = gym.make_vec(CRUISE, num_envs=3, render_mode="rgb_array", **settings)
-    shield = VectorSafetyShield(env, certificate_of(env.unwrapped.plant))
-    single = SafetyShield(make(), shield.certificate)
+    shield = vector_shield(env, certificate_of(env.unwrapped.plant))
+    single = safety_shield(make(), shield.certificate)
     _, info = shield.reset(seed=0)
     single.reset(options={"state": info["state"][2]})
     assert shield.render()[0].shape == single.render().shape

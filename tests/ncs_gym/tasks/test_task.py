@@ -5,8 +5,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, Disturbance, LinearPlant, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
+from ncs_gym import Channel, Disturbance, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
 from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
+from tests.product import gym_vector_env, linear_plant
 
 
 def test_regulation_costs_about_one_at_the_edge_of_the_box(plant):
@@ -107,7 +108,7 @@ def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
     for _ in range(5):
         A, B = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2))
         known = {"gamma": 1e-6, "sensor_bound": 0, "initial_bound": 0}
-        plant = LinearPlant(A=A, B=B, box=rng.uniform(0.5, 2.0, 3), u_max=[1.0, 2.0], dt=1.0, **known)
+        plant = linear_plant(A=A, B=B, box=rng.uniform(0.5, 2.0, 3), u_max=[1.0, 2.0], dt=1.0, **known)
         to_state, output = np.linalg.solve(np.eye(3) - A, B), rng.standard_normal(3)
         angles = np.linspace(0.0, 2.0 * np.pi, 20_001)
         inputs = np.stack([np.cos(angles), np.sin(angles)])
@@ -165,7 +166,7 @@ def test_reward_is_a_number_and_moves_nothing(kind, pays, words):
 def test_whole_numbers_are_rewards_and_the_array_stays_the_tasks_own():
     paid = np.ones(3, np.int64)
     task = PayingMany(lambda state, u: paid)
-    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, plant=truck_trailer(mass=4000.0), task=task)
+    envs = gym_vector_env(3, plant=truck_trailer(mass=4000.0), task=task)
     envs.reset(seed=0)
     rewards = envs.step(np.ones((3, 1), np.float32))[1]
     assert (rewards.dtype, rewards.tolist()) == (np.float64, [1.0, 1.0, 1.0])
@@ -235,7 +236,7 @@ class Table(PayingMany):
 
 @pytest.mark.parametrize("pays", [None, "table"])
 def test_what_a_task_begins_with_stays_its_own_and_as_it_was_drawn(pays):
-    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=4, plant=truck_trailer(mass=4000.0), task=Table(pays))
+    envs = gym_vector_env(4, plant=truck_trailer(mass=4000.0), task=Table(pays))
     envs.reset(seed=0)
     envs.step(np.zeros((4, 1), np.float32))
     seen = envs.reset(options={"reset_mask": np.array([False, False, True, True])})[0][:, -1]
@@ -325,7 +326,7 @@ def test_what_a_task_stores_in_itself_is_refused_where_environments_share_it(kin
 
 @pytest.mark.parametrize("kind", [Smooth, SmoothMany])
 def test_what_a_task_computes_once_is_not_refused(kind):
-    envs = gym.make_vec("ncs_gym/LinearNCS-v0", 3, plant=truck_trailer(mass=4000.0), task=kind(count, "never"))
+    envs = gym_vector_env(3, plant=truck_trailer(mass=4000.0), task=kind(count, "never"))
     envs.reset(seed=0)
     envs.step(np.ones((3, 1), np.float32))
 

@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from ncs_gym import (
-    BallDisturbance,
-    Channel,
-    LinearPlant,
-    NCSEnv,
-    NCSVectorEnv,
-    bound_violation_probability,
-    truck_trailer,
-)
+from ncs_gym import BallDisturbance, Channel, NCSVectorEnv, bound_violation_probability, truck_trailer
 from ncs_gym.processes.plant_step import PlantSimulation
+from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 IDS = ("TruckTrailer", "CartPole")
 DELTA = 0.2
@@ -49,12 +42,12 @@ def draws_of(env, count):
 
 
 def both(plant, **settings):
-    return NCSEnv(plant, **settings), NCSVectorEnv(20, plant=plant, **settings)
+    return loop_env(plant, **settings), vector_env(20, plant=plant, **settings)
 
 
 @pytest.mark.parametrize("many", [False, True])
 def test_gaussian_noise_is_that_of_the_covariances_and_truncated_noise_is_not(many):
-    plant = truck_trailer(gamma=0.0, delta=DELTA)
+    plant = library_plant(truck_trailer, gamma=0.0, delta=DELTA)
     covariances = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
     count = 100 if many else 2000
     for noise in ("gaussian", "truncated"):
@@ -85,7 +78,7 @@ def test_what_is_bounded_by_declaration_stays_inside_its_bound():
         ("initial_bound", "process_noise_cov"),
     ):
         others = {name: bound for name, bound in bounds.items() if name == kept}
-        for env in both(LinearPlant(**CALM, **others, **{covariance: [[1.0]]}), noise="gaussian"):
+        for env in both(linear_plant(**CALM, **others, **{covariance: [[1.0]]}), noise="gaussian"):
             moved, measured, errors = draws_of(env, 1000)
             sizes = {"disturbance_bound": moved, "sensor_bound": measured, "initial_bound": errors}
             assert 0.9 * bounds[kept] < np.abs(sizes[kept]).max() <= bounds[kept] * (1.0 + 1e-9)
@@ -105,7 +98,7 @@ class OwnBallAhead(OwnBall):
 
 @pytest.mark.parametrize("disturbance", [OwnBall(), OwnBallAhead()])
 def test_own_disturbance_inside_its_bound_is_not_blamed_for_noise_outside_it(disturbance):
-    plant = LinearPlant(**CALM, gamma=0.01, process_noise_cov=[[0.01]], sensor_bound=0.1, initial_bound=0.1)
+    plant = linear_plant(**CALM, gamma=0.01, process_noise_cov=[[0.01]], sensor_bound=0.1, initial_bound=0.1)
     for env in both(plant, disturbance=disturbance, noise="gaussian"):
         moved = draws_of(env, 500)[0]
         assert np.mean(plant.disturbance.gauge(moved) > 1.0) > 0.01
@@ -114,7 +107,7 @@ def test_own_disturbance_inside_its_bound_is_not_blamed_for_noise_outside_it(dis
 
 
 def test_a_disturbance_in_place_of_the_process_noise_stays_inside_its_bound():
-    plant = truck_trailer(delta=DELTA)
+    plant = library_plant(truck_trailer, delta=DELTA)
     for env in both(plant, disturbance="sphere", noise="gaussian"):
         moved, measured, _ = draws_of(env, 500)
         assert plant.disturbance.gauge(moved).max() <= 1.0
@@ -123,7 +116,7 @@ def test_a_disturbance_in_place_of_the_process_noise_stays_inside_its_bound():
 
 @pytest.mark.parametrize(("delta", "steps", "period"), [(1e-9, 200, 2), (1e-3, 7, 3), (0.05, 3, 1), (1e-12, 10**9, 1)])
 def test_bound_violation_probability_is_the_sum_over_all_draws_rounded_up(delta, steps, period):
-    plant = truck_trailer(delta=delta)
+    plant = library_plant(truck_trailer, delta=delta)
     wanted = (steps + steps // period + 1) * Fraction(delta)
     bound = bound_violation_probability(plant, Channel(send_period=period, loss=0.9, delay=3), steps)
     assert Fraction(bound) >= wanted
@@ -133,20 +126,27 @@ def test_bound_violation_probability_is_the_sum_over_all_draws_rounded_up(delta,
 def test_bound_violation_probability_counts_only_what_is_gaussian():
     channel = Channel(send_period=10)
     for name, draws in (("process_noise_cov", 100), ("measurement_noise_cov", 10), ("initial_cov", 1)):
-        plant = LinearPlant(
+        plant = linear_plant(
             **CALM | {"delta": 1e-4}, gamma=0.1, sensor_bound=0.1, initial_bound=0.1, **{name: [[1e-3]]}
         )
         assert bound_violation_probability(plant, channel, 100) == pytest.approx(draws * 1e-4, rel=1e-9)
-    bounded = LinearPlant(**CALM, gamma=0.01, sensor_bound=0.1, initial_bound=0.1)
+    bounded = linear_plant(**CALM, gamma=0.01, sensor_bound=0.1, initial_bound=0.1)
     assert bound_violation_probability(bounded, channel, 10**6) == 0.0
     assert bound_violation_probability(truck_trailer(), channel, 10**6) == 1.0
-    assert bound_violation_probability(truck_trailer(delta=1e-3), channel, 0) == pytest.approx(1e-3, rel=1e-9)
+    assert bound_violation_probability(library_plant(truck_trailer, delta=1e-3), channel, 0) == pytest.approx(
+        1e-3, rel=1e-9
+    )
 
 
 def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
     # Escapes counted where they happen, draw by draw: with independent draws the union bound is nearly attained.
-    plant, channel, steps, count = truck_trailer(gamma=0.0, delta=5e-4), Channel(send_period=2), 200, 2000
-    process = simulation_of(NCSVectorEnv(count, plant=plant, channel=channel, noise="gaussian"))
+    plant, channel, steps, count = (
+        library_plant(truck_trailer, gamma=0.0, delta=5e-4),
+        Channel(send_period=2),
+        200,
+        2000,
+    )
+    process = simulation_of(vector_env(count, plant=plant, channel=channel, noise="gaussian"))
     rng, zero, none = np.random.default_rng(1), np.zeros((2, count)), np.zeros(count, np.int64)
     escaped = plant.initial_noise.bound.gauge(process.first_error(np.random.default_rng(0), count).T) > 1.0
     memory = process.begin(rng, count)
@@ -159,7 +159,7 @@ def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
 
 
 def test_extreme_noise_lies_on_the_bounds_in_scalar_and_vector_environments():
-    plant = LinearPlant(**CALM, gamma=1e-6, sensor_bound=0.1, initial_bound=0.2)
+    plant = linear_plant(**CALM, gamma=1e-6, sensor_bound=0.1, initial_bound=0.2)
     for env in both(plant, noise="extreme"):
         _, info = env.reset(seed=3)
         np.testing.assert_allclose(np.abs(info["estimation_error"]), 0.2, rtol=1e-9)

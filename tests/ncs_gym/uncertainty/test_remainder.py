@@ -2,12 +2,12 @@
 
 import copy
 import pickle
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant, Remainder, linear_model
+from ncs_gym import Ellipsoid, LinearPlant, Remainder
+from tests.product import altered, linear_model
 
 ROOM = {"disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}
 
@@ -21,19 +21,19 @@ PLANT = linear_model(swinging, box=[0.5, 1.0], u_max=1.0, dt=0.05, samples=400, 
 
 
 def test_other_arguments_change_beside_the_remainder(tmp_path):
-    assert replace(PLANT, sensor_bound=0.002).remainder is PLANT.remainder
-    assert replace(PLANT, box=PLANT.box.copy()).fingerprint == PLANT.fingerprint
-    assert replace(PLANT, box=[1.0, 1.0], remainder=None).remainder is None
+    assert altered(PLANT, sensor_bound=0.002).remainder is PLANT.remainder
+    assert altered(PLANT, box=PLANT.box.copy()).fingerprint == PLANT.fingerprint
+    assert altered(PLANT, box=[1.0, 1.0], remainder=None).remainder is None
     PLANT.save(tmp_path / "plant.json")
     twins = LinearPlant.load(tmp_path / "plant.json"), copy.deepcopy(PLANT), pickle.loads(pickle.dumps(PLANT))
     for twin in twins:
         assert twin.fingerprint == PLANT.fingerprint
         with pytest.raises(ValueError, match="another box"):
-            replace(twin, box=[1.0, 1.0])
+            altered(twin, box=[1.0, 1.0])
 
 
 def test_remainder_given_anew_holds_for_whatever_it_is_given_for():
     remainder = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
-    first = replace(PLANT, remainder=remainder)
-    wider = replace(PLANT, box=[1.0, 1.0], remainder=remainder)
+    first = altered(PLANT, remainder=remainder)
+    wider = altered(PLANT, box=[1.0, 1.0], remainder=remainder)
     assert first.remainder.sentence == wider.remainder.sentence == remainder.sentence

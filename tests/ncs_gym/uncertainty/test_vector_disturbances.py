@@ -12,14 +12,12 @@ from ncs_gym import (
     BoxDisturbance,
     Disturbance,
     FunctionProcess,
-    LinearPlant,
     MovedOperatingPointWarning,
-    NCSEnv,
-    NCSVectorEnv,
     SinusoidDisturbance,
     SphereDisturbance,
     truck_trailer,
 )
+from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 IN_M = AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]]))
 
@@ -50,7 +48,7 @@ def test_batched_draws_are_distributed_like_scalar_ones():
 
 
 def test_a_disturbance_beyond_its_bound_raises():
-    env = NCSVectorEnv(3, plant=truck_trailer(), disturbance=lambda rng, plant, nominal: np.ones(2))
+    env = vector_env(3, plant=truck_trailer(), disturbance=lambda rng, plant, nominal: np.ones(2))
     env.reset(seed=0)
     with pytest.raises(ValueError, match="outside its bound"):
         env.step(np.zeros((3, 1), np.float32))
@@ -80,7 +78,7 @@ class Misshapen(Loud):
         return np.zeros((plant.n, 1))
 
 
-@pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(2, **settings)])
+@pytest.mark.parametrize("kind", [loop_env, lambda **settings: vector_env(2, **settings)])
 def test_disturbances_that_are_drawn_ahead_are_checked(kind):
     for source, words in ((Loud(), "outside its bound"), (Misshapen(), "finite with shape")):
         env = kind(plant=truck_trailer(), disturbance=source)
@@ -94,7 +92,7 @@ def test_disturbances_that_are_drawn_ahead_are_checked(kind):
 
 
 @pytest.mark.parametrize("promised", [(), ("vectorized",), ("vectorized", "memoryless")])
-@pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(3, **settings)])
+@pytest.mark.parametrize("kind", [loop_env, lambda **settings: vector_env(3, **settings)])
 def test_a_disturbance_that_writes_into_what_it_is_given_moves_nothing(kind, promised):
     class Scratch(Disturbance):
         locals().update(dict.fromkeys(promised, True))
@@ -105,7 +103,7 @@ def test_a_disturbance_that_writes_into_what_it_is_given_moves_nothing(kind, pro
                 step += 7
             return np.zeros_like(nominal_next)
 
-    plant = truck_trailer(gamma=0.01, process_noise_cov=np.zeros((2, 2)))
+    plant = library_plant(truck_trailer, gamma=0.01, process_noise_cov=np.zeros((2, 2)))
     env = kind(plant=plant, disturbance=Scratch())
     _, info = env.reset(seed=0)
     for step in range(1, 6):
@@ -124,11 +122,11 @@ def test_a_load_about_a_middle_that_is_not_zero_is_drawn_between_its_ends(name, 
     for ends in ((-0.5, 0.5), (0.0, 1.0)):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MovedOperatingPointWarning)
-            plant = LinearPlant(
+            plant = linear_plant(
                 A=[[0.8, 0.0], [0.1, 0.7]], B=[[0.4], [0.0]], dt=1.0, box=[1.0, 1.0], u_max=1.0,
                 disturbance_bound=(E, *ends), sensor_bound=0.01, initial_bound=0.02,
             )  # fmt: skip
-        env = NCSVectorEnv(2000, plant=plant, disturbance=name)
+        env = vector_env(2000, plant=plant, disturbance=name)
         before = env.reset(seed=0)[1]["state"]
         *_, infos = env.step(np.zeros(env.action_space.shape, np.float32))
         d = infos["state"] - before @ plant.A.T - infos["input"] @ plant.B.T
@@ -138,9 +136,9 @@ def test_a_load_about_a_middle_that_is_not_zero_is_drawn_between_its_ends(name, 
         np.testing.assert_allclose(load, np.linspace(-0.5, 0.5, 2000), atol=0.04)
 
 
-@pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(3, **settings)])
+@pytest.mark.parametrize("kind", [loop_env, lambda **settings: vector_env(3, **settings)])
 def test_disturbances_outside_their_bound_violate_the_assumption_at_the_step_at_which_they_act(kind):
-    plant = LinearPlant(
+    plant = linear_plant(
         A=0.5 * np.eye(2), B=[[0.0], [0.3]], box=1.0, u_max=1.0, dt=0.1,
         disturbance_bound=0.05, sensor_bound=0.01, initial_bound=0.02,
     )  # fmt: skip

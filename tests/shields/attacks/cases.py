@@ -26,6 +26,7 @@ from ncs_gym.network.contract import contract_of
 from shields import Certificate
 from tests.certificates import certificate_of
 from tests.plants import random_plant, servo, varying_cart_pole, varying_truck
+from tests.product import altered, library_plant
 
 CHANNELS = {
     "perfect": Channel(),
@@ -36,11 +37,11 @@ CHANNELS = {
 TRUCKS = {
     "1000 kg": truck_trailer(),
     "4000 kg": truck_trailer(mass=4000.0),
-    "4000 kg, position only": truck_trailer(mass=4000.0, H=np.array([[1.0, 0.0]])),
+    "4000 kg, position only": library_plant(truck_trailer, mass=4000.0, H=np.array([[1.0, 0.0]])),
 }
 # n = 2..8, m = 1..3, p < n; inputs so weak that the shield lets some through and overrides others.
 RANDOM = {
-    f"n={n} m={m} p={p}": replace(random_plant(seed, n, m, p), u_max=u_max)
+    f"n={n} m={m} p={p}": altered(random_plant(seed, n, m, p), u_max=u_max)
     for seed, (n, m, p, u_max) in enumerate(
         (
             (2, 1, 1, 0.2),
@@ -156,9 +157,9 @@ CASES = {
     "cruise, both ways": lambda: two_ways(TRUCKS["4000 kg"], horizon=3),
     "cart-pole, both ways": lambda: two_ways(cart_pole(), horizon=12),
     "batch reactor, both ways": lambda: two_ways(batch_reactor(), horizon=6),
-    "cruise, at all times": lambda: stable(replace(TRUCKS["4000 kg"], between_samples=8), horizon=3),
-    "reactor, at all times": lambda: unstable(replace(batch_reactor(), between_samples=4), safe_set="polytope"),
-    "cruise, both ways and at all times": lambda: two_ways(replace(TRUCKS["4000 kg"], between_samples=8), horizon=3),
+    "cruise, at all times": lambda: stable(altered(TRUCKS["4000 kg"], between_samples=8), horizon=3),
+    "reactor, at all times": lambda: unstable(altered(batch_reactor(), between_samples=4), safe_set="polytope"),
+    "cruise, both ways and at all times": lambda: two_ways(altered(TRUCKS["4000 kg"], between_samples=8), horizon=3),
     "cart-pole with remainder": lambda: registered("CartPoleNonlinear", horizon=6),
     "pendulum with remainder": lambda: registered("Pendulum"),
     "cruise of 5 %, with remainder": lambda: stable(varying_truck(), horizon=3, process=FamilyProcess()),

@@ -12,11 +12,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from shields import SafetyFilter, SafetyShield
+from shields import SafetyFilter
 from shields.runtime import safety_filter
 from shields.runtime.backup_plans import plan_check
 from shields.runtime.guarantee import OLD_SAMPLE
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
+from tests.product import altered, safety_shield
 from tests.shields.attacks.cases import CASES, RANDOM, case
 from tests.shields.attacks.worlds import (
     AGE,
@@ -199,7 +200,7 @@ def plans_turned_round(patch):
 def without_the_grid(name):
     """A case whose box is certified at the sampling instants alone, and which is judged at all times."""
     timed = case(name)
-    return replace(timed, plant=replace(timed.plant, between_samples=None), at_all_times=True)
+    return replace(timed, plant=altered(timed.plant, between_samples=None), at_all_times=True)
 
 
 def tried(patch, defect, name, mode, through):
@@ -306,7 +307,7 @@ def test_broken_contract_ends_the_guarantee_before_anything_is_left(name, mode):
 @pytest.mark.parametrize("env_id", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
 def test_registered_environments_are_shielded_as_they_come(env_id, mode):
     made = lambda: gym.make(f"ncs_gym/{env_id}-v0", disturbance="adversarial", terminate_on_violation=False)  # noqa: E731
-    rng, shielded, bare = np.random.default_rng(0), SafetyShield(made(), mode=mode), made()
+    rng, shielded, bare = np.random.default_rng(0), safety_shield(made(), mode=mode), made()
     for env, is_left in ((shielded, False), (bare, True)):
         env.reset(seed=0)
         for _ in range(120):

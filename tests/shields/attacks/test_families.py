@@ -11,11 +11,11 @@ import pytest
 from scipy.linalg import expm
 
 from experiments.commands.attack import hostile_agents, starts, worst_case
-from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSVectorEnv, Packet, Remainder
+from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Packet, Remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
-from shields import SafeLoop, VectorSafetyShield
 from tests.certificates import certificate_of
 from tests.plants import varying_cart_pole, varying_truck
+from tests.product import altered, family_of, safe_loop, sampled_plant, vector_env, vector_shield
 from tests.verdicts import verified
 
 FAMILIES = {
@@ -49,8 +49,8 @@ def members(family, count, rng):
 def attacked(name, plant, certificate, count, steps, mode="project", seed=0, process=None):
     """Counts of an attack on a certificate, of members that are chosen; their steps are compared with the equations."""
     rng, settings, family = np.random.default_rng(seed), FAMILIES[name][1], FAMILIES[name][0]().remainder.family
-    many = NCSVectorEnv(count, plant=plant, process=process, **settings, **worst_case(certificate))
-    shield = VectorSafetyShield(many, certificate, mode, on_unproved="ignore")
+    many = vector_env(count, plant=plant, process=process, **settings, **worst_case(certificate))
+    shield = vector_shield(many, certificate, mode, on_unproved="ignore")
     chosen = members(family, count, rng)
     fixed = {"parameters": {each: chosen[:, k] for k, each in enumerate(family.names)}}
     begun = {"state": starts(certificate, rng, count)}
@@ -93,7 +93,7 @@ def test_no_member_leaves_what_is_certified_for_all(name, mode, count, steps):
 def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
     family = FAMILIES[name][0]()
     nothing = Remainder(Ellipsoid(np.zeros((family.n, family.n))), True, "nothing", family.remainder.family)
-    bare = replace(family)
+    bare = altered(family)
     object.__setattr__(bare, "remainder", nothing)  # nobody can make such a plant
     counts = attacked(name, bare, certified(name, bare), 24, 120)
     assert counts["alarms"] > 1000
@@ -105,7 +105,7 @@ def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
 def test_both_verifiers_agree_and_refuse_the_certificate_of_the_middle(name):
     family = FAMILIES[name][0]()
     assert verified(certified(name), family).valid
-    bare = replace(family, remainder=None)
+    bare = altered(family, remainder=None)
     wrong = replace(certified(name, bare), fingerprint=family.fingerprint)
     assert not verified(wrong, family).valid
 
@@ -132,11 +132,8 @@ def gains(**settings):
     if "state_limits" in given:
         del given["box"], given["u_max"]
     moving = [([[0.9, 0.1], [0.0, 0.8]], 0.28), ([[0.9, 0.1], [0.0, 0.8]], 0.3), ([[0.89, 0.1], [0.01, 0.8]], 0.3)]
-    return LinearPlant.family(
-        [
-            LinearPlant.from_statespace((A, [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1), **given)
-            for A, gain in moving
-        ]
+    return family_of(
+        [sampled_plant((A, [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1), **given) for A, gain in moving]
     )
 
 
@@ -154,7 +151,7 @@ LIMITS = {
 def test_members_keep_limits_of_every_kind(kind, count, steps):
     plant = gains(**LIMITS[kind])
     downlink = Channel(delay=1, loss=0.4, max_consecutive_losses=1) if kind == "a downlink" else None
-    many = NCSVectorEnv(
+    many = vector_env(
         count,
         plant=plant,
         channel=Channel(loss=0.4, delay=1),
@@ -163,7 +160,7 @@ def test_members_keep_limits_of_every_kind(kind, count, steps):
         noise="extreme",
     )
     certificate = certificate_of(plant, many.certificate_contract, "polytope")
-    shield = VectorSafetyShield(many, certificate, on_unproved="ignore")
+    shield = vector_shield(many, certificate, on_unproved="ignore")
     rng = np.random.default_rng(0)
     _, info = shield.reset(seed=0, options={"parameters": {"member": np.arange(count) % 3}})
     act, held, near, overridden = hostile_agents(certificate, plant, count, rng), 0, -1.0, 0
@@ -187,12 +184,12 @@ def tank(k):
     settings = {"state_limits": ([1.5], [2.5]), "input_limits": (0.0, 2.0), "offset": [0.0]}
     rests = {"operating_state": [0.4 / k], "operating_input": [0.8]}
     bounds = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.02}
-    return LinearPlant.from_statespace(model, **settings, **rests, **bounds)
+    return sampled_plant(model, **settings, **rests, **bounds)
 
 
 @cache
 def varying_tank():
-    return LinearPlant.family(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
+    return family_of(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
 
 
 @pytest.mark.cases(6)
@@ -201,7 +198,7 @@ def varying_tank():
 @pytest.mark.parametrize("k", [0.19, 0.2, 0.21])
 def test_a_tank_that_rests_elsewhere_keeps_its_levels(k, outward, every):
     plant = varying_tank()
-    loop = SafeLoop(certificate_of(plant, None, "polytope"), plant, Channel(delay=1), on_unproved="ignore")
+    loop = safe_loop(certificate_of(plant, None, "polytope"), plant, Channel(delay=1), on_unproved="ignore")
     level, arrived, reached = 2.0, [], 0.0
     loop.start(plant.to_deviation([level + 0.02 * outward]))
     for step in range(150):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import differential_evolution
 
-from shields import SafetyFilter
 from tests.certificates import certificate_of
+from tests.product import safety_filter
 from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 PLANTS = TRUCKS | RANDOM
@@ -19,7 +19,7 @@ def test_no_search_over_state_error_disturbance_and_proposal_leaves_the_safe_set
     # Gradient-free, the decision as a black box: x in S, e in E(Sigma_k), d in E(D), any proposal, any Sigma_k.
     plant = PLANTS[name]
     certificate, n = certificate_of(plant), plant.n
-    shield = SafetyFilter(certificate, plant, mode)
+    shield = safety_filter(certificate, plant, mode)
     inside = [certificate.safe_set.factor, certificate.error_set.factor, plant.disturbance.factor]
 
     def levels(numbers):  # of many candidates, one per column
@@ -44,7 +44,7 @@ def test_no_ascent_over_state_error_and_disturbance_leaves_the_safe_set_under_th
     # (I) by another route: coordinate ascent from many starts, the input rounded as it is applied.
     plant = PLANTS[name]
     certificate = certificate_of(plant)
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
     safe, errors, M = certificate.safe_set, certificate.error_set, certificate.M
     shares = certificate.multipliers

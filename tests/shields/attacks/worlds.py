@@ -7,12 +7,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ncs_gym import Actuator, Channel, Disturbance, Ellipsoid, NCSEnv, NCSVectorEnv, Packet, certified_error_set
+from ncs_gym import Actuator, Channel, Disturbance, Ellipsoid, NCSEnv, Packet, certified_error_set
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import contract_of
-from shields import SafeLoop, SafetyShield, VectorSafetyShield, silence_of
+from shields import silence_of
 from tests.ncs_gym.envs.same_draws import holding_gain
+from tests.product import safe_loop, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.adversary import Adversary, Between, Traffic, boundary, box_of, farthest, gauges, region_of
 from tests.shields.attacks.cases import Case, box_ellipsoid
 
@@ -208,12 +209,12 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
     given = planning(case, mode) | {"on_unproved": "ignore"}
     if many:
         autoreset = ("NextStep", "SameStep")[seed % 2]
-        env = NCSVectorEnv(count, max_episode_steps=VECTOR_EPISODE, autoreset_mode=autoreset, **settings)
-        shield: Any = VectorSafetyShield(env, certificate, **given)
+        env = vector_env(count, max_episode_steps=VECTOR_EPISODE, autoreset_mode=autoreset, **settings)
+        shield: Any = vector_shield(env, certificate, **given)
     else:
         env = SeenEnv(**settings)
         env.render_mode = "rgb_array"  # nothing is drawn: there is no renderer
-        shield = SafetyShield(env, certificate, **given)
+        shield = safety_shield(env, certificate, **given)
 
     def column(value: Any) -> np.ndarray:
         """A value of the infos with the environment as the last axis."""
@@ -311,7 +312,7 @@ def through_loop(
     delay = 0 if downlink is None else contract_of(downlink).max_age
     channel = Channel(jitter=oldest, quantization_step=uplink.quantization_step)
     behind = {"downlink": downlink} if aware else {}
-    loop = SafeLoop(certificate, plant, channel, on_unproved="ignore", **planning(case, mode), **behind)
+    loop = safe_loop(certificate, plant, channel, on_unproved="ignore", **planning(case, mode), **behind)
     outage = 0
     silence = None if more is None else silence_of(certificate, plant)
     kept_until = 0 if silence is None or more is None else silence.max_age + silence.anywhere + more

@@ -5,14 +5,14 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant
-from shields import SafetyFilter
+from ncs_gym import Ellipsoid
 from shields.runtime.backup_plans import PlanTest, Prediction, plan_check
 from shields.runtime.backup_plans.plan_check import Tightening
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
+from tests.product import linear_plant, safety_filter
 from tests.shields.attacks.adversary import farthest
 from tests.shields.attacks.cases import case as attacked_case
 from tests.shields.edges import edge_of
@@ -27,7 +27,7 @@ NAMES = (
 @pytest.fixture(scope="module", params=NAMES)
 def case(request):
     known = attacked_case(request.param)
-    first = SafetyFilter(known.certificate, known.plant).test
+    first = safety_filter(known.certificate, known.plant).test
     assert (not first.cone) == ("polytope" in request.param)
     return known.plant, known.certificate, PlanTest(Prediction(first, STEPS), MARGIN)
 
@@ -101,7 +101,7 @@ def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
 def test_tightenings_between_samples_are_what_extreme_errors_and_disturbances_attain(name):
     known = attacked_case(name)
     plant, rows = known.plant, rows_within_step(known.plant)
-    test = PlanTest(Prediction(SafetyFilter(known.certificate, plant).test, STEPS), MARGIN)
+    test = PlanTest(Prediction(safety_filter(known.certificate, plant).test, STEPS), MARGIN)
     estimates, shapes, plans = situations(plant, known.certificate, np.random.default_rng(0), 4)
     for x_hat, shape, (plan,), limits in zip(
         estimates, shapes, plans, test.tightenings_of(shapes).between, strict=True
@@ -157,7 +157,7 @@ def test_plans_are_certified_if_every_possible_state_stays_in_the_box_and_ends_i
 
 def test_plans_of_one_input_are_certified_by_the_one_step_test(case):
     plant, certificate, test = case
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(4)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(4)
     estimates, shapes, plans = situations(plant, certificate, rng, 200)
     certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0, 0]
     safe = [
@@ -239,7 +239,7 @@ QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}
 @pytest.mark.parametrize("margin", [0.0, 0.1])
 @pytest.mark.parametrize(("where", "step"), [("box", 1), ("box", 2), ("end", 1), ("end", 2)])
 def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(where, step, margin):
-    plant = LinearPlant(A=[[1e-4]], B=[[1e6, -1e6]], box=[1.0], disturbance_bound=0.0, **QUIET)
+    plant = linear_plant(A=[[1e-4]], B=[[1e6, -1e6]], box=[1.0], disturbance_bound=0.0, **QUIET)
     L, steps = (np.array([[1e4]]), step + 1) if where == "box" else (np.eye(1), step)  # one of them is far away
     test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), steps), margin), np.random.default_rng(0)
     nothing, levels = np.zeros((1, 1)), []
@@ -261,7 +261,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(wh
 def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, step):
     # A is half of the identity and what its own square annihilates, but for rounding.
     A = 3001.7 * np.array([[0.3, -0.1], [0.9, -0.3]]) + 0.5 * np.eye(2)
-    plant = LinearPlant(A=A, B=[[0.3], [0.9]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
+    plant = linear_plant(A=A, B=[[0.3], [0.9]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
     L, steps = (1e4 * np.eye(2), step + 1) if where == "box" else (np.diag([1e16, 1.0]), step)
     test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), steps), 0.0), np.random.default_rng(0)
     nothing, levels = np.zeros((2, 2)), []
@@ -295,7 +295,7 @@ def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case
     [("end", 1, 0.0), ("end", 2, 0.0), ("end", 2, 0.05), ("box", 1, 0.0), ("box", 2, 0.0), ("box", 2, 0.05)],
 )
 def test_plans_are_certified_in_rational_arithmetic_however_far_out_the_estimate_is(where, steps, margin, size):
-    plant = LinearPlant(A=[[0.5, -0.3], [0.0, 0.0]], B=[[1.0], [0.0]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
+    plant = linear_plant(A=[[0.5, -0.3], [0.0, 0.0]], B=[[1.0], [0.0]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
     L, horizon = (1e4 * np.eye(2), steps + 1) if where == "box" else (np.eye(2), steps)  # one of them is far away
     test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), horizon), margin), np.random.default_rng(0)
     nothing, inwards, levels = np.zeros((2, 2)), np.array([1.0, 0.0]), []
@@ -323,7 +323,7 @@ ROWS = np.array([[1.0, 0.0], [-TILT, 1.0]])
 
 
 def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thin():
-    plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=0.0, **QUIET)
+    plant = linear_plant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=0.0, **QUIET)
     test, rng = PlanTest(Prediction(ellipsoid_test(1e4 * TILTED @ TILTED.T, plant), 2), 0.0), np.random.default_rng(0)
     nothing, plan, levels = np.zeros((1, 2)), np.zeros((1, 1, 2, 1)), []
     for _ in range(20):
@@ -339,7 +339,7 @@ def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thi
 def test_a_state_is_known_to_be_in_the_box_in_rational_arithmetic(far, margin):
     """With an error that is long and thin, or with an estimate so far along the box that it cancels in its row."""
     wide = np.diag([1e-9, 0.9]) @ ROWS
-    plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=wide, disturbance_bound=0.0, **QUIET)
+    plant = linear_plant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=wide, disturbance_bound=0.0, **QUIET)
     test = PlanTest(Prediction(ellipsoid_test(1e4 * TILTED @ TILTED.T, plant), 1), margin)
     rng = np.random.default_rng(0)
     levels = []
@@ -360,7 +360,7 @@ def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and
     error = np.diag([0.0, 1e-18])
     for _ in range(40):
         bound = TILTED @ np.diag([1e-3, 1e-2] * rng.uniform(0.5, 1.0, 2)) @ TILTED.T
-        plant = LinearPlant(A=np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=Ellipsoid(bound), **QUIET)
+        plant = linear_plant(A=np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=Ellipsoid(bound), **QUIET)
         test = PlanTest(Prediction(ellipsoid_test(TILTED @ TILTED.T, plant), steps), 0.0)
         known, plan = test.tightenings_of(error[None]), np.zeros((1, 1, steps, 1))
         x = edge_of(lambda x, t=test, k=known, p=plan: t.certified(np.array([[0.0, x]]), k, p)[0, 0, -1], 16.0)

@@ -13,6 +13,7 @@ from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
 from shields.runtime.backup_plans import plan_search
 from shields.runtime.backup_plans.plan_search import closed_loop
+from tests.product import safety_filter
 from tests.shields.attacks.cases import case
 from tests.shields.attacks.worlds import BOX, through_loop
 from tests.shields.runtime.batches import decided_alike
@@ -22,7 +23,7 @@ NAMES = ["cruise", "cart-pole", "batch reactor", "n=4 m=3 p=2"]
 
 def shield_of(name, horizon=None):
     known = case(name)
-    return SafetyFilter(known.certificate, known.plant, "lookahead", horizon or known.horizon)
+    return safety_filter(known.certificate, known.plant, "lookahead", horizon or known.horizon)
 
 
 def situations(shield, rng, count):
@@ -173,7 +174,7 @@ def test_what_cannot_be_used_means_the_next_stored_input(what):
 
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
 def test_other_modes_keep_no_plan(mode, certificate, loaded):
-    shield = SafetyFilter(certificate, loaded, mode)
+    shield = safety_filter(certificate, loaded, mode)
     for u in (0.0, 4.0):
         decision = shield.decide(np.array([1.8, 0.5]), 0.1 * certificate.Sigma, np.array([u]), [[1.0]])
         assert decision.plan.shape == (0, 1)
@@ -188,7 +189,7 @@ def test_other_modes_keep_no_plan(mode, certificate, loaded):
 @pytest.mark.parametrize("name", ["cruise", "n=4 m=3 p=2"])
 def test_horizon_of_one_is_mode_project(name):
     shield, rng = shield_of(name, 1), np.random.default_rng(3)
-    project = SafetyFilter(shield.certificate, shield.plant, "project")
+    project = safety_filter(shield.certificate, shield.plant, "project")
     for x_hat, shape, proposed in zip(*situations(shield, rng, 200), strict=True):
         decision, other = shield.decide(x_hat, shape, proposed), project.decide(x_hat, shape, proposed)
         np.testing.assert_allclose(decision.input, other.input, rtol=2.0**-23)

@@ -4,12 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv, truck_trailer
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
+from ncs_gym import Ellipsoid, truck_trailer
 from shields.runtime.backup_plans.plan_search import Plans
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
+from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.cases import box_ellipsoid, case, plan_case
 
 COUNT = 6
@@ -20,8 +20,8 @@ def many():
     """Six reactors behind lookahead, with starts anywhere in an ellipsoid of nearly the size of the box."""
     plant, horizon, network, contract = plan_case("batch reactor", "overtaking")
     start = {"initial_set": box_ellipsoid(plant, 0.95), "disturbance": "adversarial"}
-    env = NCSVectorEnv(COUNT, plant=plant, channel=network, contract=contract, **start)
-    return VectorSafetyShield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
+    env = vector_env(COUNT, plant=plant, channel=network, contract=contract, **start)
+    return vector_shield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
 
 
 def test_a_restart_before_the_first_step_drops_the_plan_of_the_start_and_no_other(many):
@@ -74,7 +74,7 @@ def test_a_start_exactly_on_a_face_is_in_the_box():
 
 def test_an_estimate_proves_the_box_only_with_room_for_its_error():
     plant, horizon, _, contract = plan_case("batch reactor", "overtaking")
-    shield = SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
+    shield = safety_filter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
     shape = 0.01 * np.eye(plant.n)
     errors = shield.errors_of(shape)
     row = plant.box_rows[0] / (plant.box_rows[0] @ plant.box_rows[0])  # |c_0 x| = 1 on it
@@ -87,7 +87,7 @@ def test_an_estimate_proves_the_box_only_with_room_for_its_error():
 
 def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
     plant, horizon, _, contract = plan_case("cruise", "bursts")
-    shield = SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
+    shield = safety_filter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
 
     def nothing_found(estimates, *rest):
         count = len(estimates)
@@ -115,7 +115,7 @@ def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
 def planned():
     """A loop around a reactor outside S, with a stored plan of at least three inputs."""
     plant, horizon, channel, contract = plan_case("batch reactor", "overtaking")
-    loop = SafeLoop(certificate_of(plant, contract), plant, channel, "lookahead", horizon, on_unproved="ignore")
+    loop = safe_loop(certificate_of(plant, contract), plant, channel, "lookahead", horizon, on_unproved="ignore")
     rng = np.random.default_rng(0)
     for _ in range(200):
         loop.start(plant.half_widths * rng.uniform(-0.95, 0.95, plant.n))
@@ -155,7 +155,7 @@ def test_a_start_clears_what_was_stored(planned):
 def test_start_outside_the_safe_set_is_guaranteed_exactly_if_a_first_plan_is_certified():
     plant, horizon, channel, contract = plan_case("batch reactor", "constant delay")
     certificate, rng, seen = certificate_of(plant, contract), np.random.default_rng(0), set()
-    shield = SafetyShield(NCSEnv(plant, channel, contract=contract), certificate, "lookahead", horizon=horizon)
+    shield = safety_shield(loop_env(plant, channel, contract=contract), certificate, "lookahead", horizon=horizon)
     for seed in range(60):
         start = rng.uniform(-1.0, 1.0, plant.n) * plant.half_widths * rng.choice([0.3, 0.9, 1.05])
         _, info = shield.reset(seed=seed, options={"state": start})
@@ -175,7 +175,7 @@ def test_start_outside_the_safe_set_is_guaranteed_exactly_if_a_first_plan_is_cer
 def test_final_info_says_what_the_last_decision_stored():
     env = gym.make_vec("ncs_gym/BatchReactor-v0", num_envs=8, max_episode_steps=5, autoreset_mode="SameStep")
     certificate = certificate_of(env.unwrapped.plant, env.unwrapped.certificate_contract, safe_set="ellipsoid")
-    shield, lengths = VectorSafetyShield(env, certificate, mode="lookahead"), []
+    shield, lengths = vector_shield(env, certificate, mode="lookahead"), []
     shield.reset(seed=0)
     for step in range(40):
         *_, truncated, info = shield.step(np.ones((8, 2), np.float32))
@@ -192,7 +192,7 @@ def test_final_info_says_what_the_last_decision_stored():
 def test_what_is_no_plan_counts_as_none_of_many_loops_too(wrong):
     cart, horizon = case("cart-pole"), 12
     made, plant, error = (
-        SafetyFilter(cart.certificate, cart.plant, "lookahead", horizon),
+        safety_filter(cart.certificate, cart.plant, "lookahead", horizon),
         cart.plant,
         cart.certificate.Sigma,
     )
@@ -210,6 +210,6 @@ def test_what_is_no_plan_counts_as_none_of_many_loops_too(wrong):
 
 
 def test_horizon_of_numpy_is_that_of_a_spec():
-    env = SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), mode="lookahead", horizon=np.int64(6))
+    env = safety_shield(gym.make("ncs_gym/TruckTrailerCruise-v0"), mode="lookahead", horizon=np.int64(6))
     made = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert made.get_wrapper_attr("horizon") == 6

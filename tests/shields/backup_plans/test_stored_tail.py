@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ncs_gym import NCSEnv, NCSVectorEnv, Packet
-from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE, OLD_SAMPLE
 from tests.certificates import certificate_of
+from tests.product import safe_loop, safety_shield, vector_shield
 from tests.shields.attacks.cases import plan_case
 
 NAMES = ("cruise", "cart-pole", "batch reactor")
@@ -23,7 +23,7 @@ class World:
     def __init__(self, name, seed, least=1):
         self.plant, horizon, channel, contract = plan_case(name, CHANNEL if name != "cruise" else "overtaking")
         self.safe = certificate_of(self.plant, contract).safe_set
-        self.loop = SafeLoop(certificate_of(self.plant, contract), self.plant, channel, "lookahead", horizon=horizon)
+        self.loop = safe_loop(certificate_of(self.plant, contract), self.plant, channel, "lookahead", horizon=horizon)
         self.contract, self.rng = contract, np.random.default_rng(seed)
         self.stored = 0
         while not (self.stored >= least and self.loop.guaranteed):
@@ -163,9 +163,9 @@ def test_wrappers_say_so_while_a_tail_is_stored_and_the_error_is_not_certified(n
     plant, horizon, channel, contract = plan_case(name, CHANNEL)
     certificate = certificate_of(plant, contract)
     if is_vector:
-        inner, kind = DoubtfulVectorEnv(3, plant=plant, channel=channel, contract=contract), VectorSafetyShield
+        inner, kind = DoubtfulVectorEnv(3, plant=plant, channel=channel, contract=contract), vector_shield
     else:
-        inner, kind = DoubtfulEnv(plant, channel, contract=contract), SafetyShield
+        inner, kind = DoubtfulEnv(plant, channel, contract=contract), safety_shield
     env = kind(inner, certificate, "lookahead", horizon=horizon)
     start_with_a_tail(lambda x: env.reset(seed=1, options={"state": x})[1], plant, certificate.safe_set, 3)
     lengths = list(drive(env, inner, np.ones(env.action_space.shape, np.float32), 4))

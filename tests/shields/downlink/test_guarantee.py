@@ -5,20 +5,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
 
-from ncs_gym import (
-    Actuator,
-    Channel,
-    Ellipsoid,
-    FunctionProcess,
-    LinearPlant,
-    NCSEnv,
-    NCSVectorEnv,
-    cart_pole,
-    truck_trailer,
-)
+from ncs_gym import Actuator, Channel, Ellipsoid, FunctionProcess, cart_pole, truck_trailer
 from ncs_gym.network import downlink_protocol
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
     EXPLANATIONS,
     FAR_OUT,
@@ -41,6 +30,7 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
+from tests.product import linear_plant, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.cases import behind
 from tests.shields.edges import edge_of
 
@@ -51,11 +41,11 @@ THIN = np.array([[1.0, -0.5], [-0.5, 0.25]])
 UNSTABLE = behind(cart_pole(), (Channel(loss=0.3, delay=1, max_consecutive_losses=1), Channel(delay=2)))
 
 
-def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
+def shielded(mode="project", start=0.3, kind=loop_env, **settings):
     certificate = certificate_of(PLANT)
     usual = {"downlink": KEPT, "initial_set": Ellipsoid(start**2 * certificate.L)}
     env = kind(PLANT, UPLINK, **(usual | settings))
-    return SafetyShield(env, certificate, mode=mode)
+    return safety_shield(env, certificate, mode=mode)
 
 
 def levels(shield, info):
@@ -100,7 +90,7 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
 
 def test_a_given_start_is_followed_under_zero_input():
     plant, certificate, input_delay, rng = UNSTABLE.plant, UNSTABLE.certificate, 3, np.random.default_rng(0)
-    shield, safe, root = SafetyFilter(certificate, plant), certificate.safe_set, np.linalg.cholesky(certificate.M).T
+    shield, safe, root = safety_filter(certificate, plant), certificate.safe_set, np.linalg.cholesky(certificate.M).T
     powers = [np.linalg.matrix_power(plant.A, k) for k in range(input_delay + 1)]
     spread = [np.linalg.norm(root @ power @ np.linalg.cholesky(plant.disturbance.shape_matrix), 2) for power in powers]
     entered = left = 0
@@ -123,9 +113,9 @@ def test_a_given_start_is_followed_under_zero_input():
 def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size, count):
     # Starts that A annihilates, but for the rounding of products of huge numbers.
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[0.5, -0.3], [0.25, -0.15]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    plant = linear_plant(A=[[0.5, -0.3], [0.25, -0.15]], B=np.ones((2, 1)), box=np.eye(2), **settings)
     certificate, rng, known = certificate_of(plant), np.random.default_rng(0), 0
-    shield, M = SafetyFilter(certificate, plant), rational(certificate.M)
+    shield, M = safety_filter(certificate, plant), rational(certificate.M)
     *_, axes = np.linalg.svd(plant.A)
     for _ in range(count):
         base = axes[1] * size * rng.uniform(0.5, 1.0)
@@ -142,9 +132,9 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
 @pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
 def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size, count):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    plant = linear_plant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
     certificate, rng = certificate_of(plant), np.random.default_rng(0)
-    shield, A, L = SafetyFilter(certificate, plant), rational(plant.A), rational(certificate.L)
+    shield, A, L = safety_filter(certificate, plant), rational(plant.A), rational(certificate.L)
     for _ in range(count):
         long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
         width = edge_of(lambda x, long=long: starts_known(shield, Ellipsoid(long + x * THIN), 1)[1].in_safe_set, 16.0)
@@ -157,9 +147,9 @@ def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effec
     certificate, rng, shape = UNSTABLE.certificate, np.random.default_rng(0), UNSTABLE.plant.A.shape
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
     if many:
-        shield = VectorSafetyShield(NCSVectorEnv(1, plant=UNSTABLE.plant, **settings), certificate, "lookahead")
+        shield = vector_shield(vector_env(1, plant=UNSTABLE.plant, **settings), certificate, "lookahead")
     else:
-        shield = SafetyShield(NCSEnv(UNSTABLE.plant, **settings), certificate, "lookahead")
+        shield = safety_shield(loop_env(UNSTABLE.plant, **settings), certificate, "lookahead")
     stored = 0
     for seed in range(40):  # starts in S, some of which leave it in the two steps before any input
         start = certificate.safe_set.sample_boundary(rng) * rng.uniform(0.9, 1.0)
@@ -187,7 +177,7 @@ def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_
 
 def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
     """The present estimate, which is not seen then, may be farther out than its prediction was: rounding counts it."""
-    shield = SafetyFilter(certificate_of(PLANT), PLANT)
+    shield = safety_filter(certificate_of(PLANT), PLANT)
     errors = shield.errors_of(0.1 * certificate_of(PLANT).Sigma)
 
     def reason(distance, downlink):
@@ -202,7 +192,7 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
 
 def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_sensors_contract_allows():
     """The certificate counts the steps of both channels, the age of a sample those of its own alone."""
-    shield = SafetyFilter(UNSTABLE.certificate, UNSTABLE.plant)
+    shield = safety_filter(UNSTABLE.certificate, UNSTABLE.plant)
     monitor = GuaranteeMonitor(shield, downlink_protocol(UNSTABLE.downlink, None))
     n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
     assert UNSTABLE.certificate.contract.max_age == allowed + 2
@@ -231,9 +221,9 @@ class Meddling(gym.Wrapper):
 @pytest.mark.parametrize(("key", "reason"), [("input_committed", OTHER_INPUT), ("input", LATE_INPUT)])
 def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     certificate = certificate_of(PLANT)
-    inner = NCSEnv(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
+    inner = loop_env(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
     env = Meddling(inner, key)
-    shield = SafetyShield(env, certificate)
+    shield = safety_shield(env, certificate)
     shield.reset(seed=0)
     for _ in range(5):
         assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
@@ -248,8 +238,8 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
 @pytest.mark.parametrize("late", [False, True])
 def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
-    env = Meddling(NCSEnv(UNSTABLE.plant, **settings), "input")
-    shield, kept = SafetyShield(env, UNSTABLE.certificate, "lookahead"), 0
+    env = Meddling(loop_env(UNSTABLE.plant, **settings), "input")
+    shield, kept = safety_shield(env, UNSTABLE.certificate, "lookahead"), 0
     rng, push = np.random.default_rng(0), np.ones(1, np.float32)
     for seed in range(15):
         env.active = False
@@ -276,8 +266,8 @@ class MeddlingWithMany(VectorWrapper):
 
 def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
-    env = MeddlingWithMany(NCSVectorEnv(6, plant=UNSTABLE.plant, **settings))
-    shield, rng, kept = VectorSafetyShield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
+    env = MeddlingWithMany(vector_env(6, plant=UNSTABLE.plant, **settings))
+    shield, rng, kept = vector_shield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
     for seed in range(5):
         shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng, 6)})
         env.chosen = np.arange(6) % 2 == 0
@@ -291,8 +281,8 @@ def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
 def test_resetting_some_environments_makes_no_other_wait_less():
     waits = []
     for others in (0, 3):
-        env = NCSVectorEnv(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
-        shield = VectorSafetyShield(env, certificate_of(PLANT))
+        env = vector_env(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
+        shield = vector_shield(env, certificate_of(PLANT))
         _, info = shield.reset(seed=0, options={"state": np.array([[1.99, 1.0], [0.0, 0.0]])})
         for _ in range(others):
             options = {"reset_mask": np.array([False, True]), "state": np.zeros((2, 2))}
@@ -308,7 +298,7 @@ def test_resetting_some_environments_makes_no_other_wait_less():
 def test_safe_loop_speaks_the_protocol(downlink):
     """A plain loop with an actuator, to which every input comes c steps after it was decided."""
     certificate, rng = certificate_of(PLANT), np.random.default_rng(0)
-    loop = SafeLoop(certificate, PLANT, UPLINK, downlink=downlink)
+    loop = safe_loop(certificate, PLANT, UPLINK, downlink=downlink)
     actuator = Actuator(loop.input_delay, PLANT.m)
     up, down = ChannelState(UPLINK, rng), ChannelState(downlink, rng)
     state = 0.2 * Ellipsoid(certificate.L).sample_boundary(rng)
@@ -333,7 +323,7 @@ def test_safe_loop_speaks_the_protocol(downlink):
 
 def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
     actuator = Actuator(2, 1)
-    plain = SafeLoop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(delay=2))
+    plain = safe_loop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(delay=2))
     plain.start(np.zeros(2))
     commands = []
     for _ in range(4):

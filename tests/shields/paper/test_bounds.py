@@ -11,6 +11,7 @@ from shields.paper.bounds import (
     state_error_bound,
     uplink_error_bound,
 )
+from tests.product import library_plant
 
 Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
 
@@ -61,7 +62,7 @@ def test_safety_margin_is_the_distance_argument_of_the_paper():
 
 
 def test_model_of_a_plant_agrees_with_the_single_formulas():
-    plant = truck_trailer(gamma=1e-5, process_noise_cov=Q, initial_cov=P0)
+    plant = library_plant(truck_trailer, gamma=1e-5, process_noise_cov=Q, initial_cov=P0)
     bounds = PaperModel(plant).at(0.8, 1.1)
     epsilon_up = uplink_error_bound(1e-5, Q, P0, 0.05, 0.88)
     assert bounds.epsilon_up == pytest.approx(epsilon_up)

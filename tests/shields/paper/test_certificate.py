@@ -5,19 +5,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, truck_trailer
-from shields import Infeasible, SafetyFilter, SafetyShield, certify, verify
-from shields.paper import synthesize
+from ncs_gym import truck_trailer
+from shields import Infeasible, certify, verify
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_scale
+from tests.product import altered, library_plant, linear_plant, paper_synthesis, safety_filter, safety_shield
 from tests.verdicts import broken, verified
 
-SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
+SMALL = library_plant(truck_trailer, gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 
 
 @pytest.fixture(scope="module")
 def paper():
-    return synthesize(SMALL)
+    return paper_synthesis(SMALL)
 
 
 def test_certificate_carries_the_papers_constants(paper):
@@ -36,8 +36,8 @@ def test_certificate_carries_the_papers_constants(paper):
     ],
 )
 def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search, steps):
-    plant = truck_trailer(**bounds)
-    certificate = synthesize(plant, search=search, dkappa=steps[0], drho=steps[1])
+    plant = library_plant(truck_trailer, **bounds)
+    certificate = paper_synthesis(plant, search=search, dkappa=steps[0], drho=steps[1])
     report = verified(certificate, plant)
     assert report.valid, str(report)
     assert {f"(C{i})" for i in (1, 2, 3, 7)} <= {c.name.split()[0] for c in report.conditions}
@@ -54,9 +54,9 @@ def test_exact_conditions_may_be_proved_for_the_same_set(paper):
 
 def test_no_shield_takes_a_certificate_of_the_paper(paper):
     with pytest.raises(ValueError, match="takes a Certificate"):
-        SafetyFilter(paper, SMALL)
+        safety_filter(paper, SMALL)
     with pytest.raises(ValueError, match="a Certificate, its document or path"):
-        SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
+        safety_shield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
     with pytest.raises(ValueError, match="takes a Certificate and a LinearPlant"):
         verify(paper, SMALL)
 
@@ -64,7 +64,7 @@ def test_no_shield_takes_a_certificate_of_the_paper(paper):
 @pytest.mark.slow
 def test_printed_parameters_are_infeasible_and_the_reason_has_figures():
     with pytest.raises(Infeasible, match=r"\(C2\) binds") as caught:
-        synthesize(truck_trailer(), dkappa=0.05, drho=0.1)  # proven over the whole domain
+        paper_synthesis(truck_trailer(), dkappa=0.05, drho=0.1)  # proven over the whole domain
     error = caught.value
     assert error.binding == "C2"
     assert error.shortfall == pytest.approx(1.0 - 0.034, abs=5e-4)
@@ -82,25 +82,25 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
 
     def scaled(factor):
         factor *= scale
-        return truck_trailer(
-            gamma=factor * 5e-4, process_noise_cov=factor * 1e-4 * np.eye(2), initial_cov=factor * 1e-4 * np.eye(2)
-        )
+        covariance = factor * 1e-4 * np.eye(2)
+        bounds = {"gamma": factor * 5e-4, "process_noise_cov": covariance, "initial_cov": covariance}
+        return library_plant(truck_trailer, **bounds)
 
-    assert verified(synthesize(scaled(0.97), dkappa=0.005, drho=0.01), scaled(0.97)).valid
+    assert verified(paper_synthesis(scaled(0.97), dkappa=0.005, drho=0.01), scaled(0.97)).valid
     with pytest.raises(Infeasible):
-        synthesize(scaled(1.05), dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
+        paper_synthesis(scaled(1.05), dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
 
 
 @pytest.mark.slow
 def test_too_coarse_a_grid_says_so():
     with pytest.raises(Infeasible, match="use smaller steps") as caught:
-        synthesize(SMALL, dkappa=0.4, drho=1.0)
+        paper_synthesis(SMALL, dkappa=0.4, drho=1.0)
     assert caught.value.binding == "grid"
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e4])
 def test_units_of_the_state_change_nothing(unit, paper):
-    scaled = replace(
+    scaled = altered(
         SMALL,
         B=SMALL.B * unit,
         continuous_model=None,
@@ -110,14 +110,14 @@ def test_units_of_the_state_change_nothing(unit, paper):
         measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,
         initial_cov=SMALL.initial_cov * unit**2,
     )
-    certificate = synthesize(scaled)
+    certificate = paper_synthesis(scaled)
     assert verified(certificate, scaled).valid
     assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
     np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
 
 
 def one_state(A, B, u_max, gamma, Q, P0):
-    return LinearPlant(
+    return linear_plant(
         A=[[A]], B=[[B]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
     )
 
@@ -125,21 +125,21 @@ def one_state(A, B, u_max, gamma, Q, P0):
 @pytest.mark.slow
 def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified():
     with pytest.raises(Infeasible):
-        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), dkappa=0.05, drho=0.1)
+        paper_synthesis(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), dkappa=0.05, drho=0.1)
 
 
 @pytest.mark.slow
 def test_an_input_limit_that_binds_is_named():
     with pytest.raises(Infeasible, match="input limit") as caught:
-        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), dkappa=0.05, drho=0.1)
+        paper_synthesis(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), dkappa=0.05, drho=0.1)
     assert caught.value.binding == "C5"
     assert 0.0 < caught.value.shortfall < 1.0
 
 
 def test_no_uncertainty_at_all_is_no_division_by_zero():
     zero = np.zeros((2, 2))
-    plant = truck_trailer(gamma=0.0, process_noise_cov=zero, initial_cov=zero)
-    assert verified(synthesize(plant), plant).valid
+    plant = library_plant(truck_trailer, gamma=0.0, process_noise_cov=zero, initial_cov=zero)
+    assert verified(paper_synthesis(plant), plant).valid
 
 
 @pytest.mark.parametrize("kappa", [float(np.nextafter(1.0, 0.0)), 1.0 - 1e-12, 0.0, -1.0, 1e70])

@@ -2,12 +2,13 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym import truck_trailer
 from shields.paper.algorithm import kappa_rho_grid, search_grid
 from shields.paper.bounds import PaperModel
 from shields.paper.optimization_problem import OptimizationProblem
+from tests.product import library_plant, linear_plant
 
-SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
+SMALL = library_plant(truck_trailer, gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 POINTS = [(k, 1.0 + (1.0 / k - 1.0) * s) for k in (0.8, 0.9, 0.98) for s in (0.0, 0.3, 0.8)]
 
 
@@ -56,7 +57,7 @@ def test_a_point_is_solved_the_same_whatever_was_solved_before():
 
 def test_log_det_and_eigenvalue_of_a_known_solution():
     # One state without dynamics: L <= 1 by the box, whatever K is, in units in which the box is 2 wide to each side.
-    plant = LinearPlant(A=[[0.0]], B=[[1.0]], box=[[0.5]], u_max=1.0, dt=0.1, gamma=1e-9, process_noise_cov=[[1e-9]])
+    plant = linear_plant(A=[[0.0]], B=[[1.0]], box=[[0.5]], u_max=1.0, dt=0.1, gamma=1e-9, process_noise_cov=[[1e-9]])
     bounds = PaperModel(plant).at(0.5, 1.5)
     assert OptimizationProblem(plant).largest_eigenvalue(bounds) == pytest.approx(4.0, rel=1e-6)
     assert OptimizationProblem(plant).solution(bounds).log_det == pytest.approx(np.log(4.0), abs=1e-6)
@@ -76,7 +77,7 @@ def test_solution_meets_the_printed_constraints():
 
 
 def test_several_inputs_share_one_auxiliary_matrix():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.6, 0.2], [-0.1, 0.7]], B=np.eye(2), box=np.eye(2), u_max=[1.0, 2.0], dt=0.1, gamma=1e-6,
         process_noise_cov=1e-7 * np.eye(2), measurement_noise_cov=1e-6 * np.eye(2), initial_cov=1e-7 * np.eye(2),
     )  # fmt: skip
@@ -101,7 +102,7 @@ def test_first_feasible_pair_wins():
 
 @pytest.mark.slow
 def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_grid():
-    plant = truck_trailer(gamma=1e-5, process_noise_cov=np.zeros((2, 2)))
+    plant = library_plant(truck_trailer, gamma=1e-5, process_noise_cov=np.zeros((2, 2)))
     grid = {"dkappa": 0.03, "drho": 0.08}
     first, largest = search_grid(plant, **grid), search_grid(plant, search="largest", **grid)
     assert largest.log_det > first.log_det + 0.1

@@ -9,12 +9,13 @@ import numpy as np
 from ncs_gym import Channel, LinearPlant, MovedOperatingPointWarning, contract_of
 from shields import Certificate
 from tests.certificates import certificate_of
+from tests.product import linear_plant, sampled_plant
 
 QUIET = {"sensor_bound": 0.01, "initial_bound": 0.01}
 CHANNEL = Channel(loss=0.3, max_consecutive_losses=1, send_period=2)
 CONTRACT = contract_of(CHANNEL)
 # A safety filter's angle, -30 to 45 degrees (AMPyC); two tanks with two valves; a hill that only goes up.
-ANGLE = LinearPlant(
+ANGLE = linear_plant(
     A=[[1.0, 0.1], [-0.045, 0.9]],
     B=[[0.0], [0.1]],
     dt=0.1,
@@ -23,7 +24,7 @@ ANGLE = LinearPlant(
     disturbance_bound=[0.002, 0.004],
     **QUIET,
 )
-TANKS = LinearPlant.from_statespace(
+TANKS = sampled_plant(
     ([[-0.1, 0.05], [0.0, -0.2]], [[0.1, 0.02], [0.03, 0.2]], np.eye(2), 0),
     1.0,
     state_limits=([0.0, 0.0], [16.0, 8.0]),
@@ -36,7 +37,7 @@ TANKS = LinearPlant.from_statespace(
 )
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", MovedOperatingPointWarning)
-    HILL = LinearPlant.from_statespace(
+    HILL = sampled_plant(
         ([[-0.01]], [[1.32]], [[1.0]], 0),
         0.1,
         state_limits=(0.0, 40.0),
@@ -60,13 +61,11 @@ TWO_INPUTS = {
 } | QUIET
 ASYMMETRIC = {"angle": ANGLE, "tanks": TANKS, "hill": HILL}
 MIXED = {
-    "rates": LinearPlant.from_statespace(MODEL, 0.1, du_max=0.3, **ONE_INPUT, **QUIET),
-    "rates of a late input": LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, du_max=0.3, **ONE_INPUT, **QUIET),
+    "rates": sampled_plant(MODEL, 0.1, du_max=0.3, **ONE_INPUT, **QUIET),
+    "rates of a late input": sampled_plant(MODEL, 0.1, input_delay=2, du_max=0.3, **ONE_INPUT, **QUIET),
     # What passengers feel: the second row of the model itself, from -.6 to .4.
-    "feedthrough": LinearPlant.from_statespace(
-        MODEL, 0.1, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
-    ),
-    "coupled": LinearPlant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS),
+    "feedthrough": sampled_plant(MODEL, 0.1, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET),
+    "coupled": linear_plant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS),
 }
 PLANTS = ASYMMETRIC | MIXED
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid
-from shields import Certificate, SafetyFilter, VectorSafetyShield, verify
+from shields import Certificate, verify
+from tests.product import safety_filter, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS, certificate, mixed_values
 
@@ -42,7 +43,7 @@ def test_file_keeps_it(name, tmp_path):
 @pytest.mark.parametrize("name", PLANTS)
 def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     plant, found = PLANTS[name], certificate(name)
-    shield, P, rng = SafetyFilter(found, plant), found.polytope, np.random.default_rng(0)
+    shield, P, rng = safety_filter(found, plant), found.polytope, np.random.default_rng(0)
     shape, reasons = 0.5 * found.error_shapes[0], []
     reach = Ellipsoid(shape).support(P.rows @ plant.A) + plant.disturbance.support(P.rows)
     own = Ellipsoid(shape).support(plant.mixed_rows[:, : plant.n])
@@ -86,7 +87,7 @@ def test_no_limit_is_passed_while_guaranteed(name, mode):
     names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "max_episode_steps": 70}
     for disturbance in (AdversarialDisturbance(), AdversarialDisturbance(rows=P.rows), "sphere"):
         env = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=count, disturbance=disturbance, noise="extreme", **names)
-        shield = VectorSafetyShield(env, found, mode)
+        shield = vector_shield(env, found, mode)
         starts = P.center + 0.9 * (P.sample_boundary(rng, count) - P.center)
         _, info = shield.reset(seed=3, options={"state": starts})
         assert info["shield_guaranteed"].all()

@@ -11,8 +11,21 @@ import pytest
 from scipy.optimize import linprog
 
 from ncs_gym import Channel, Ellipsoid, LinearPlant, contract_of
-from shields import Infeasible, SafeLoop, SafetyShield, VectorSafetyShield, synthesize, verify
+from shields import Infeasible, verify
 from tests.certificates import certificate_of, feasible_age_not_sought
+from tests.product import (
+    altered,
+    gym_env,
+    gym_vector_env,
+    linear_plant,
+    rate_limited,
+    resampled,
+    safe_loop,
+    safety_shield,
+    sampled_plant,
+    synthesize,
+    vector_shield,
+)
 from tests.shields.polytope.limits import (
     CHANNEL,
     CONTRACT,
@@ -49,12 +62,10 @@ def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
 def test_without_the_limit_in_the_certificate_it_is_passed(name):
     """The negative twin: a shield that does not know the limit, in the same runs."""
     plant, count = PLANTS[name], 30
-    blind = replace(plant, mixed_rows=None, mixed_ends=None)
+    blind = altered(plant, mixed_rows=None, mixed_ends=None)
     found = certificate_of(blind, CONTRACT, "polytope")
-    env = gym.make_vec(
-        "ncs_gym/LinearNCS-v0", num_envs=count, plant=blind, channel=CHANNEL, contract=CONTRACT, max_episode_steps=70
-    )
-    shield = VectorSafetyShield(env, found)
+    env = gym_vector_env(count, plant=blind, channel=CHANNEL, contract=CONTRACT, max_episode_steps=70)
+    shield = vector_shield(env, found)
     _, info = shield.reset(seed=3)
     rng, passed = np.random.default_rng(1), 0
     for _ in range(60):
@@ -69,7 +80,7 @@ def test_without_the_limit_in_the_certificate_it_is_passed(name):
 @pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
 def test_unshielded_steps_beyond_a_limit_are_counted(name):
     plant, rng = PLANTS[name], np.random.default_rng(1)
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=CHANNEL, contract=CONTRACT)
+    env = gym_env(plant=plant, channel=CHANNEL, contract=CONTRACT)
     _, info = env.reset(seed=0)
     counted = 0
     for _ in range(60):
@@ -86,7 +97,7 @@ def test_unshielded_steps_beyond_a_limit_are_counted(name):
 @pytest.mark.parametrize("name", MIXED)
 def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name):
     plant, found = PLANTS[name], certificate(name)
-    closer = replace(plant, mixed_ends=0.3 * plant.mixed_ends)
+    closer = altered(plant, mixed_ends=0.3 * plant.mixed_ends)
     claimed = replace(found, fingerprint=closer.fingerprint)
     P, first = found.polytope, len(found.polytope.rows) + plant.m
     upper, lower = P.multipliers.copy(), P.lower_multipliers.copy()
@@ -110,27 +121,27 @@ def test_stable_plant_with_limits_of_rates_needs_no_contract():
 
 def test_limits_of_rates_may_be_given_to_the_constructor():
     model = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "dt": 0.1, **ONE_INPUT, **QUIET}
-    plant, other = LinearPlant(**model, du_max=0.3), LinearPlant(**model).with_rate_limits(0.3)
+    plant, other = linear_plant(**model, du_max=0.3), rate_limited(linear_plant(**model), 0.3)
     assert plant.fingerprint == other.fingerprint
     assert plant.state_names == other.state_names == ("x1", "x2", "u1 of 1 step ago")
     with pytest.raises(ValueError, match="du_max must be a positive number"):
-        LinearPlant(**model, du_max=-1.0)
+        linear_plant(**model, du_max=-1.0)
 
 
 def test_rates_may_be_given_per_second_and_for_a_plant_that_is_made():
-    plant = LinearPlant.from_statespace(MODEL, 0.1, **ONE_INPUT, **QUIET)
-    assert plant.with_rate_limits(0.3).fingerprint == PLANTS["rates"].fingerprint
-    assert plant.with_rate_limits(2.5, per="second").fingerprint == plant.with_rate_limits(0.25).fingerprint
-    late = LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, **ONE_INPUT, **QUIET)
-    assert late.with_rate_limits(0.3).fingerprint == PLANTS["rates of a late input"].fingerprint
-    assert late.with_rate_limits(0.3).n == late.n == plant.n + 2
+    plant = sampled_plant(MODEL, 0.1, **ONE_INPUT, **QUIET)
+    assert rate_limited(plant, 0.3).fingerprint == PLANTS["rates"].fingerprint
+    assert rate_limited(plant, 2.5, per="second").fingerprint == rate_limited(plant, 0.25).fingerprint
+    late = sampled_plant(MODEL, 0.1, input_delay=2, **ONE_INPUT, **QUIET)
+    assert rate_limited(late, 0.3).fingerprint == PLANTS["rates of a late input"].fingerprint
+    assert rate_limited(late, 0.3).n == late.n == plant.n + 2
     assert "|u1 - u1 of 1 step ago| <= 0.3" in str(PLANTS["rates"])
     assert "u1 of 1 step ago <= " not in str(PLANTS["rates"]).replace("|u1 - u1 of 1 step ago| <= 0.3", "")
 
 
 def test_limit_of_a_late_input_is_one_of_the_input_that_acts():
     limit = [([-0.5, -1.0], [1.0], -0.6, 0.4)]
-    plant = LinearPlant.from_statespace(MODEL, 0.1, input_delay=2, mixed_limits=limit, **ONE_INPUT, **QUIET)
+    plant = sampled_plant(MODEL, 0.1, input_delay=2, mixed_limits=limit, **ONE_INPUT, **QUIET)
     assert not len(plant.mixed_rows)
     state = np.array([0.1, 0.2, 0.35, -0.4])  # the oldest input acts now
     value = -0.05 - 0.2 + 0.35
@@ -139,7 +150,7 @@ def test_limit_of_a_late_input_is_one_of_the_input_that_acts():
 
 def test_episode_begins_with_the_operating_input_as_the_one_before():
     for name in ("rates", "rates of a late input"):
-        env = gym.make("ncs_gym/LinearNCS-v0", plant=PLANTS[name], channel=CHANNEL, contract=CONTRACT)
+        env = gym_env(plant=PLANTS[name], channel=CHANNEL, contract=CONTRACT)
         _, info = env.reset(seed=1)
         assert not info["state"][2:].any()
         assert info["state"][:2].all()
@@ -152,7 +163,7 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     settings = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "downlink": downlink}
     env = gym.make("ncs_gym/LinearNCS-v0", disturbance="adversarial", **settings)
     both = replace(CONTRACT, max_age=CONTRACT.max_age + contract_of(downlink).max_age)
-    shield = SafetyShield(env, certificate_of(plant, both, "polytope"), mode)
+    shield = safety_shield(env, certificate_of(plant, both, "polytope"), mode)
     rng, guaranteed = np.random.default_rng(0), 0
     for seed in range(5):
         _, info = shield.reset(seed=seed)
@@ -169,7 +180,7 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
 @pytest.mark.parametrize("name", ["rates", "rates of a late input"])
 def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it(name):
     plant, found = PLANTS[name], certificate(name)
-    loop = SafeLoop(found, plant, Channel(), mode="lookahead")
+    loop = safe_loop(found, plant, Channel(), mode="lookahead")
     loop.start(np.zeros(plant.n))
     loop.receive()
     for proposed in (plant.input_high, plant.input_low):
@@ -184,10 +195,10 @@ def test_file_and_fingerprint_hold_the_limits(tmp_path):
         assert again.fingerprint == plant.fingerprint, name
         np.testing.assert_array_equal(again.mixed_rows, plant.mixed_rows)
         np.testing.assert_array_equal(again.mixed_ends, plant.mixed_ends)
-        assert replace(plant, mixed_ends=1.01 * plant.mixed_ends).fingerprint != plant.fingerprint
-    without = replace(PLANTS["coupled"], mixed_rows=None, mixed_ends=None)
+        assert altered(plant, mixed_ends=1.01 * plant.mixed_ends).fingerprint != plant.fingerprint
+    without = altered(PLANTS["coupled"], mixed_rows=None, mixed_ends=None)
     assert "mixed_rows" not in without.document["plant"]
-    open_end = replace(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])
+    open_end = altered(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])
     open_end.save(tmp_path / "plant.json")
     assert LinearPlant.load(tmp_path / "plant.json").mixed_ends[0].tolist() == [-np.inf]
 
@@ -195,7 +206,7 @@ def test_file_and_fingerprint_hold_the_limits(tmp_path):
 def test_limits_move_with_the_operating_point():
     """The same limits and the same model, told from another point, hold for the same inputs and states."""
     plant, there = PLANTS["coupled"], {"operating_state": [5.0, 3.0], "operating_input": [4.0, 2.0]}
-    other = LinearPlant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS | there)
+    other = linear_plant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS | there)
     state, u = np.array([5.5, 4.5]), np.array([5.0, 2.9])
     values = [each.mixed_values(each.to_deviation(state), each.to_deviation(u, "input")) for each in (plant, other)]
     np.testing.assert_allclose(*values)
@@ -223,26 +234,26 @@ REFUSED = {
 def test_what_is_no_such_limit_is_refused(what):
     given, sentence = REFUSED[what]
     with pytest.raises(ValueError, match=sentence):
-        LinearPlant(mixed_limits=given, **TWO_INPUTS)
+        linear_plant(mixed_limits=given, **TWO_INPUTS)
 
 
 def test_what_is_no_limit_of_rates_is_refused():
-    plant = LinearPlant.from_statespace(MODEL, 0.1, **ONE_INPUT, **QUIET)
+    plant = sampled_plant(MODEL, 0.1, **ONE_INPUT, **QUIET)
     for given, sentence in ((0.0, "du_max must be a positive number"), ([1.0, 2.0], "du_max"), ("a", "du_max")):
         with pytest.raises(ValueError, match=sentence):
-            plant.with_rate_limits(given)
+            rate_limited(plant, given)
     with pytest.raises(ValueError, match="per must be"):
-        plant.with_rate_limits(1.0, per="minute")
+        rate_limited(plant, 1.0, per="minute")
     with pytest.raises(ValueError, match="between_samples is for plants without"):
-        LinearPlant.from_statespace(MODEL, 0.1, between_samples=4, du_max=0.3, **ONE_INPUT, **QUIET)
+        sampled_plant(MODEL, 0.1, between_samples=4, du_max=0.3, **ONE_INPUT, **QUIET)
     with pytest.raises(ValueError, match="initial_bound"):
-        replace(plant, initial_bound=None, initial_cov=1e-4 * np.eye(2)).with_rate_limits(1.0)
+        rate_limited(altered(plant, initial_bound=None, initial_cov=1e-4 * np.eye(2)), 1.0)
 
 
 def test_only_a_polytope_is_sought_and_a_limit_that_nothing_keeps_has_a_reason():
     with pytest.raises(ValueError, match="only a polytope is sought"):
         synthesize(PLANTS["coupled"], safe_set="ellipsoid")
-    unstable = LinearPlant.from_statespace(
+    unstable = sampled_plant(
         ([[1.0]], [[1.0]], [[1.0]], 0), 0.1, state_limits=(-1.0, 1.0), input_limits=(-3.0, 3.0), du_max=1e-3,
         disturbance_bound=0.05, **QUIET,
     )  # fmt: skip
@@ -251,7 +262,7 @@ def test_only_a_polytope_is_sought_and_a_limit_that_nothing_keeps_has_a_reason()
 
 
 def test_limits_count_beside_times_between_samples():
-    plant = LinearPlant.from_statespace(
+    plant = sampled_plant(
         MODEL, 0.1, between_samples=4, mixed_limits=[([-0.5, -1.0], [1.0], -0.6, 0.4)], **ONE_INPUT, **QUIET
     )
     found = certificate_of(plant, CONTRACT, "polytope")
@@ -259,8 +270,8 @@ def test_limits_count_beside_times_between_samples():
     names = [condition.name[:4] for condition in verify(found, plant).conditions]
     assert names.count("(PM)") == 1
     assert names.count("(PB)") == 4 * len(plant.box)
-    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=CHANNEL, contract=CONTRACT, disturbance="adversarial")
-    shield, rng = SafetyShield(env, found), np.random.default_rng(0)
+    env = gym_env(plant=plant, channel=CHANNEL, contract=CONTRACT, disturbance="adversarial")
+    shield, rng = safety_shield(env, found), np.random.default_rng(0)
     shield.reset(seed=0)
     for _ in range(100):
         _, _, _, _, info = shield.step(rng.choice([-1.0, 1.0], 1).astype(np.float32))
@@ -272,4 +283,4 @@ def test_limits_count_beside_times_between_samples():
 @pytest.mark.parametrize("name", ["rates", "rates of a late input"])
 def test_plant_of_past_inputs_says_why_it_has_no_other_step(name):
     with pytest.raises(ValueError, match=r"states are past inputs, of input_delay or limits of rates.*dt=0.05"):
-        PLANTS[name].resampled(0.05)
+        resampled(PLANTS[name], 0.05)

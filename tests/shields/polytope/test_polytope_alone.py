@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract
-from shields import Infeasible, synthesize
+from shields import Infeasible
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.max_margin_gain import max_margin_gain
@@ -14,6 +14,7 @@ from shields.synthesis.polytope_certificates import certify_polytope
 from shields.synthesis.polytope_gain import most_tolerant_gain, polytope_margin
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import named, servo, with_radii
+from tests.product import synthesize
 from tests.verdicts import verified
 
 AGE = ChannelContract(3)

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import LinearPlant, cart_pole
+from ncs_gym import cart_pole
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import CART_POLE_CHANNEL
-from shields import synthesize, verify
+from shields import verify
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
@@ -25,6 +25,7 @@ from shields.synthesis.polytope_certificates import certify_polytope, with_polyt
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.product import altered, linear_plant, sampled_plant, synthesize
 from tests.second_verifier.verify import verify_again
 from tests.verdicts import verified
 
@@ -75,7 +76,7 @@ def test_default_has_a_polytope_around_the_same_ellipsoid_bit_for_bit():
 def test_units_of_inputs_do_not_matter():
     plant = random_plant(3, 2, 1)
     certificate = certificate_of(plant)
-    tiny = replace(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
+    tiny = altered(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
     K = certificate.K * 1e-39
     found_there = search.invariant_polytope(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
     broken = [
@@ -113,7 +114,7 @@ def small_plant(**changes):
     """Two states, of which the second is pushed; in the unit box."""
     given = {"A": [[0.9, 0.2], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": np.eye(2), "u_max": 1.0, "dt": 0.1}
     noise = {"gamma": 1e-4, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
-    return LinearPlant(**(given | noise | changes))
+    return linear_plant(**(given | noise | changes))
 
 
 def test_box_with_nearly_the_same_row_twice_keeps_the_ellipsoid_and_says_what_helps():
@@ -147,7 +148,7 @@ def chain(masses, dt):
     forces = np.zeros((2 * masses, 2))
     forces[[masses, masses + 1, 2 * masses - 2, 2 * masses - 1], [0, 0, 1, 1]] = 1.0, -1.0, 1.0, -1.0
     pushes = zero_order_hold(model, np.concatenate([still, moving]), dt)[1]
-    return LinearPlant.from_statespace(
+    return sampled_plant(
         (model, forces, np.eye(2 * masses), np.zeros((2 * masses, 2))),
         dt,
         box=4.0 * np.ones(2 * masses),
@@ -170,7 +171,7 @@ def test_chain_of_three_masses_with_two_forces_certifies_within_a_minute():
 
 def slow_plant():
     """Time constants of 60, 2 and .05 s at steps of .1 s; the limits have two different ends."""
-    return LinearPlant(
+    return linear_plant(
         A=[[0.9982, -0.0004, 0.0024], [0.0475, 0.9645, -0.2049], [0.2070, -0.1415, 0.1174]],
         B=0.01 * np.ones((3, 1)),
         state_limits=([-0.9, -0.8, -1.1], [1.1, 1.2, 0.9]),

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
-from shields import SafetyFilter
+from ncs_gym import ChannelContract, Ellipsoid
 from shields.runtime.projection import closest_between
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.starts import starts_inside
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.product import altered, linear_plant, safety_filter
 from tests.shields.runtime.batches import decided_alike
 
 ALL = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleTwoWay")
@@ -53,12 +53,12 @@ def test_closest_points_do_not_depend_on_units_and_bear_many_rows(unit):
 
 
 def test_rows_given_twice_or_with_both_signs_change_no_projection():
-    plant = replace(random_plant(2, 2, 2, gamma=1e-4), u_max=2.0)
-    estimates, shape, proposals = situations(SafetyFilter(certificate_of(plant, safe_set="polytope"), plant), 200)
+    plant = altered(random_plant(2, 2, 2, gamma=1e-4), u_max=2.0)
+    estimates, shape, proposals = situations(safety_filter(certificate_of(plant, safe_set="polytope"), plant), 200)
     results = []
     for box in (plant.box_rows, np.concatenate([plant.box_rows, -plant.box_rows, plant.box_rows])):
-        twice = replace(plant, box=box)
-        shield = SafetyFilter(certificate_of(twice, safe_set="polytope"), twice)
+        twice = altered(plant, box=box)
+        shield = safety_filter(certificate_of(twice, safe_set="polytope"), twice)
         decisions = [shield.decide(x, shape, u) for x, u in zip(estimates, proposals, strict=True)]
         results.append((np.array([each.input for each in decisions]), [each.reason for each in decisions]))
     assert results[0][1] == results[1][1]
@@ -81,14 +81,14 @@ def test_parallel_rows_do_not_hide_the_closest_point():
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
 def test_batches_decide_as_single_loops(name, mode):
-    shield = SafetyFilter(*wide_certificate(name), mode)
+    shield = safety_filter(*wide_certificate(name), mode)
     estimates, shape, proposals = situations(shield, 64)
     assert len(set(decided_alike(shield, estimates, np.tile(shape, (64, 1, 1)), proposals).reason)) > 1
 
 
 def test_sums_in_another_order_stay_within_the_room_for_rounding():
     certificate, plant = wide_certificate("CartPole")
-    shield = SafetyFilter(certificate, plant)
+    shield = safety_filter(certificate, plant)
     estimates, _, proposals = situations(shield, 200)
     order = np.random.default_rng(1).permutation(plant.n)
     test = shield.test
@@ -102,7 +102,7 @@ def test_sums_in_another_order_stay_within_the_room_for_rounding():
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
 def test_what_is_not_usable_ends_in_the_fallback(value):
     certificate, plant = wide_certificate("CartPole")
-    shield = SafetyFilter(certificate, plant)
+    shield = safety_filter(certificate, plant)
     shape = certificate.Sigma
     estimate = np.zeros(plant.n)
     decision = shield.decide(np.full(plant.n, value), shape, np.zeros(1))
@@ -126,10 +126,10 @@ def test_starts_are_decided_exactly():
 
 
 def test_polytope_of_a_plant_with_one_state_is_an_interval():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[1.05]], B=[[0.5]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-4,
         measurement_noise_cov=[[1e-6]], initial_cov=[[1e-6]],
     )  # fmt: skip
     certificate = certificate_of(plant, ChannelContract(2), "polytope")
     np.testing.assert_array_equal(certificate.polytope.rows[0], plant.box_rows[0])
-    assert SafetyFilter(certificate, plant).decide(np.zeros(1), certificate.Sigma, np.zeros(1)).reason == "safe"
+    assert safety_filter(certificate, plant).decide(np.zeros(1), certificate.Sigma, np.zeros(1)).reason == "safe"

@@ -12,21 +12,11 @@ import pytest
 from scipy.optimize import linprog
 
 from benchmarks.published import channel_of, contract_of_plant, plant_of, published
-from ncs_gym import (
-    AdversarialDisturbance,
-    ChannelContract,
-    LinearPlant,
-    MovedOperatingPointWarning,
-    contract_of,
-)
-from shields import (
-    CertificateError,
-    Infeasible,
-    VectorSafetyShield,
-    synthesize,
-)
+from ncs_gym import AdversarialDisturbance, ChannelContract, MovedOperatingPointWarning, contract_of
+from shields import CertificateError, Infeasible
 from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
 from tests.certificates import certificate_of
+from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
 from tests.verdicts import broken, verified
@@ -49,8 +39,8 @@ def test_plant_in_deviations_from_another_point_has_the_same_polytope():
     """Nothing depends on where deviations are counted from: the same limits, told from another equilibrium."""
     model = {"A": [[0.5, 0.25], [0.0, 0.75]], "B": [[0.0], [0.25]], "dt": 0.5, "disturbance_bound": 0.01} | QUIET
     limits = {"state_limits": ([-2.0, -4.0], [6.0, 4.0]), "input_limits": (-8.0, 8.0)}
-    here = LinearPlant(**model, **limits, operating_state=[0.0, 0.0], operating_input=[0.0])
-    there = LinearPlant(**model, **limits, operating_state=[0.5, 1.0], operating_input=[1.0])
+    here = linear_plant(**model, **limits, operating_state=[0.0, 0.0], operating_input=[0.0])
+    there = linear_plant(**model, **limits, operating_state=[0.5, 1.0], operating_input=[1.0])
     found = [certificate_of(plant, safe_set="polytope") for plant in (here, there)]
     rests = [plant.from_deviation(each.resting_state) for plant, each in zip((here, there), found, strict=True)]
     np.testing.assert_allclose(*rests, atol=1e-4)
@@ -65,7 +55,7 @@ def test_plant_in_deviations_from_another_point_has_the_same_polytope():
 
 def test_limit_with_one_end_alone_is_kept():
     """The other end of the only state's range follows from the input's."""
-    room = LinearPlant(
+    room = linear_plant(
         A=[[0.98]], B=[[0.05]], dt=60.0, operating_state=22.0, operating_input=8.0,
         state_limits=(20.0, np.inf), input_limits=(0.0, 12.0), disturbance_bound=0.1, **QUIET,
     )  # fmt: skip
@@ -99,7 +89,7 @@ def test_share_of_the_box_is_that_of_random_points(name):
 
 
 def test_share_of_the_last_input_is_what_linear_programs_find():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, box=[10.0, 10.0], u_max=5.0, du_max=1.0,
         disturbance_bound=[0.1, 0.05], sensor_bound=0.1, initial_bound=[0.3, 0.2],
     )  # fmt: skip
@@ -210,7 +200,7 @@ def test_bound_of_a_disturbance_with_two_ends_holds_all_of_it_in_rational_number
     model = {"A": [[0.9, 0.1], [0.0, 0.7]], "B": [[0.1], [0.4]], "dt": 1.0} | QUIET
     limits = {"state_limits": ([-5.0, -5.0], [6.0, 4.0]), "input_limits": (-3.0, 4.0)}
     with pytest.warns(MovedOperatingPointWarning):
-        plant = LinearPlant(**model, **limits, disturbance_bound=(E, low, high))
+        plant = linear_plant(**model, **limits, disturbance_bound=(E, low, high))
     x, u = plant.operating_state, plant.operating_input  # deviations of the new point from the old one, (0, 0)
     assert np.abs(x).max() > 0.01
     rows = [[Fraction(float(entry)) for entry in row] for row in np.hstack([plant.A, plant.B, E])]
@@ -219,27 +209,27 @@ def test_bound_of_a_disturbance_with_two_ends_holds_all_of_it_in_rational_number
         there = [Fraction(float(entry)) for entry in (*x, *u, *corner)]
         d = [sum(a * b for a, b in zip(row, there, strict=True)) - Fraction(float(x[i])) for i, row in enumerate(rows)]
         assert float(np.array(d, dtype=float) @ np.linalg.solve(D, np.array(d, dtype=float))) <= 1.0
-    absolute = LinearPlant(**model, **limits, disturbance_bound=0.0)
+    absolute = linear_plant(**model, **limits, disturbance_bound=0.0)
     np.testing.assert_allclose(plant.box_ends + plant.box @ x, absolute.box_ends, atol=1e-12)
     np.testing.assert_allclose(plant.input_ends + u, absolute.input_ends, atol=1e-12)
 
 
 def test_disturbance_with_symmetric_ends_leaves_the_operating_point():
     settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
-    both = LinearPlant(**settings, disturbance_bound=([[1.0]], [-0.1], [0.1]))
-    assert both.fingerprint == LinearPlant(**settings, disturbance_bound=([[1.0]], 0.1)).fingerprint
-    of_two = LinearPlant(**settings, disturbance_bound=([[1.0, 5.0]], [-0.1, 0.0], [0.1, 0.0]))
+    both = linear_plant(**settings, disturbance_bound=([[1.0]], [-0.1], [0.1]))
+    assert both.fingerprint == linear_plant(**settings, disturbance_bound=([[1.0]], 0.1)).fingerprint
+    of_two = linear_plant(**settings, disturbance_bound=([[1.0, 5.0]], [-0.1, 0.0], [0.1, 0.0]))
     assert of_two.fingerprint == both.fingerprint, "what is always 0 adds nothing"
     with pytest.raises(ValueError, match="low <= high"):
-        LinearPlant(**settings, disturbance_bound=([[1.0]], [0.1], [-0.1]))
+        linear_plant(**settings, disturbance_bound=([[1.0]], [0.1], [-0.1]))
     with pytest.raises(ValueError, match="no state stays where it is"):
-        LinearPlant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
+        linear_plant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
     with pytest.raises(ValueError, match="not strictly within the limits"):
-        LinearPlant(**settings | {"B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.9]))
+        linear_plant(**settings | {"B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.9]))
 
 
 def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[1.0, 0.1], [0.0, 0.95]],
         B=[[0.0], [0.1]],
         dt=0.1,
@@ -262,13 +252,13 @@ def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
         "disturbance_bound": 0.005,
     } | QUIET
     delay = {"input_delay": 1} if points is None else {"between_samples": points}
-    plant = LinearPlant.from_statespace(model, 0.1, **limits, **delay)
+    plant = sampled_plant(model, 0.1, **limits, **delay)
     found = certificate_of(plant, CONTRACT, "polytope")
     assert verify_again(found, plant).valid
     P, rng = found.polytope, np.random.default_rng(0)
     names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "disturbance": AdversarialDisturbance()}
     for mode in ("project", "lookahead"):
-        env = VectorSafetyShield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=30, **names), found, mode)
+        env = vector_shield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=30, **names), found, mode)
         _, info = env.reset(seed=1)
         seen = info["shield_guaranteed"].copy()
         for k in range(80):
@@ -306,7 +296,7 @@ def test_published_plant_keeps_its_limits_under_attack(name):
         env = gym.make_vec(
             "ncs_gym/LinearNCS-v0", num_envs=100, disturbance=AdversarialDisturbance(rows=P.rows), **names
         )
-        shield = VectorSafetyShield(env, found, mode)
+        shield = vector_shield(env, found, mode)
         starts = P.center + 0.5 * (P.sample_boundary(rng, 100) - P.center)
         _, info = shield.reset(seed=0, options={"state": starts})
         assert info["shield_guaranteed"].mean() > 0.5
@@ -322,7 +312,7 @@ def test_published_plant_keeps_its_limits_under_attack(name):
 
 def test_ellipsoid_is_not_kept_by_an_input_that_rests_elsewhere_even_where_that_moves_nothing():
     """Of two inputs that do the same, opposite ones move nothing, and saturate the fallback."""
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[1.02, 0.1], [0.0, 0.99]],
         B=[[0.0, 0.0], [0.1, 0.1]],
         dt=0.1,
@@ -352,7 +342,7 @@ def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
 
 def test_operating_point_that_a_disturbance_moves_is_told():
     with pytest.warns(MovedOperatingPointWarning, match=r"deviations are counted from the state \[.*\] and the input"):
-        LinearPlant(
+        linear_plant(
             A=[[0.9]], B=[[0.2]], dt=1.0, box=1.0, u_max=1.0, disturbance_bound=([[1.0]], [0.0], [0.02]), **QUIET
         )
 
@@ -360,7 +350,7 @@ def test_operating_point_that_a_disturbance_moves_is_told():
 def test_what_an_offset_lacks_of_an_equilibrium_by_rounding_is_in_the_bound():
     state, A, B = 101325.0, 0.5, 0.25
     offset = (1.0 - A) * state * (1.0 + 5e-13)
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[A]],
         B=[[B]],
         dt=1.0,
@@ -393,7 +383,7 @@ def test_resting_state_is_taken_where_it_is_one():
     ):
         with pytest.raises(ValueError, match=words):
             synthesize(plant, contract=CONTRACT, resting_state=wrong)
-    rough = replace(plant, disturbance_bound=0.3)
+    rough = altered(plant, disturbance_bound=0.3)
     with pytest.raises(Infeasible, match="this is around the resting_state that was given"):
         synthesize(rough, contract=CONTRACT, resting_state=state)
     with pytest.raises(ValueError, match="resting_state is given"):
@@ -406,7 +396,7 @@ def test_offset_and_a_disturbance_with_two_ends_may_both_be_given():
     for low in (-0.1, -0.02):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MovedOperatingPointWarning)
-            plant = LinearPlant(**settings, **limits, disturbance_bound=([[1.0]], [low], [0.1]))
+            plant = linear_plant(**settings, **limits, disturbance_bound=([[1.0]], [low], [0.1]))
         assert plant.disturbance.shape_matrix[0, 0] >= (0.5 * (0.1 - low)) ** 2
 
 
@@ -414,20 +404,20 @@ def test_share_of_the_largest_ellipsoid_is_said_of_boxes_with_a_center_alone():
     quiet = {"u_max": 1.0, "dt": 1.0, "disturbance_bound": 0.001, "sensor_bound": 0.002, "initial_bound": 0.005}
     one, two = {"A": [[0.9]], "B": [[0.1]]} | quiet, {"A": np.diag([0.9, 0.8]), "B": 0.2 * np.eye(2)} | quiet
     for plant in (
-        LinearPlant(**one, state_limits=(-0.7, np.inf)),
-        LinearPlant(**two, state_limits=(-1.0, 1.0), output_limits=[([1.0, 1.0], -1.9, 0.1)]),
+        linear_plant(**one, state_limits=(-0.7, np.inf)),
+        linear_plant(**two, state_limits=(-1.0, 1.0), output_limits=[([1.0, 1.0], -1.9, 0.1)]),
     ):
         assert "volume_of_box_ellipsoid" not in synthesize(plant).provenance
-    aside = synthesize(LinearPlant(**one, state_limits=(-0.7, 2.1)))
+    aside = synthesize(linear_plant(**one, state_limits=(-0.7, 2.1)))
     half = np.sqrt(aside.L[0, 0])  # of the largest ellipsoid, an interval, 1.4
     assert aside.provenance["volume_of_box_ellipsoid"] == pytest.approx(half / 1.4, rel=1e-3)
 
 
 def test_other_half_widths_of_a_plant_with_two_ends_are_symmetric():
-    plant = LinearPlant(A=[[0.9]], B=[[0.1]], state_limits=(-0.7, 2.1), u_max=1.0, dt=1.0, disturbance_bound=0.01)
-    assert replace(plant, gamma=0.0).box_ends.tolist() == plant.box_ends.tolist()
-    assert (replace(plant, box=[1.0]).box_low, replace(plant, box=[1.0]).box_high) == (-1.0, 1.0)
-    aside = replace(plant, box=[1.0], box_ends=[[-0.5], [1.5]])  # given together
+    plant = linear_plant(A=[[0.9]], B=[[0.1]], state_limits=(-0.7, 2.1), u_max=1.0, dt=1.0, disturbance_bound=0.01)
+    assert altered(plant, gamma=0.0).box_ends.tolist() == plant.box_ends.tolist()
+    assert (altered(plant, box=[1.0]).box_low, altered(plant, box=[1.0]).box_high) == (-1.0, 1.0)
+    aside = altered(plant, box=[1.0], box_ends=[[-0.5], [1.5]])  # given together
     assert (aside.box_low, aside.box_high) == (-0.5, 1.5)
 
 
@@ -443,7 +433,7 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
 
 def test_state_that_only_follows_needs_no_limit():
     """It decays by itself: whatever a regulator does, it may be as large as it likes."""
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[1.02, 0.0], [0.05, 0.9]],
         B=[[0.1], [0.0]],
         dt=0.1,

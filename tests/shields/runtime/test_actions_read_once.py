@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
 
-from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv, truck_trailer
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
+from ncs_gym import Ellipsoid, truck_trailer
 from tests.certificates import certificate_of
+from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 from tests.shields.attacks.cases import CHANNELS
 
 PLANT = truck_trailer(mass=4000.0)
@@ -16,15 +16,15 @@ COUNT = 3
 
 def scalar(wrapper=lambda env: env, mode="project"):
     S = certificate_of(PLANT).safe_set
-    env = NCSEnv(PLANT, CHANNELS["perfect"], initial_set=Ellipsoid(0.9 * S.shape_matrix), disturbance="adversarial")
-    return SafetyShield(wrapper(env), certificate_of(PLANT), mode)
+    env = loop_env(PLANT, CHANNELS["perfect"], initial_set=Ellipsoid(0.9 * S.shape_matrix), disturbance="adversarial")
+    return safety_shield(wrapper(env), certificate_of(PLANT), mode)
 
 
 def vector(wrapper=lambda env: env, mode="project"):
     S = certificate_of(PLANT).safe_set
     settings = {"initial_set": Ellipsoid(0.9 * S.shape_matrix), "disturbance": "adversarial"}
-    env = NCSVectorEnv(COUNT, plant=PLANT, channel=CHANNELS["perfect"], **settings)
-    return VectorSafetyShield(wrapper(env), certificate_of(PLANT), mode)
+    env = vector_env(COUNT, plant=PLANT, channel=CHANNELS["perfect"], **settings)
+    return vector_shield(wrapper(env), certificate_of(PLANT), mode)
 
 
 class Shifting:
@@ -79,7 +79,7 @@ def test_action_that_another_thread_writes_into_is_applied_as_it_was_tested(shie
 
 def test_what_a_filter_and_a_loop_were_given_may_be_written_into_afterwards():
     certificate = certificate_of(PLANT)
-    shield, loop = SafetyFilter(certificate, PLANT), SafeLoop(certificate, PLANT, CHANNELS["perfect"])
+    shield, loop = safety_filter(certificate, PLANT), safe_loop(certificate, PLANT, CHANNELS["perfect"])
     estimate, proposed, shape, told = np.zeros(2), np.ones(1), 0.1 * certificate.Sigma, np.ones(1)
     errors, decision = shield.errors_of(shape), shield.decide(estimate, shape, proposed)
     shape[:], estimate[:], proposed[:] = 0.0, 9.0, 4.0

@@ -7,39 +7,32 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    BrokenContractWarning,
-    Channel,
-    ChannelContract,
-    NCSEnv,
-    NCSVectorEnv,
-    RandomChannel,
-    VectorRandomChannel,
-    cart_pole,
-)
-from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
+from ncs_gym import BrokenContractWarning, Channel, ChannelContract, RandomChannel, VectorRandomChannel, cart_pole
+from shields import GuaranteeLostWarning
+from tests import product
 from tests.certificates import certificate_of
 from tests.plants import small
+from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT, CONTRACT = cart_pole(), ChannelContract(4)
 DOWNLINK = Channel(loss=0.2, delay=1, max_consecutive_losses=2)  # c = 3
 
 
 def loop(channel, downlink):
-    return SafeLoop(certificate_of(PLANT, CONTRACT), PLANT, channel, downlink=downlink)
+    return safe_loop(certificate_of(PLANT, CONTRACT), PLANT, channel, downlink=downlink)
 
 
 def shield(channel, downlink):
-    env = NCSEnv(PLANT, channel, contract=CONTRACT, downlink=downlink)
-    return SafetyShield(env, certificate_of(PLANT, CONTRACT))
+    env = loop_env(PLANT, channel, contract=CONTRACT, downlink=downlink)
+    return safety_shield(env, certificate_of(PLANT, CONTRACT))
 
 
-def vector_shield(channel, downlink):
-    env = NCSVectorEnv(num_envs=2, plant=PLANT, channel=channel, contract=CONTRACT, downlink=downlink)
-    return VectorSafetyShield(env, certificate_of(PLANT, CONTRACT))
+def many_shields(channel, downlink):
+    env = vector_env(num_envs=2, plant=PLANT, channel=channel, contract=CONTRACT, downlink=downlink)
+    return vector_shield(env, certificate_of(PLANT, CONTRACT))
 
 
-@pytest.mark.parametrize("make", [loop, shield, vector_shield])
+@pytest.mark.parametrize("make", [loop, shield, many_shields])
 @pytest.mark.parametrize(
     ("channel", "downlink", "words"),
     [
@@ -52,7 +45,7 @@ def vector_shield(channel, downlink):
 def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, channel, downlink, words):
     with pytest.warns(BrokenContractWarning, match=words) as caught:
         make(channel, downlink)
-    assert [each.filename for each in caught] == [__file__]
+    assert [each.filename for each in caught] == [product.__file__]
 
 
 @pytest.mark.parametrize(
@@ -62,9 +55,9 @@ def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, 
         (Channel(quantization_step=0.01, delay=5), "become 5 steps old, but .* in all, and it rounds .* to 0.01, but"),
     ],
 )
-@pytest.mark.parametrize("make", [NCSEnv, NCSVectorEnv])
+@pytest.mark.parametrize("make", [loop_env, vector_env])
 def test_rounding_that_the_contract_does_not_allow_is_pointed_out(make, channel, words):
-    many, shielded = ((2,), VectorSafetyShield) if make is NCSVectorEnv else ((), SafetyShield)
+    many, shielded = ((2,), vector_shield) if make is vector_env else ((), safety_shield)
     promised = replace(channel, max_consecutive_losses=0)
     env = make(*many, plant=PLANT, channel=promised)  # whose contract is that of its channel
     with pytest.warns(BrokenContractWarning, match=words) as caught:
@@ -72,7 +65,7 @@ def test_rounding_that_the_contract_does_not_allow_is_pointed_out(make, channel,
     assert len([each for each in caught if each.category is BrokenContractWarning]) == 1
 
 
-@pytest.mark.parametrize("make", [loop, shield, vector_shield])
+@pytest.mark.parametrize("make", [loop, shield, many_shields])
 @pytest.mark.parametrize(
     ("channel", "downlink"),
     [
@@ -115,16 +108,16 @@ def test_real_loop_behind_a_downlink_counts_what_its_uplink_promises():
 def test_real_loop_points_out_losses_that_break_the_contract(channel, words):
     with pytest.warns(BrokenContractWarning, match=words) as caught:
         loop(channel, None)
-    assert [each.filename for each in caught] == [__file__]
+    assert [each.filename for each in caught] == [product.__file__]
 
 
 def test_certificate_of_the_registered_contract_is_compared_with_the_channel_asked_for():
     env = gym.make("ncs_gym/CartPole-v0", channel=Channel(delay=9))
     with pytest.warns(BrokenContractWarning, match="become 9 steps old"):
-        SafetyShield(env, certificate_of(env.unwrapped.plant, env.unwrapped.contract))
+        safety_shield(env, certificate_of(env.unwrapped.plant, env.unwrapped.contract))
 
 
-@pytest.mark.parametrize("make", [shield, vector_shield])
+@pytest.mark.parametrize("make", [shield, many_shields])
 def test_channel_of_an_episode_that_breaks_the_contract_is_pointed_out_once(make):
     env, late = make(Channel(), None), Channel(delay=9)
     for _ in range(2):
@@ -142,17 +135,17 @@ def test_shield_keeps_its_guarantee_over_drawn_channels_and_says_where_it_is_los
     fitting = [Channel(), Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(delay=4, quantization_step=0)]
 
     def shielded(env, vector):
-        drawn, safe = (VectorRandomChannel, VectorSafetyShield) if vector else (RandomChannel, SafetyShield)
+        drawn, safe = (VectorRandomChannel, vector_shield) if vector else (RandomChannel, safety_shield)
         certificate = certificate_of(PLANT, CONTRACT)
         return drawn(safe(env, certificate), fitting) if outside else safe(drawn(env, fitting), certificate)
 
-    many = shielded(NCSVectorEnv(8, plant=PLANT, contract=CONTRACT, max_episode_steps=20), vector=True)
+    many = shielded(vector_env(8, plant=PLANT, contract=CONTRACT, max_episode_steps=20), vector=True)
     many.reset(seed=0)
     for _ in range(100):
         info = many.step(many.action_space.sample())[4]
         assert info["shield_guaranteed"].all()
         assert not info["cost"].any()
-    one = shielded(NCSEnv(PLANT, contract=CONTRACT), vector=False)
+    one = shielded(loop_env(PLANT, contract=CONTRACT), vector=False)
     for seed in range(6):
         one.reset(seed=seed)
         assert all(one.step(one.action_space.sample())[4]["shield_guaranteed"] for _ in range(20))
@@ -165,7 +158,7 @@ def test_environment_of_a_stable_plant_without_the_contract_of_the_certificate_i
     plant, channel = small(0.5 * np.eye(2)), Channel(delay=1)
     certificate = certificate_of(plant, ChannelContract(max_age=1), "polytope")
     for make in (gym.make, gym.make_vec):
-        shield = SafetyShield if make is gym.make else VectorSafetyShield
+        shield = safety_shield if make is gym.make else vector_shield
         env = make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel)
         with pytest.warns(BrokenContractWarning, match=r"made without one.*contract=ChannelContract\(max_age=1"):
             shield(env, certificate)

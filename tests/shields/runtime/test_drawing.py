@@ -7,14 +7,14 @@ import pytest
 from gymnasium.wrappers import RecordVideo
 
 from ncs_gym.rendering import theme
-from shields import SafetyShield
+from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 FULL_THROTTLE = np.ones(1, np.float32)
 
 
 def shielded(certificate, mode="project", render_mode="rgb_array"):
-    env = SafetyShield(gym.make(CRUISE, render_mode=render_mode), certificate, mode=mode)
+    env = safety_shield(gym.make(CRUISE, render_mode=render_mode), certificate, mode=mode)
     env.reset(seed=0)
     return env
 
@@ -90,9 +90,9 @@ def test_record_video_works_on_either_side_of_the_shield(certificate, tmp_path, 
     folder = str(tmp_path / "videos")
     env = gym.make(CRUISE, render_mode="rgb_array")
     if outside:
-        env = RecordVideo(SafetyShield(env, certificate), folder, video_length=4)
+        env = RecordVideo(safety_shield(env, certificate), folder, video_length=4)
     else:
-        env = SafetyShield(RecordVideo(env, folder, video_length=4), certificate)
+        env = safety_shield(RecordVideo(env, folder, video_length=4), certificate)
     env.reset(seed=0)
     for _ in range(5):
         env.step(FULL_THROTTLE)

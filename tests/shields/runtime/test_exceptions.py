@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
 
-from ncs_gym import Channel, NCSEnv, NCSVectorEnv, Packet, truck_trailer
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
+from ncs_gym import Channel, Packet, truck_trailer
+from shields import VectorSafetyShield
 from shields.runtime.backup_plans import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
+from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 MODES = ["project", "lookahead"]
@@ -59,8 +60,8 @@ def stopped(*_, **__):
 
 def shield_of(kind, mode):
     if kind == "one":
-        return SafetyShield(RaisingOne(NCSEnv(PLANT)), certificate_of(PLANT), mode)
-    return VectorSafetyShield(RaisingMany(NCSVectorEnv(3, plant=PLANT)), certificate_of(PLANT), mode)
+        return safety_shield(RaisingOne(loop_env(PLANT)), certificate_of(PLANT), mode)
+    return vector_shield(RaisingMany(vector_env(3, plant=PLANT)), certificate_of(PLANT), mode)
 
 
 @pytest.mark.parametrize("raised", RAISED)
@@ -128,7 +129,7 @@ class StopsWhoAsks:
 @pytest.mark.parametrize("name", ["decide", "advance", "begin"])
 @pytest.mark.parametrize("mode", MODES)
 def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypatch):
-    loop = SafeLoop(certificate_of(PLANT), PLANT, Channel(delay=1), mode)
+    loop = safe_loop(certificate_of(PLANT), PLANT, Channel(delay=1), mode)
     loop.start(np.zeros(2))
     loop.step(0.1)
     loop.receive([Packet(1, np.zeros(2))])
@@ -182,9 +183,9 @@ def test_solver_that_does_not_come_to_its_end_has_no_answer_and_is_not_asked_aga
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor", "lookahead"])
 def test_what_numpy_is_told_to_raise_does_not_stop_a_step(mode):
     certificate = certificate_of(PLANT)
-    shields = [SafetyShield(NCSEnv(PLANT), certificate, mode)]
-    shields.append(VectorSafetyShield(NCSVectorEnv(2, plant=PLANT), certificate, mode))
-    loop, shield = SafeLoop(certificate, PLANT, Channel(delay=1), mode), SafetyFilter(certificate, PLANT, mode)
+    shields = [safety_shield(loop_env(PLANT), certificate, mode)]
+    shields.append(vector_shield(vector_env(2, plant=PLANT), certificate, mode))
+    loop, shield = safe_loop(certificate, PLANT, Channel(delay=1), mode), safety_filter(certificate, PLANT, mode)
     for each in (*shields, loop):
         each.start(np.zeros(2)) if each is loop else each.reset(seed=0)
     with np.errstate(all="raise"):
@@ -215,7 +216,7 @@ def episodes(env, seed):
 def test_environments_in_threads_go_as_alone(mode):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        made = [SafetyShield(gym.make(ID), mode=mode), VectorSafetyShield(gym.make_vec(ID, num_envs=5), mode=mode)]
+        made = [safety_shield(gym.make(ID), mode=mode), vector_shield(gym.make_vec(ID, num_envs=5), mode=mode)]
     envs = [deepcopy(made[number % 2]) for number in range(8)]
     with ThreadPoolExecutor(8) as pool:
         answers = list(pool.map(episodes, envs, range(8)))

@@ -5,29 +5,24 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Channel,
-    ChannelContract,
-    LinearPlant,
-    NCSVectorEnv,
-    batch_reactor,
-    bound_violation_probability,
-    cart_pole,
-    truck_trailer,
-)
-from shields import VectorSafetyShield
+from ncs_gym import Channel, ChannelContract, batch_reactor, bound_violation_probability, cart_pole, truck_trailer
 from shields.runtime.guarantee import ALARM
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
+from tests.product import library_plant, linear_plant, vector_env, vector_shield
 from tests.shields.attacks.adversary import gauges
 
 # So large a delta that draws leave their ellipsoids all the time.
 WILD = 0.97
 LOOPS = {
-    "truck": (truck_trailer(mass=4000.0, delta=WILD), None, Channel(loss=0.3, send_period=2, delay=2)),
-    "cart-pole": (cart_pole(delta=WILD), ChannelContract(4), Channel(loss=0.6, max_consecutive_losses=2, jitter=2)),
+    "truck": (library_plant(truck_trailer, mass=4000.0, delta=WILD), None, Channel(loss=0.3, send_period=2, delay=2)),
+    "cart-pole": (
+        library_plant(cart_pole, delta=WILD),
+        ChannelContract(4),
+        Channel(loss=0.6, max_consecutive_losses=2, jitter=2),
+    ),
     "batch reactor": (
-        batch_reactor(delta=WILD),
+        library_plant(batch_reactor, delta=WILD),
         ChannelContract(3),
         Channel(loss=1.0, max_consecutive_losses=2, delay=1),
     ),
@@ -42,7 +37,7 @@ LOOPS = {
 def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
     plant, contract, channel = LOOPS[name]
     settings = {"channel": channel, "contract": contract, "noise": "gaussian", "max_episode_steps": 60}
-    shield = VectorSafetyShield(NCSVectorEnv(20, plant=plant, **settings), certificate_of(plant, contract), mode=mode)
+    shield = vector_shield(vector_env(20, plant=plant, **settings), certificate_of(plant, contract), mode=mode)
     shield.reset(seed=0)
     escaped, alarms, reasons, rng = False, 0, set(), np.random.default_rng(0)
     for _ in range(80):
@@ -66,8 +61,8 @@ def tight_plant(delta):
     """A plant whose safe box is 2 % wider than the bound that a level delta gives to its noise."""
     declared = {"u_max": 1.0, "dt": 0.1, "process_noise_cov": [[0.1]], "sensor_bound": 1e-3, "initial_bound": 1e-3}
     declared |= {"A": [[0.01]], "B": [[1e-3]], "delta": delta}
-    radius = np.sqrt(LinearPlant(box=[1.0], **declared).disturbance.shape_matrix[0, 0])
-    return LinearPlant(box=[1.02 * radius], **declared)
+    radius = np.sqrt(linear_plant(box=[1.0], **declared).disturbance.shape_matrix[0, 0])
+    return linear_plant(box=[1.02 * radius], **declared)
 
 
 @cache
@@ -75,8 +70,8 @@ def share_of_exits(delta, noise):
     """The share of episodes whose state leaves S, under random proposals; episodes begin in S."""
     plant = tight_plant(delta)
     certificate = certificate_of(plant)
-    env = NCSVectorEnv(COUNT, plant=plant, channel=Channel(loss=0.3), noise=noise, max_episode_steps=None)
-    shield, rng = VectorSafetyShield(env, certificate), np.random.default_rng(0)
+    env = vector_env(COUNT, plant=plant, channel=Channel(loss=0.3), noise=noise, max_episode_steps=None)
+    shield, rng = vector_shield(env, certificate), np.random.default_rng(0)
     _, info = shield.reset(seed=0)
     assert info["shield_guaranteed"].all()
     outside = np.zeros(COUNT, np.bool_)

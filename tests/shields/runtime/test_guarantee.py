@@ -7,10 +7,11 @@ import pytest
 from ncs_gym import Channel, Packet
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
-from shields import Decision, SafeLoop, SafetyFilter, certificate_for
+from shields import Decision, SafetyFilter, certificate_for
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
+from tests.product import safe_loop, safety_filter
 from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 
@@ -65,7 +66,7 @@ def decision(passed, fallback):
 def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(name):
     plant, count, rng = (TRUCKS | RANDOM)[name], 200, np.random.default_rng(0)
     certificate = certificate_of(plant)
-    shield, Sigma = SafetyFilter(certificate, plant), certificate.Sigma
+    shield, Sigma = safety_filter(certificate, plant), certificate.Sigma
     monitor, references = GuaranteeMonitor(shield), [Reference(shield) for _ in range(count)]
     shapes = np.array([0.2 * Sigma, Sigma, 1.1 * Sigma, -Sigma, 1e5 * np.eye(plant.n), np.full_like(Sigma, np.nan)])
     known = shield.errors_of_many(shapes)
@@ -116,7 +117,7 @@ def test_a_guarantee_that_returned_lasts_while_the_contract_is_kept(gaps):
     env = gym.make("ncs_gym/BatchReactor-v0").unwrapped
     plant, contract = env.plant, env.certificate_contract
     channel = Channel(quantization_step=contract.quantization_step)
-    loop = SafeLoop(certificate_for(plant, contract), plant, channel, mode="switch", on_unproved="ignore")
+    loop = safe_loop(certificate_for(plant, contract), plant, channel, mode="switch", on_unproved="ignore")
     loop.start(np.zeros(plant.n), initial_set=np.zeros(plant.n))
     times = np.cumsum([*[1] * 6, 6, *gaps, *[2] * 20]).tolist()
     x, held, returned = np.zeros(plant.n), True, 0

@@ -7,25 +7,26 @@ import pytest
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from agents import LoopConfig, ShieldSettings
-from ncs_gym import Channel, NCSEnv, NCSVectorEnv, truck_trailer
-from shields import GuaranteeLostError, GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
+from ncs_gym import Channel, truck_trailer
+from shields import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
 from tests.certificates import certificate_of
+from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 OUTSIDE = 0.99 / np.abs(PLANT.box_rows).max(axis=0)
 
 
 def scalar(**settings):
-    return SafetyShield(NCSEnv(PLANT), certificate_of(PLANT), **settings)
+    return safety_shield(loop_env(PLANT), certificate_of(PLANT), **settings)
 
 
 def vector(**settings):
-    return VectorSafetyShield(NCSVectorEnv(3, plant=PLANT), certificate_of(PLANT), **settings)
+    return vector_shield(vector_env(3, plant=PLANT), certificate_of(PLANT), **settings)
 
 
 def loop(**settings):
-    return SafeLoop(certificate_of(PLANT), PLANT, Channel(), **settings)
+    return safe_loop(certificate_of(PLANT), PLANT, Channel(), **settings)
 
 
 def still(shield):
@@ -100,8 +101,8 @@ def test_guarantee_lost_in_the_last_step_of_an_episode_is_said_though_the_next_h
         def step(self, actions):
             return self.env.step(0.5 * actions)
 
-    env = NCSVectorEnv(2, plant=PLANT, max_episode_steps=1, autoreset_mode=AutoresetMode.SAME_STEP)
-    shield = VectorSafetyShield(Halves(env), certificate_of(PLANT))
+    env = vector_env(2, plant=PLANT, max_episode_steps=1, autoreset_mode=AutoresetMode.SAME_STEP)
+    shield = vector_shield(Halves(env), certificate_of(PLANT))
     shield.reset(seed=0)
     (text, _), *others = said(lambda: shield.step(np.full(shield.action_space.shape, 0.01, np.float32)))
     assert OTHER_INPUT in text

@@ -1,15 +1,14 @@
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import SafetyFilter
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.product import altered, safety_filter
 from tests.shields.edges import edge_of
 
 PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
@@ -226,7 +225,7 @@ def test_one_state_leaves_nothing_to_be_sharper_about():
 def test_bounds_on_rounding_hold_column_by_column():
     # A plant whose states differ much in size, and a disturbance that is far from the unit ball of the safe set.
     A = np.array([[0.5, 40.0, 0.0], [0.0, 0.4, -300.0], [0.0, 0.0, 0.3]])
-    plant = replace(random_plant(3, 3, 2), A=A)
+    plant = altered(random_plant(3, 3, 2), A=A)
     L = np.diag([4.0, 9.0, 1.0]) + 0.5
     test = ellipsoid_test(L, plant)
     G, D = np.abs(test.root), plant.disturbance.shape_matrix
@@ -264,7 +263,7 @@ def test_error_shapes_are_enlarged_by_the_rounding_of_moving_them():
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
     plant = PLANTS[key]
-    shield = SafetyFilter(certificate_of(plant), plant)
+    shield = safety_filter(certificate_of(plant), plant)
     still, u = np.zeros((plant.n, 1)), np.zeros(plant.m)
     # An error ellipsoid whose h is 5e-6 below 1.
     shape = edge_of(lambda size: shield.errors_of(size * np.eye(plant.n)).radius > 5e-6, 1e6, 80) * np.eye(plant.n)

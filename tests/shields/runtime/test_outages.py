@@ -11,7 +11,6 @@ from ncs_gym import (
     ChannelContract,
     Command,
     Ellipsoid,
-    LinearPlant,
     Packet,
     cart_pole,
     certified_error_set,
@@ -19,7 +18,6 @@ from ncs_gym import (
 )
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.processes import nonlinear_cart_pole
-from shields import SafeLoop
 from shields.runtime.guarantee import (
     ALARM,
     LATE_INPUT,
@@ -29,6 +27,7 @@ from shields.runtime.guarantee import (
     UNKNOWN_START,
 )
 from tests.certificates import certificate_of
+from tests.product import safe_loop, sampled_plant
 
 PLANT = cart_pole()
 UPLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=1)
@@ -37,7 +36,7 @@ DOWNLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=1)  # c = 2
 
 def loop_with(echo_age=4, downlink=DOWNLINK, plant=PLANT, contract=4, **settings):
     certificate = certificate_of(plant, None if contract is None else ChannelContract(contract))
-    return SafeLoop(certificate, plant, UPLINK, downlink=downlink, echo_age=echo_age, **settings)
+    return safe_loop(certificate, plant, UPLINK, downlink=downlink, echo_age=echo_age, **settings)
 
 
 class World:
@@ -261,8 +260,8 @@ def test_state_that_many_samples_tell_is_found_on_a_channel_of_any_delay(delay, 
     limits = {"state_limits": ([0.2, 0.3], [2.0, 2.2]), "input_limits": (0.0, 1.0)}
     bounds = {"disturbance_bound": [0.01, 0.002], "sensor_bound": 0.02, "initial_bound": 0.02}
     point = {"operating_state": [1.2, 1.5], "operating_input": 0.5}
-    plant = LinearPlant.from_statespace(model, dt=1.0, **limits, **bounds, **point)
-    loop = SafeLoop(certificate_of(plant, safe_set="polytope"), plant, Channel(delay=delay), on_unproved="ignore")
+    plant = sampled_plant(model, dt=1.0, **limits, **bounds, **point)
+    loop = safe_loop(certificate_of(plant, safe_set="polytope"), plant, Channel(delay=delay), on_unproved="ignore")
     rng, x, arrived, proved = np.random.default_rng(delay), np.array([0.3, -0.2]), [], []
     loop.start(np.zeros(2), known=False)
     for step in range(30):
@@ -284,7 +283,7 @@ def test_state_that_many_samples_tell_is_found_on_a_channel_of_any_delay(delay, 
 @pytest.mark.parametrize("apart", [0, 1, 3])
 def test_two_values_of_one_sample_end_the_guarantee_whether_the_start_is_known_or_not(known, apart, first):
     plant = truck_trailer(mass=4000.0)
-    loop = SafeLoop(certificate_of(plant), plant, Channel(delay=4), on_unproved="ignore")
+    loop = safe_loop(certificate_of(plant), plant, Channel(delay=4), on_unproved="ignore")
     loop.start(np.zeros(2), known=known)
     proved, arrivals = [], {}
     arrivals.setdefault(first + 1, []).append(Packet(first, np.zeros(2), loop.episode))
@@ -302,7 +301,7 @@ def test_two_values_of_one_sample_end_the_guarantee_whether_the_start_is_known_o
 
 def test_samples_of_before_an_unknown_input_tell_nothing_of_where_the_state_is():
     plant = truck_trailer(mass=4000.0)
-    loop = SafeLoop(certificate_of(plant), plant, Channel(jitter=5), on_unproved="ignore")
+    loop = safe_loop(certificate_of(plant), plant, Channel(jitter=5), on_unproved="ignore")
     x, unknown = np.zeros(2), None
     loop.start(np.zeros(2), known=False)
     for step in range(6):  # the only sample is of step 0, and nobody knows what acted since then

@@ -5,7 +5,6 @@ The plant swings once around within a step, so that ways leave the box between s
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import product
 from typing import Any, NamedTuple
@@ -14,14 +13,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Channel, LinearPlant, NCSEnv, NCSVectorEnv, Packet
+from ncs_gym import Channel, LinearPlant, Packet
 from ncs_gym.network import downlink_protocol
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 from tests.plants import swinging
+from tests.product import altered, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 
 KEEPING = ("project", "switch", "boundary", "lookahead")
 STEPS = 8
@@ -66,7 +65,7 @@ def settings(c: int) -> dict[str, Any]:
 
 
 def follow_wrapper(mode: str, kind: str, c: int, start: np.ndarray) -> Trace:
-    env = SafetyShield(NCSEnv(**settings(c)), certificate(kind), mode, on_unproved="ignore")
+    env = safety_shield(loop_env(**settings(c)), certificate(kind), mode, on_unproved="ignore")
     rng, trace = np.random.default_rng(0), Trace([], [], [])
     _, info = env.reset(seed=0, options={"state": start})
     for _ in range(STEPS):
@@ -78,9 +77,7 @@ def follow_wrapper(mode: str, kind: str, c: int, start: np.ndarray) -> Trace:
 
 
 def follow_vector(mode: str, kind: str, c: int, starts: np.ndarray) -> list[Trace]:
-    env = VectorSafetyShield(
-        NCSVectorEnv(num_envs=len(starts), **settings(c)), certificate(kind), mode, on_unproved="ignore"
-    )
+    env = vector_shield(vector_env(num_envs=len(starts), **settings(c)), certificate(kind), mode, on_unproved="ignore")
     rng, traces = np.random.default_rng(0), [Trace([], [], []) for _ in starts]
     _, info = env.reset(seed=0, options={"state": starts})
     for _ in range(STEPS):
@@ -110,7 +107,7 @@ def follow_loop(
     """
     plant, rng = swing(), np.random.default_rng(0)
     downlink = Channel(delay=c) if c else None
-    loop = SafeLoop(certificate(kind), plant, Channel(), mode, downlink=downlink, on_unproved="ignore")
+    loop = safe_loop(certificate(kind), plant, Channel(), mode, downlink=downlink, on_unproved="ignore")
     x, pending, trace, u = start, [np.zeros(1)] * c, Trace([], [], []), None
     given = {"initial_set": start} if known and exact else {}
     loop.start(start if guess is None else guess, known=known, **given)
@@ -218,8 +215,8 @@ def as_the_table_says(proofs: np.ndarray, c: int, on_grid: bool) -> np.ndarray:
 @pytest.mark.parametrize("c", [0, 1, 2, 3])
 @pytest.mark.parametrize("points", [None, 32])
 def test_flags_are_those_of_the_table_for_every_sequence_of_proofs(points, c):
-    plant = swing() if points else replace(swing(), between_samples=None)
-    shield = SafetyFilter(certificate_of(plant), plant, "switch")
+    plant = swing() if points else altered(swing(), between_samples=None)
+    shield = safety_filter(certificate_of(plant), plant, "switch")
     protocol = downlink_protocol(Channel(delay=c) if c else None, None)
     monitor, steps = GuaranteeMonitor(shield, protocol), 4
     proofs = np.array(list(product((NOTHING, ESTIMATE, DECISION), repeat=steps + c))).T

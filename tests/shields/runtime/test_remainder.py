@@ -4,16 +4,26 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, LinearPlant, NCSEnv, Remainder
-from shields import Infeasible, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
+from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Remainder
+from shields import Infeasible
 from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
 from tests.plants import with_remainder
+from tests.product import (
+    family_of,
+    linear_plant,
+    loop_env,
+    safety_filter,
+    safety_shield,
+    sampled_plant,
+    synthesize,
+    vector_shield,
+)
 
 COMMON = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1}
 COMMON |= {"sensor_bound": 0.001, "initial_bound": 0.001}
 BOUND = Ellipsoid(1e-4 * np.eye(2))
-EXACT = LinearPlant(**COMMON, disturbance_bound=BOUND)
+EXACT = linear_plant(**COMMON, disturbance_bound=BOUND)
 LEFT_OUT = Remainder(BOUND, False, "an example")
 LOCAL = with_remainder()
 LINEAR = "ncs_gym/LinearNCS-v0"
@@ -23,14 +33,12 @@ def late(steps, remainder=LEFT_OUT):
     """The same plant, whose inputs take effect some steps later."""
     bounds = {"disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
     model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
-    return LinearPlant.from_statespace(
-        model, box=[1.0, 1.0], u_max=1.0, input_delay=steps, remainder=remainder, **bounds
-    )
+    return sampled_plant(model, box=[1.0, 1.0], u_max=1.0, input_delay=steps, remainder=remainder, **bounds)
 
 
 def reasons(plant, start, mode="monitor", **settings):
     """Why the proof does not hold, step by step, while the state decays."""
-    env = SafetyShield(NCSEnv(plant, **settings), certificate_of(plant), mode)
+    env = safety_shield(loop_env(plant, **settings), certificate_of(plant), mode)
     _, info = env.reset(seed=0, options={"state": np.asarray(start)})
     seen = [info["shield_reason"]]
     for _ in range(40):
@@ -97,7 +105,7 @@ def test_inputs_under_way_beyond_their_limits_are_outside_the_model(downlink):
 
 def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_the_model():
     plant = late(1)
-    shield = SafetyFilter(certificate_of(plant), plant)
+    shield = safety_filter(certificate_of(plant), plant)
     for error, reason in ((0.0, ""), (0.009, ""), (0.011, LEFT_MODEL)):
         errors = shield.errors_of(np.diag([1e-12, 1e-12, error**2]))
         for last in (0.99, -0.99):
@@ -108,7 +116,7 @@ def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_
 
 @pytest.mark.slow
 def test_remainder_that_the_box_cannot_bear_is_named():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[1.2]],
         B=[[1.0]],
         box=[1.0],
@@ -126,10 +134,10 @@ def test_remainder_that_the_box_cannot_bear_is_named():
 def test_family_that_the_box_cannot_bear_is_told_what_share_of_its_radii_would_do():
     def furnace(loss):
         bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.02, "initial_bound": 0.02}
-        return LinearPlant(A=[[1.0 - 0.1 * loss]], B=[[0.05]], dt=0.1, box=[1.0], u_max=2.0, **bounds)
+        return linear_plant(A=[[1.0 - 0.1 * loss]], B=[[0.05]], dt=0.1, box=[1.0], u_max=2.0, **bounds)
 
     with pytest.raises(Infeasible, match=r"radii shrink to 13\.\d% of those given"):
-        synthesize(LinearPlant.family(furnace, {"loss": (-6.0, 8.0)}, monotone=True))
+        synthesize(family_of(furnace, {"loss": (-6.0, 8.0)}, monotone=True))
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -137,14 +145,14 @@ def test_a_step_that_no_measurement_shows_is_no_measurement(many):
     """Two states apart from each other; only the first is measured, and the process differs in the second alone."""
     bounds = {"disturbance_bound": [0.01, 0.02], "sensor_bound": [0.01], "initial_bound": [0.05, 0.02]}
     model = {"A": np.diag([0.9, 0.8]), "B": [[0.1], [0.1]], "H": [[1.0, 0.0]], "dt": 1.0, "box": 1.0, "u_max": 2.0}
-    plant = LinearPlant(**model, **bounds)
+    plant = linear_plant(**model, **bounds)
     process = FunctionProcess(lambda x, u: plant.A @ x + plant.B @ u + [0.0, 0.3])
     given = {"plant": plant, "process": process, "allow_assumption_violation": True}
     certificate = synthesize(plant)
     if many:
-        env = VectorSafetyShield(gym.make_vec(LINEAR, num_envs=2, **given), certificate, on_unproved="ignore")
+        env = vector_shield(gym.make_vec(LINEAR, num_envs=2, **given), certificate, on_unproved="ignore")
     else:
-        env = SafetyShield(gym.make(LINEAR, **given), certificate, on_unproved="ignore")
+        env = safety_shield(gym.make(LINEAR, **given), certificate, on_unproved="ignore")
     env.reset(seed=0)
     info = env.step(np.zeros((2, 1) if many else 1, np.float32))[4]
     reason = info["shield_reason"][0] if many else info["shield_reason"]

@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Actuator,
-    Channel,
-    ChannelContract,
-    NCSVectorEnv,
-    Packet,
-    cart_pole,
-    lane_keeping,
-    truck_trailer,
-)
-from shields import SafeLoop, VectorSafetyShield
+from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole, lane_keeping, truck_trailer
 from tests.certificates import certificate_of
+from tests.product import safe_loop, vector_env, vector_shield
 
 PLANT = cart_pole()
 CHANNEL = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
@@ -25,7 +16,7 @@ DOWNLINK = Channel(0.5, delay=1, max_consecutive_losses=1)
 def test_commands_carry_requests_to_the_actuator():
     plant = truck_trailer(mass=4000.0)
     downlink = Channel(delay=1, loss=0.3, max_consecutive_losses=1)
-    loop = SafeLoop(certificate_of(plant), plant, Channel(0.2, on_request=True), downlink=downlink)
+    loop = safe_loop(certificate_of(plant), plant, Channel(0.2, on_request=True), downlink=downlink)
     actuator, requested = Actuator(loop.input_delay, 1), []
     assert actuator.requested  # nothing was heard
     loop.start(np.zeros(2))
@@ -44,7 +35,7 @@ def test_commands_carry_requests_to_the_actuator():
 
 def test_loop_asks_in_every_step_while_the_state_is_not_known():
     plant = truck_trailer(mass=4000.0)
-    loop = SafeLoop(certificate_of(plant), plant, Channel(on_request=True), on_unproved="ignore")
+    loop = safe_loop(certificate_of(plant), plant, Channel(on_request=True), on_unproved="ignore")
     loop.start(np.zeros(2), known=False)
     asked = []
     for step in range(4):
@@ -62,7 +53,7 @@ def test_loop_asks_in_every_step_while_the_state_is_not_known():
 )
 def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, contract):
     late = Channel(0.5, delay=4, max_consecutive_losses=1, quantization_step=1e-4, on_request=True)
-    loop = SafeLoop(certificate_of(plant, contract), plant, late, on_unproved="ignore")
+    loop = safe_loop(certificate_of(plant, contract), plant, late, on_unproved="ignore")
     rng, x, lost, packets, ages = np.random.default_rng(0), np.zeros(plant.n), False, {}, []
     loop.start(x, known=False)
     for step in range(60):
@@ -81,8 +72,8 @@ def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, con
 
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])
 def test_shield_keeps_its_set_whatever_is_asked_for(downlink):
-    env = NCSVectorEnv(40, plant=PLANT, channel=CHANNEL, contract=CONTRACT, downlink=downlink, disturbance="sphere")
-    shield, rng = VectorSafetyShield(env, certificate_of(PLANT, env.certificate_contract)), np.random.default_rng(0)
+    env = vector_env(40, plant=PLANT, channel=CHANNEL, contract=CONTRACT, downlink=downlink, disturbance="sphere")
+    shield, rng = vector_shield(env, certificate_of(PLANT, env.certificate_contract)), np.random.default_rng(0)
     shield.reset(seed=0)
     packets = 0
     for _ in range(150):

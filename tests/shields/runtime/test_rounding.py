@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, LinearPlant, NCSEnv
-from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
+from ncs_gym import Channel
+from shields import CertificateError, Infeasible
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.safety_filter import require_computable
 from shields.runtime.set_test import certified_root, ellipsoid_test
@@ -21,6 +21,7 @@ from shields.verification.rational_matrix import (
     subtract,
 )
 from tests.certificates import certificate_of, with_proof
+from tests.product import altered, linear_plant, loop_env, safety_filter, safety_shield, synthesize
 from tests.shields.edges import edge_of
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
@@ -48,9 +49,9 @@ def worst_disturbance(certificate, plant, x, u):
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10, 1e13])
 def test_passed_means_inside_however_far_out_the_estimate_is(size, count):
     # Estimates along a direction that A annihilates: products of huge numbers cancel.
-    plant = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
+    plant = linear_plant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
     certificate = certificate_of(plant)
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     *_, axes = np.linalg.svd(SINGULAR)
     passed, worst = 0, -1.0
     for _ in range(count):
@@ -75,7 +76,7 @@ def slanted(ratio):
     c, s = np.cos(0.6), np.sin(0.6)
     C = np.diag([1.0, ratio]) @ np.array([[c, s], [-s, c]])
     T, size = np.linalg.inv(C), (0.1 / ratio) ** 2
-    return LinearPlant(
+    return linear_plant(
         A=T @ np.array([[0.6, 0.2], [-0.1, 0.5]]) @ C,
         B=T @ np.array([[1.5], [1.2]]),
         box=C,
@@ -92,7 +93,7 @@ def slanted(ratio):
 def test_passed_means_inside_for_thin_safe_sets(ratio):
     plant = slanted(ratio)
     certificate = certificate_of(plant)
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     passed = 0
     for _ in range(300):
         x, shape = 1.2 * certificate.safe_set.sample(rng), 1e-12 * certificate.Sigma
@@ -173,7 +174,7 @@ def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded)
     # Such a gain cannot verify with these limits; a fault in the verifier must not be enough.
     monkeypatch.setattr("shields.runtime.safety_filter.require_valid", lambda *_: None)
     with pytest.raises(CertificateError, match="gain is too large"):
-        SafetyFilter(replace(certificate, K=1e9 * np.array([[1.0, -1.0]])), loaded)
+        safety_filter(replace(certificate, K=1e9 * np.array([[1.0, -1.0]])), loaded)
 
 
 def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loaded):
@@ -191,9 +192,9 @@ def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loa
 @pytest.mark.parametrize("name", ["singular", "slanted"])
 def test_error_lies_in_its_ellipsoid_exactly_when_rounding_is_all_there_is(name, first_error):
     # No noise but a disturbance of the user's that asks for all of E(D), from up to 60 half-widths out.
-    base = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=0.0)
-    plant = replace(base if name == "singular" else slanted(30.0), gamma=0.0, measurement_noise_cov=None)
-    plant = replace(plant, initial_cov=first_error**2 * np.eye(2))
+    base = linear_plant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=0.0)
+    plant = altered(base if name == "singular" else slanted(30.0), gamma=0.0, measurement_noise_cov=None)
+    plant = altered(plant, initial_cov=first_error**2 * np.eye(2))
     sign = [1.0]
 
     def everything(rng, plant, nominal_next):
@@ -201,7 +202,7 @@ def test_error_lies_in_its_ellipsoid_exactly_when_rounding_is_all_there_is(name,
         return sign[0] * plant.disturbance.extreme_point(plant.half_widths * [1.0, -1.0])
 
     for channel in (Channel(), Channel(loss=1.0), Channel(loss=0.5, delay=1)):
-        env = NCSEnv(plant, channel, disturbance=everything)
+        env = loop_env(plant, channel, disturbance=everything)
         for seed in range(2):
             far = plant.half_widths * np.random.default_rng(seed).uniform(-1, 1, 2) * (60.0 if seed % 2 else 0.9)
             _, info = env.reset(seed=seed, options={"state": far})
@@ -218,7 +219,7 @@ def test_error_lies_in_its_ellipsoid_exactly_when_rounding_is_all_there_is(name,
 
 @pytest.mark.parametrize("size", [3.0, 1e3, 1e8])
 def test_start_far_out_is_recovered_from_only_while_rounding_does_not_count(certificate, size):
-    env = SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
+    env = safety_shield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
     _, info = env.reset(seed=0, options={"state": np.array([size, 0.0])})
     assert info["shield_reason"] == (FAR_OUT if size > 100.0 else NOT_KNOWN_INSIDE)
     for _ in range(199):

@@ -17,10 +17,10 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from shields import SafeLoop
 from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from tests.certificates import certificate_of
+from tests.product import safe_loop
 from tests.shields.attacks.cases import TRUCKS
 
 # Plant, contract, channel.
@@ -32,7 +32,7 @@ LOOPS = {
 
 def loop_of(name, mode="project", channel=None):
     plant, contract, usual = LOOPS[name]
-    return SafeLoop(certificate_of(plant, contract), plant, usual if channel is None else channel, mode)
+    return safe_loop(certificate_of(plant, contract), plant, usual if channel is None else channel, mode)
 
 
 def started(channel=None):
@@ -123,7 +123,7 @@ def test_what_the_caller_keeps_is_its_own():
 
 def test_measurement_of_one_output_may_be_a_number():
     plant = TRUCKS["4000 kg, position only"]
-    loops = [SafeLoop(certificate_of(plant), plant, Channel()) for _ in range(2)]
+    loops = [safe_loop(certificate_of(plant), plant, Channel()) for _ in range(2)]
     for loop, measurement in zip(loops, (0.03, [0.03]), strict=True):
         loop.start([0.0, 0.0])
         loop.step(0.0)
@@ -270,13 +270,13 @@ def test_printed_loop_says_whether_the_state_is_proved_to_be_safe_and_why_not():
 
 def test_printed_loop_names_horizon_and_downlink():
     plant, _, channel = LOOPS["truck"]
-    loop = SafeLoop(certificate_of(plant), plant, channel, "lookahead", 1)
+    loop = safe_loop(certificate_of(plant), plant, channel, "lookahead", 1)
     loop.start(np.zeros(2))
     assert text_of(loop)["mode"] == "lookahead, horizon 1 step"
     assert text_of(loop)["contract"] == "none: any packets may be lost or late"
     assert text_of(loop)["guaranteed"].startswith("yes: the state stays in the box, if everything")
     certificate = certificate_of(cart_pole(), ChannelContract(4))
-    loop = SafeLoop(certificate, cart_pole(), Channel(), downlink=Channel(delay=2))
+    loop = safe_loop(certificate, cart_pole(), Channel(), downlink=Channel(delay=2))
     assert text_of(loop)["downlink"] == "inputs take effect 2 steps after the decision"
     assert "never older than 2 steps (4 less the downlink's 2)" in text_of(loop)["contract"]
 
@@ -284,7 +284,7 @@ def test_printed_loop_names_horizon_and_downlink():
 @pytest.mark.parametrize("downlink", [None, Channel(delay=2)])
 def test_printed_loop_says_that_the_contract_is_broken_now(downlink):
     plant, allowed = cart_pole(), 4 if downlink is None else 2
-    loop = SafeLoop(certificate_of(plant, ChannelContract(4)), plant, Channel(), downlink=downlink)
+    loop = safe_loop(certificate_of(plant, ChannelContract(4)), plant, Channel(), downlink=downlink)
     loop.start(np.zeros(4))
     for age in range(1, 7):
         loop.decide(0.0)

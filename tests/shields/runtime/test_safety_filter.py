@@ -1,22 +1,21 @@
-from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, truck_trailer
-from shields import SafetyFilter
+from ncs_gym import truck_trailer
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.product import altered, linear_plant, safety_filter
 from tests.shields.attacks.cases import RANDOM
 from tests.shields.edges import edge_of
 from tests.shields.runtime.batches import decided_alike
 
 TWO_STATES = random_plant(3, 2, 1)
 # Actions are so coarse that float32 steps are visible in the test.
-STRONG = replace(TWO_STATES, u_max=1e4)
+STRONG = altered(TWO_STATES, u_max=1e4)
 
 
 def many(shield, estimates, shapes, inputs):
@@ -33,7 +32,7 @@ def case(request):
 
 def test_an_input_that_passes_is_returned_untouched(case):
     plant, certificate = case
-    shield = SafetyFilter(certificate, plant)
+    shield = safety_filter(certificate, plant)
     u = 1e-3 * plant.u_max
     decision = shield.decide(np.zeros(plant.n), 0.01 * certificate.Sigma, u)
     assert not decision.intervened
@@ -45,7 +44,7 @@ def test_an_input_that_passes_is_returned_untouched(case):
 
 def test_projected_input_is_expressible_in_float32_and_the_closest(case):
     plant, certificate = case
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(1)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(1)
     checked = 0
     for _ in range(200):
         estimate = 1.2 * certificate.safe_set.sample(rng)
@@ -82,7 +81,7 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
 )
 def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
     estimate = np.array([0.5, 0.1])
-    decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, proposed)
+    decision = safety_filter(certificate, loaded).decide(estimate, certificate.Sigma, proposed)
     assert decision.reason == "invalid"
     assert decision.intervened
     assert decision.fallback
@@ -91,7 +90,7 @@ def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
 
 @pytest.mark.parametrize("estimate", [np.array([np.nan, 0.0]), np.array([np.inf, 0.0]), *map(np.zeros, (3, (2, 1)))])
 def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estimate):
-    decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, np.ones(1))
+    decision = safety_filter(certificate, loaded).decide(estimate, certificate.Sigma, np.ones(1))
     assert decision.reason == "invalid"
     assert not decision.proved
     assert not decision.fallback
@@ -114,7 +113,7 @@ UNUSABLE_SHAPES = [
 @pytest.mark.parametrize("mode", MODES)
 def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded, shape, mode):
     estimate = np.array([1.5, 0.5])
-    decision = SafetyFilter(certificate, loaded, mode).decide(estimate, shape, np.ones(1))
+    decision = safety_filter(certificate, loaded, mode).decide(estimate, shape, np.ones(1))
     assert decision.reason == "invalid"
     assert decision.intervened
     assert not decision.proved
@@ -124,7 +123,7 @@ def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded,
 
 def test_indefinite_error_shapes_of_three_states_are_unusable():
     plant = random_plant(3, 3, 2)
-    shield = SafetyFilter(certificate_of(plant), plant)
+    shield = safety_filter(certificate_of(plant), plant)
     swap = np.zeros((3, 3))
     swap[0, 1] = swap[1, 0] = 0.1
     for shape in (swap, 0.01 * np.eye(3) + swap, 4.0 * np.triu(swap) + 0.01 * np.eye(3)):
@@ -139,7 +138,7 @@ def test_indefinite_error_shapes_of_three_states_are_unusable():
 @pytest.mark.parametrize("plant", [STRONG, random_plant(3, 3, 2)], ids=["2, 1", "3, 2"])
 @pytest.mark.parametrize("size", [1e150, 1e308])
 def test_huge_estimates_never_give_a_nan_input(size, plant):
-    shield = SafetyFilter(certificate_of(plant), plant)
+    shield = safety_filter(certificate_of(plant), plant)
     for signs in product((-1.0, 1.0), repeat=plant.n):
         decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(plant.n), np.zeros(plant.m))
         assert np.isfinite(decision.input).all()
@@ -147,8 +146,8 @@ def test_huge_estimates_never_give_a_nan_input(size, plant):
 
 
 def test_decide_takes_numbers_where_there_is_one_state_or_one_input():
-    plant = LinearPlant(A=[[0.9]], B=[[0.5]], dt=0.1, box=[1.0], u_max=1.0, disturbance_bound=0.05, initial_bound=0.1)
-    shield = SafetyFilter(certificate_of(plant), plant)
+    plant = linear_plant(A=[[0.9]], B=[[0.5]], dt=0.1, box=[1.0], u_max=1.0, disturbance_bound=0.05, initial_bound=0.1)
+    shield = safety_filter(certificate_of(plant), plant)
     for u in (0.3, 1.0):
         one = shield.decide(0.2, 1e-4 * np.eye(1), u)
         assert one.input == shield.decide(np.array([0.2]), 1e-4 * np.eye(1), np.array([u])).input
@@ -173,7 +172,7 @@ class Contrary:
 @pytest.mark.parametrize("states", [2, 3])
 def test_decide_never_raises(states):
     plant = random_plant(3, states, states - 1)
-    shield = SafetyFilter(certificate_of(plant), plant)
+    shield = safety_filter(certificate_of(plant), plant)
     good = np.zeros(states), 1e-4 * np.eye(states), np.zeros(plant.m)
     for k in range(3):
         for bad in (Contrary(), [Contrary()], object(), {}, "x", None, 1e-320 * good[k], 1e200 * np.ones_like(good[k])):
@@ -183,7 +182,7 @@ def test_decide_never_raises(states):
 
 
 def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch):
-    shield = SafetyFilter(certificate, loaded)
+    shield = safety_filter(certificate, loaded)
     case = np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0])
     assert shield.decide(*case).reason == "projected"
     for rule in ("set_test.closest_on_line", "projection.closest_on_lines"):
@@ -193,7 +192,7 @@ def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch
 
 
 def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loaded):
-    shield = SafetyFilter(certificate, loaded)
+    shield = safety_filter(certificate, loaded)
     assert np.isnan(shield.margin(np.zeros(2), certificate.Sigma, np.zeros(3)))
     assert np.isnan(shield.margin(np.array([np.nan, 0.0]), certificate.Sigma, np.zeros(1)))
     assert np.isnan(shield.margin(np.zeros(2), 1e-4 * np.eye(3), np.zeros(1)))
@@ -203,7 +202,7 @@ def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loade
 
 
 def test_known_inside_ends_at_the_edge(certificate, loaded):
-    shield, shape = SafetyFilter(certificate, loaded), 0.04 * certificate.Sigma
+    shield, shape = safety_filter(certificate, loaded), 0.04 * certificate.Sigma
     direction = certificate.safe_set.extreme_point(np.array([1.0, 0.3]))
     radius = np.sqrt(np.linalg.eigvals(certificate.M @ shape).real.max())
     assert shield.knows_inside((1.0 - radius - 1e-6) * direction, shape)
@@ -215,7 +214,7 @@ def test_proposed_fallback_is_no_intervention(case):
     plant, certificate = case
     rng = np.random.default_rng(5)
     for mode in ("switch", "monitor"):
-        shield, seen = SafetyFilter(certificate, plant, mode), 0
+        shield, seen = safety_filter(certificate, plant, mode), 0
         for _ in range(200):
             estimate = 3.0 * certificate.safe_set.sample(rng)
             decision = shield.decide(estimate, certificate.Sigma, shield.fallback_input(estimate))
@@ -226,7 +225,7 @@ def test_proposed_fallback_is_no_intervention(case):
 
 def test_monitor_never_changes_the_input_and_counts_what_switch_would_do(case):
     plant, certificate = case
-    monitor, switch = SafetyFilter(certificate, plant, "monitor"), SafetyFilter(certificate, plant, "switch")
+    monitor, switch = safety_filter(certificate, plant, "monitor"), safety_filter(certificate, plant, "switch")
     rng, counted = np.random.default_rng(6), 0
     for _ in range(200):
         estimate, shape = 1.3 * certificate.safe_set.sample(rng), certificate.Sigma * rng.uniform(0.05, 1.0)
@@ -244,7 +243,7 @@ def test_monitor_never_changes_the_input_and_counts_what_switch_would_do(case):
 
 def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
     plant, certificate = case
-    boundary, switch = SafetyFilter(certificate, plant, "boundary"), SafetyFilter(certificate, plant, "switch")
+    boundary, switch = safety_filter(certificate, plant, "boundary"), safety_filter(certificate, plant, "switch")
     rng = np.random.default_rng(7)
     seen = set()
     for _ in range(300):
@@ -263,7 +262,7 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
 def test_boundary_trusts_weak_inputs_of_larger_plants_too():
     plant = RANDOM["n=3 m=2 p=1"]
     certificate = certificate_of(plant)
-    boundary, rng = SafetyFilter(certificate, plant, "boundary"), np.random.default_rng(0)
+    boundary, rng = safety_filter(certificate, plant, "boundary"), np.random.default_rng(0)
     reasons = set()
     for _ in range(200):
         estimate = certificate.safe_set.sample(rng)
@@ -272,7 +271,7 @@ def test_boundary_trusts_weak_inputs_of_larger_plants_too():
 
 
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
-    shield = SafetyFilter(certificate, loaded, "switch")
+    shield = safety_filter(certificate, loaded, "switch")
     shape = 0.1 * certificate.Sigma
     last = edge_of(lambda u: shield.decide(np.array([1.6, 0.0]), shape, np.array([u])).reason == "safe", 4.0, 80)
     sets = shield.test.reachable(np.array([[1.6], [0.0]]), shield.errors_of(shape).batch())
@@ -283,7 +282,7 @@ def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
 def test_projection_leaves_room_for_float32():
     plant = STRONG
     certificate = certificate_of(plant)
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     reasons = []
     for _ in range(300):
         estimate = 0.8 * certificate.safe_set.sample(rng)
@@ -321,8 +320,8 @@ def random_cases(rng, shield, count):
     ],
 )
 def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
-    plant = replace(random_plant(n, n, m), u_max=0.3 / m)
-    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 300
+    plant = altered(random_plant(n, n, m), u_max=0.3 / m)
+    shield, rng, count = safety_filter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 300
     reasons = decided_alike(shield, *random_cases(rng, shield, count), least=0.99).reason
     unusable = np.isin(np.arange(count), [3, 4, 5, 9, 10, 12, 13, 14, 15])
     np.testing.assert_array_equal(reasons == "invalid", unusable)
@@ -336,7 +335,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
 
 def test_empty_batches_give_empty_decisions(case):
     plant, certificate = case
-    none = SafetyFilter(certificate, plant).decide_many(
+    none = safety_filter(certificate, plant).decide_many(
         np.zeros((0, plant.n)), certificate.Sigma, np.zeros((0, plant.m))
     )
     assert (none.input.shape, none.reason.shape, none.margin.shape) == ((0, plant.m), (0,), (0,))
@@ -346,9 +345,9 @@ def test_empty_batches_give_empty_decisions(case):
 @pytest.mark.parametrize("states", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mode):
     # As if float64 had five digits.
-    plant = replace(random_plant(states, states, 1), u_max=0.3)
-    shield, rng = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(0)
-    plain = SafetyFilter(certificate_of(plant), plant, mode)
+    plant = altered(random_plant(states, states, 1), u_max=0.3)
+    shield, rng = safety_filter(certificate_of(plant), plant, mode), np.random.default_rng(0)
+    plain = safety_filter(certificate_of(plant), plant, mode)
     shield.test.rounding = 1e-5
     estimates, shapes, inputs = random_cases(rng, shield, 100)
     estimates[20:] *= 10.0
@@ -364,7 +363,7 @@ def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mo
 
 def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
     plant = TWO_STATES
-    shield, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
+    shield, Sigma = safety_filter(certificate_of(plant), plant), certificate_of(plant).Sigma
     monkeypatch.setattr("shields.runtime.safety_filter.MOST_REMEMBERED", 5)
     first = shield.errors_of(0.05 * Sigma)
     for size in np.linspace(0.1, 1.0, 4):
@@ -377,7 +376,7 @@ def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
 
 
 def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
-    shield, sizes = SafetyFilter(certificate, loaded), np.array([0.1, 0.5, 0.3])
+    shield, sizes = safety_filter(certificate, loaded), np.array([0.1, 0.5, 0.3])
     known, shapes = NumberedErrors(shield), sizes[:, None, None] * certificate.Sigma
     for each in (shapes, shapes[::-1], shapes[1:], shapes):
         table = SimpleNamespace(shapes=each[:2], shape=each.__getitem__)
@@ -393,7 +392,7 @@ def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
 def test_mask_of_proposals_is_what_is_not_intervened():
     plant = truck_trailer(mass=4000.0)
     certificate = certificate_of(plant)
-    shield, switched = SafetyFilter(certificate, plant), SafetyFilter(certificate, plant, mode="switch")
+    shield, switched = safety_filter(certificate, plant), safety_filter(certificate, plant, mode="switch")
     x_hat, shape, candidates = np.array([1.6, 0.5]), 1e-4 * np.eye(2), np.linspace(-4.0, 4.0, 9)[:, None]
     decided = shield.decide_many(np.tile(x_hat, (9, 1)), shape, candidates)
     mask = ~decided.intervened

@@ -12,7 +12,6 @@ from ncs_gym import (
     Ellipsoid,
     GilbertElliott,
     LinearPlant,
-    NCSVectorEnv,
     SpeedTracking,
     TraceChannel,
     batch_reactor,
@@ -24,18 +23,20 @@ from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant, with_remainder
+from tests.product import library_plant, linear_plant, rate_limited, vector_env
 from tests.shields.attacks.cases import RANDOM
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, TANKS
 
 TRUCK, CART, REACTOR, LOCAL = truck_trailer(mass=4000.0), cart_pole(), batch_reactor(), with_remainder()
 BOUNDS = {"box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "sensor_bound": 0.001, "initial_bound": 0.001}
-RATES = LinearPlant(
+RATES = linear_plant(
     A=[[0.9, 0.1], [0.0, 0.8]],
     B=[[0.0], [0.3]],
     disturbance_bound=0.01,
     mixed_limits=[([0.5, -1.0], [0.5], -0.7, 0.8)],
     **BOUNDS,
-).with_rate_limits(0.4)
+)
+RATES = rate_limited(RATES, 0.4)
 SPARSE = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
 ASKED = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
@@ -100,7 +101,7 @@ FEATURES = {
     ),
     "starts anywhere": Feature(TRUCK, {"channel": SPARSE}, ("project", "lookahead"), GOES_ON, options=OUTSIDE, count=3),
     "starts at the edge": Feature(TRUCK, {}, reasons=GOES_ON, options=EDGE),
-    "between the samples": Feature(truck_trailer(mass=4000.0, between_samples=2), {"channel": SPARSE}),
+    "between the samples": Feature(library_plant(truck_trailer, mass=4000.0, between_samples=2), {"channel": SPARSE}),
     "a remainder": Feature(LOCAL, {}, ("monitor", "project"), (guarantee.LEFT_MODEL, ""), options=IN_BOX, count=3),
     "a remainder behind a downlink": Feature(
         LOCAL, {"downlink": Channel(delay=2)}, ("monitor",), (guarantee.LEFT_MODEL, ""), options=IN_BOX, count=3
@@ -111,7 +112,7 @@ FEATURES = {
         reasons=("", guarantee.OUTSIDE_BOUND),
     ),
     "Gaussian noise": Feature(
-        truck_trailer(mass=4000.0, delta=0.97),
+        library_plant(truck_trailer, mass=4000.0, delta=0.97),
         {"noise": "gaussian"},
         ("project", "monitor"),
         ("", guarantee.ALARM),
@@ -177,7 +178,7 @@ ROWS = [
 def test_scalar_shields_vector_shields_and_loops_agree(name, mode, reset):
     feature = FEATURES[name]
     settings = {"max_episode_steps": 11, "autoreset_mode": reset} | feature.settings
-    many = NCSVectorEnv(feature.count, plant=feature.plant, **settings)
+    many = vector_env(feature.count, plant=feature.plant, **settings)
     certificate = certificate_of(feature.plant, many.certificate_contract, feature.safe_set)
     seen = compare(many, 34, feature.options, certificate, mode, (1, 7, 25))
     # Nothing keeps the state in S, and after an outage the error is too large for a while.

@@ -17,9 +17,6 @@ from ncs_gym import (
     Actuator,
     Channel,
     Command,
-    LinearPlant,
-    NCSEnv,
-    NCSVectorEnv,
     Packet,
     RequestActions,
     UnusedPacketsWarning,
@@ -28,8 +25,17 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
-from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from tests.certificates import certificate_of
+from tests.product import (
+    linear_plant,
+    loop_env,
+    safe_loop,
+    safety_filter,
+    safety_shield,
+    synthesize,
+    vector_env,
+    vector_shield,
+)
 
 PLANT, TWO = truck_trailer(mass=4000.0), np.zeros(2)
 
@@ -40,7 +46,7 @@ def certificate():
 
 
 def test_stepping_after_the_end_of_an_episode_is_refused():
-    env = NCSEnv(PLANT, terminate_on_violation=True)
+    env = loop_env(PLANT, terminate_on_violation=True)
     env.reset(options={"state": [1.9, 0.0]})
     while not env.step([1.0])[2]:
         pass
@@ -51,7 +57,7 @@ def test_stepping_after_the_end_of_an_episode_is_refused():
 
 
 def test_batches_and_tensors_handed_to_a_filter_are_invalid(certificate):
-    shield = SafetyFilter(certificate, PLANT)
+    shield = safety_filter(certificate, PLANT)
     gradient = torch.zeros(1, requires_grad=True)
     for estimate, proposed in ((np.zeros((5, 2)), np.zeros((5, 1))), (np.zeros(2), np.zeros((5, 1))), (TWO, gradient)):
         assert shield.decide(estimate, certificate.Sigma, proposed).reason == "invalid"
@@ -61,7 +67,7 @@ def test_batches_and_tensors_handed_to_a_filter_are_invalid(certificate):
 def test_proposals_that_are_no_input_are_told_of_once_and_not_applied(certificate):
     gradient = torch.tensor([0.5], requires_grad=True)
     for proposed in (gradient, [gradient[0]], np.full((1, 1), 0.5), "full throttle", np.nan, np.array([np.inf])):
-        loop = SafeLoop(certificate, PLANT, Channel())
+        loop = safe_loop(certificate, PLANT, Channel())
         loop.start([0.5, 0.0])
         assert loop.step(None).reason == "invalid"  # a controller that failed is no mistake
         with pytest.warns(UserWarning, match=r"one input, finite numbers of shape \(1,\), got .*K x_hat is applied"):
@@ -73,10 +79,10 @@ def test_proposals_that_are_no_input_are_told_of_once_and_not_applied(certificat
 
 @pytest.mark.parametrize("wrong", [torch.zeros(1, requires_grad=True), [torch.tensor(0.0, requires_grad=True)]])
 def test_actions_with_a_gradient_are_refused(certificate, wrong):
-    env, envs = NCSEnv(PLANT), NCSVectorEnv(1, plant=PLANT)
+    env, envs = loop_env(PLANT), vector_env(1, plant=PLANT)
     asks = Channel(on_request=True)
-    asking, many = RequestActions(NCSEnv(PLANT, asks)), VectorRequestActions(NCSVectorEnv(1, plant=PLANT, channel=asks))
-    shields = SafetyShield(NCSEnv(PLANT), certificate), VectorSafetyShield(NCSVectorEnv(1, plant=PLANT), certificate)
+    asking, many = RequestActions(loop_env(PLANT, asks)), VectorRequestActions(vector_env(1, plant=PLANT, channel=asks))
+    shields = safety_shield(loop_env(PLANT), certificate), vector_shield(vector_env(1, plant=PLANT), certificate)
     for each in (env, envs, asking, many, *shields):
         each.reset(seed=0)
         with pytest.raises(ValueError, match="must be finite with shape"):
@@ -84,11 +90,11 @@ def test_actions_with_a_gradient_are_refused(certificate, wrong):
 
 
 def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certificate):
-    inside = DictInfoToList(NCSVectorEnv(2, plant=PLANT))
-    asked = DictInfoToList(NCSVectorEnv(2, plant=PLANT, channel=Channel(on_request=True)))
+    inside = DictInfoToList(vector_env(2, plant=PLANT))
+    asked = DictInfoToList(vector_env(2, plant=PLANT, channel=Channel(on_request=True)))
     classic = DictInfoToList(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
     around = {
-        "VectorSafetyShield": VectorSafetyShield(inside, certificate),
+        "VectorSafetyShield": vector_shield(inside, certificate),
         "VectorRequestActions": VectorRequestActions(asked),
         "VectorNetworked": VectorNetworked(classic),
         "SB3VecEnv": SB3VecEnv(inside),
@@ -96,7 +102,7 @@ def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certifi
     for name, env in around.items():
         with pytest.raises(ValueError, match=rf"{name} reads .* makes a list .* outside of {name}"):
             env.reset()
-    outside = DictInfoToList(VectorSafetyShield(NCSVectorEnv(2, plant=PLANT), certificate))
+    outside = DictInfoToList(vector_shield(vector_env(2, plant=PLANT), certificate))
     assert outside.reset()[1][1]["shield_guaranteed"]
 
 
@@ -124,12 +130,12 @@ def test_rounding_too_coarse_for_any_update_is_named_once(step):
 @pytest.mark.filterwarnings("error")
 def test_channels_whose_packets_are_used_are_not_named():
     for step in (0.0, 0.05):
-        NCSEnv(PLANT, Channel(quantization_step=step, delay=3))
-        NCSEnv(cart_pole(full_state=False), Channel(loss=0.2, max_consecutive_losses=2))
+        loop_env(PLANT, Channel(quantization_step=step, delay=3))
+        loop_env(cart_pole(full_state=False), Channel(loss=0.2, max_consecutive_losses=2))
 
 
 def test_packets_without_the_number_of_a_later_episode_are_named_once(certificate):
-    loop = SafeLoop(certificate, PLANT, Channel(delay=1))
+    loop = safe_loop(certificate, PLANT, Channel(delay=1))
     for _ in range(2):
         loop.start([0.0, 0.0])
         loop.step(0.0)
@@ -143,7 +149,7 @@ def test_packets_without_the_number_of_a_later_episode_are_named_once(certificat
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_bounds_of_zero_are_certified_without_a_word():
     none = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
-    plant = LinearPlant(A=[[1.0, 0.1], [-0.3, 0.85]], B=[[0.0], [0.1]], box=[1.0, 2.0], u_max=5.0, dt=0.1, **none)
+    plant = linear_plant(A=[[1.0, 0.1], [-0.3, 0.85]], B=[[0.0], [0.1]], box=[1.0, 2.0], u_max=5.0, dt=0.1, **none)
     assert synthesize(plant).provenance["share_of_box"] > 0.7
 
 
@@ -159,7 +165,7 @@ class Alarming(gym.Wrapper):
 
 def test_monitor_has_the_share_of_guaranteed_states(certificate):
     env = Alarming(gym.make("ncs_gym/TruckTrailerCruise-v0", max_episode_steps=19))
-    shield = Monitor(SafetyShield(env, certificate, on_unproved="ignore"), info_keywords=("episode_guaranteed",))
+    shield = Monitor(safety_shield(env, certificate, on_unproved="ignore"), info_keywords=("episode_guaranteed",))
     shield.reset(seed=0)
     while not (result := shield.step([0.1]))[3]:
         pass
@@ -168,7 +174,7 @@ def test_monitor_has_the_share_of_guaranteed_states(certificate):
 
 def test_copy_of_a_loop_shares_nothing_with_it(certificate):
     """A shallow copy that shared the estimator would go on with what the other was told, and be guaranteed outside."""
-    loop = SafeLoop(certificate, PLANT, Channel(delay=1))
+    loop = safe_loop(certificate, PLANT, Channel(delay=1))
     loop.start([0.0, 0.0])
     x = np.zeros(2)
     for k in range(30):

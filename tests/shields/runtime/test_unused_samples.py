@@ -7,17 +7,18 @@ import warnings
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, truck_trailer
+from ncs_gym import Actuator, Channel, Packet, UnusedPacketsWarning, truck_trailer
 from ncs_gym.processes.plant_step import PlantSimulation
-from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
+from shields import GuaranteeLostWarning
 from shields.runtime.guarantee import ALARM, NOT_FINITE, UNKNOWN_START
 from tests.certificates import certificate_of
+from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 
 
 def started(**settings):
-    loop = SafeLoop(certificate_of(PLANT), PLANT, **{"channel": Channel(delay=1)} | settings)
+    loop = safe_loop(certificate_of(PLANT), PLANT, **{"channel": Channel(delay=1)} | settings)
     loop.start(np.zeros(2))
     return loop
 
@@ -136,8 +137,8 @@ def test_environments_name_it_as_well(many, monkeypatch):
 
     monkeypatch.setattr(PlantSimulation, "measure", damaged)
     settings = {"plant": PLANT, "channel": Channel()}
-    inner = NCSVectorEnv(num_envs=2, **settings) if many else NCSEnv(**settings)
-    env = (VectorSafetyShield if many else SafetyShield)(inner, certificate_of(PLANT), on_unproved="ignore")
+    inner = vector_env(num_envs=2, **settings) if many else loop_env(**settings)
+    env = (vector_shield if many else safety_shield)(inner, certificate_of(PLANT), on_unproved="ignore")
     env.reset(seed=0)
     reasons = [np.unique(env.step(np.zeros((2, 1) if many else 1, np.float32))[4]["shield_reason"]) for _ in range(5)]
     assert [each.tolist() for each in reasons] == [[""], [""], [NOT_FINITE], [NOT_FINITE], [NOT_FINITE]]

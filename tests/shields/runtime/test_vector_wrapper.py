@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from ncs_gym import NCSVectorEnv
-from shields import Decision, SafetyShield, VectorSafetyShield
+from shields import Decision, SafetyShield
 from shields.runtime.vector_wrapper import overridden
 from tests import arrays
 from tests.certificates import certificate_of
+from tests.product import vector_env, vector_shield
 from tests.shields.attacks.cases import CHANNELS, TRUCKS, harmful
 
 
@@ -21,9 +22,9 @@ def test_error_shapes_that_the_environment_forgets_and_meets_again_change_nothin
             return SimpleNamespace(shapes=table.shapes[present]), again
 
     runs = []
-    for kind in (NCSVectorEnv, Forgetful):
+    for kind in (vector_env, Forgetful):
         env = kind(6, plant=TRUCKS["4000 kg"], channel=CHANNELS["overtaking"], max_episode_steps=30)
-        shield, rng = VectorSafetyShield(env, certificate_of(env.plant)), np.random.default_rng(0)
+        shield, rng = vector_shield(env, certificate_of(env.plant)), np.random.default_rng(0)
         infos = [shield.reset(seed=0)[1]]
         infos += [shield.step(rng.uniform(-1, 1, (6, 1)))[4] for _ in range(60)]
         runs.append(infos)
@@ -48,8 +49,8 @@ def outwards(shield, info):
 
 def test_last_steps_behind_the_shields_back_promise_nothing():
     plant = TRUCKS["4000 kg"]
-    env = NCSVectorEnv(50, plant=plant, disturbance=harmful(plant), max_episode_steps=30, autoreset_mode="SameStep")
-    shield = VectorSafetyShield(env, certificate_of(plant))
+    env = vector_env(50, plant=plant, disturbance=harmful(plant), max_episode_steps=30, autoreset_mode="SameStep")
+    shield = vector_shield(env, certificate_of(plant))
     _, info = shield.reset(seed=0)
     for _ in range(28):
         _, _, _, _, info = shield.step(outwards(shield, info))

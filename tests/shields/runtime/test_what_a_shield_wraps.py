@@ -6,11 +6,11 @@ import pytest
 from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers import StickyAction
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearProcess, NCSEnv, NCSVectorEnv, truck_trailer
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearProcess, truck_trailer
 from ncs_gym.network import downlink_protocol
-from shields import SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import OTHER_STEPS
 from tests.certificates import certificate_of
+from tests.product import loop_env, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 # How a setting is kept, and another one: what only somebody with a will to can change.
@@ -26,11 +26,11 @@ CHANGED = {
 
 
 def scalar(**settings):
-    return SafetyShield(NCSEnv(PLANT, **settings), certificate_of(PLANT))
+    return safety_shield(loop_env(PLANT, **settings), certificate_of(PLANT))
 
 
 def vector(**settings):
-    return VectorSafetyShield(NCSVectorEnv(2, plant=PLANT, **settings), certificate_of(PLANT))
+    return vector_shield(vector_env(2, plant=PLANT, **settings), certificate_of(PLANT))
 
 
 # Where settings are kept: in the environment, inside a vector, or in the vector, which has neither process nor start.
@@ -81,6 +81,6 @@ def test_wrapper_that_changes_a_setting_in_its_reset_is_found_at_the_next_one():
             self.unwrapped.single._initial_set = Ellipsoid(3.0 * np.eye(2))
             return self.env.reset(**keywords)
 
-    shield = VectorSafetyShield(Widens(NCSVectorEnv(2, plant=PLANT)), certificate_of(PLANT))
+    shield = vector_shield(Widens(vector_env(2, plant=PLANT)), certificate_of(PLANT))
     with pytest.raises(ValueError, match="the initial_set is not the one"):
         shield.reset(seed=0)

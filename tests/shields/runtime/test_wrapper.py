@@ -10,12 +10,13 @@ from gymnasium.vector import VectorWrapper
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid
-from shields import SafetyShield, VectorSafetyShield
+from shields import SafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
     OTHER_INPUT,
     OTHER_STEPS,
 )
+from tests.product import safety_shield, vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 KEYS = {
@@ -31,7 +32,7 @@ KEYS = {
 
 
 def shielded(certificate, mode="project", penalty=0.0, **kwargs) -> SafetyShield:
-    return SafetyShield(gym.make(CRUISE, **kwargs), certificate, mode=mode, penalty=penalty)
+    return safety_shield(gym.make(CRUISE, **kwargs), certificate, mode=mode, penalty=penalty)
 
 
 def play(env, policy, steps=200, **reset):
@@ -53,8 +54,8 @@ def test_checkers_pass_on_the_shielded_environment(certificate):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", ".*is different from the unwrapped version.*")
-        check_env(SafetyShield(gym.make(CRUISE).unwrapped, certificate))
-        check_env_sb3(SafetyShield(gym.make(CRUISE).unwrapped, certificate))
+        check_env(safety_shield(gym.make(CRUISE).unwrapped, certificate))
+        check_env_sb3(safety_shield(gym.make(CRUISE).unwrapped, certificate))
 
 
 def test_info_gains_the_same_keys_and_types_always(certificate):
@@ -88,7 +89,7 @@ def test_a_copy_of_the_callers_own_action_is_passed_on(certificate):
             seen.append(action)
             return self.env.step(action)
 
-    env = SafetyShield(Spy(gym.make(CRUISE)), certificate)
+    env = safety_shield(Spy(gym.make(CRUISE)), certificate)
     env.reset(seed=0)
     for kind in (np.float32, np.float64):
         action = np.array([0.01], kind)
@@ -170,7 +171,7 @@ def test_changed_input_is_noticed_and_latched(certificate):
             self.calls += 1
             return self.env.step(action * 0.9 if self.calls == 3 else action)
 
-    infos = play(SafetyShield(Meddler(gym.make(CRUISE)), certificate), full, 10, seed=0)
+    infos = play(safety_shield(Meddler(gym.make(CRUISE)), certificate), full, 10, seed=0)
     assert [info["shield_reason"] for info in infos] == [""] * 3 + [OTHER_INPUT] * 8
 
 
@@ -186,7 +187,7 @@ def test_inner_wrapper_that_chooses_the_start_is_not_trusted(certificate):
             return observation, info
 
     reasons = [
-        SafetyShield(layer(gym.make(CRUISE)), certificate).reset(seed=0)[1]["shield_reason"]
+        safety_shield(layer(gym.make(CRUISE)), certificate).reset(seed=0)[1]["shield_reason"]
         for layer in (Elsewhere, WarmUp)
     ]
     assert reasons == [NOT_KNOWN_INSIDE, OTHER_STEPS]
@@ -230,10 +231,10 @@ def rewriting(kind):
 @pytest.mark.parametrize("autoreset", [None, "NextStep", "SameStep"])
 def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, autoreset, rewrite):
     if autoreset is None:
-        make, shield, layer = gym.make, SafetyShield, rewriting(gym.Wrapper)
+        make, shield, layer = gym.make, safety_shield, rewriting(gym.Wrapper)
         settings = {}
     else:
-        make, shield, layer = gym.make_vec, VectorSafetyShield, rewriting(VectorWrapper)
+        make, shield, layer = gym.make_vec, vector_shield, rewriting(VectorWrapper)
         settings = {"num_envs": 5, "max_episode_steps": 25, "autoreset_mode": autoreset}
     plain, inner, wrapped = (make(CRUISE, disturbance="adversarial", **settings) for _ in range(3))
     plain, inside = shield(plain, certificate), shield(layer(inner, REWRITES[rewrite]), certificate)
@@ -267,10 +268,10 @@ def test_what_is_handed_on_lies_in_the_action_space(kind, certificate):
         return Spy
 
     if kind == "scalar":
-        env, shape = SafetyShield(spy(gym.Wrapper)(gym.make(CRUISE)), certificate), (1,)
+        env, shape = safety_shield(spy(gym.Wrapper)(gym.make(CRUISE)), certificate), (1,)
     else:
         inner = spy(gym.vector.VectorWrapper)(gym.make_vec(CRUISE, num_envs=3))
-        env, shape = VectorSafetyShield(inner, certificate), (3, 1)
+        env, shape = vector_shield(inner, certificate), (3, 1)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     for _ in range(60):

@@ -9,14 +9,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, LinearPlant
-from shields import Infeasible, synthesize, verify
+from ncs_gym import ChannelContract
+from shields import Infeasible, verify
 from shields.synthesis import ellipsoid_certificates, invariant_polytope, search
 from tests.certificates import feasible_age_not_sought
+from tests.product import linear_plant, synthesize
 from tests.verdicts import verified
 
 # A plant that is refused under its contract, and certified for less age.
-AGED = LinearPlant(
+AGED = linear_plant(
     A=[[2.0, 0.1], [0.1, 1.0]], B=[[0.0], [0.1]], dt=0.1, box=[0.3, 1.0], u_max=5.0, disturbance_bound=1e-5,
     sensor_bound=1e-3, initial_bound=(np.eye(2), [1e-3, 1e-3]),
 )  # fmt: skip
@@ -57,7 +58,7 @@ def test_alternations_that_gain_less_than_a_percent_are_the_last_with_their_step
 
 
 def test_few_gains_whose_polytopes_have_too_many_rows_end_the_search(monkeypatch):
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9, 0.3], [-0.3, 0.9]], B=[[0.0], [0.1]], dt=0.1, state_limits=([-0.9, -0.8], [1.1, 1.2]), u_max=1.0,
         disturbance_bound=1e-3, sensor_bound=1e-3, initial_bound=1e-3,
     )  # fmt: skip

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from ncs_gym import ChannelContract, LinearPlant
-from shields import Infeasible, synthesize
+from shields import Infeasible
+from tests.product import sampled_plant, synthesize
 from tests.verdicts import verified
 
 # Each has its source, what is invented of it, its model, what `LinearPlant.from_statespace` is given, and the age that
@@ -24,7 +25,7 @@ LONGEST = 60.0
 
 def plant_of_call(name: str) -> LinearPlant:
     given = CALLS[name]
-    return LinearPlant.from_statespace(tuple(given["model"]), given["dt"], **given["arguments"])
+    return sampled_plant(tuple(given["model"]), given["dt"], **given["arguments"])
 
 
 @pytest.mark.parametrize(
@@ -46,4 +47,4 @@ def test_operating_point_that_was_not_given_is_asked_for():
     given = CALLS["zone_22"]
     arguments = {name: value for name, value in given["arguments"].items() if not name.startswith("operating")}
     with pytest.raises(ValueError, match="give operating_"):
-        LinearPlant.from_statespace(tuple(given["model"]), given["dt"], **arguments)
+        sampled_plant(tuple(given["model"]), given["dt"], **arguments)

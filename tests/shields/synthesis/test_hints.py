@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from benchmarks.published import contract_of_plant, plant_of
-from ncs_gym import ChannelContract, ErrorSetError, LinearPlant, certified_error_set
-from shields import Infeasible, synthesize
+from ncs_gym import ChannelContract, ErrorSetError, certified_error_set
+from shields import Infeasible
 from tests.certificates import feasible_age_not_sought
 from tests.plants import servo, with_radii
+from tests.product import linear_plant, rate_limited, sampled_plant, synthesize
 from tests.verdicts import verified
 
 # A refusal takes so long at most [s of the processor].
@@ -35,7 +36,7 @@ def tanks(**changes):
         "operating_input": [7.0, 3.0],
         "disturbance_bound": 1.5,
     }
-    return LinearPlant.from_statespace(
+    return sampled_plant(
         ([[-0.1, 0.05], [0.0, -0.2]], [[0.1, 0.02], [0.03, 0.2]], np.eye(2), 0), 1.0, **QUIET | given | changes
     )
 
@@ -47,7 +48,7 @@ def platoon(disturbance):
         A[3 * i, 3 * i + 1], A[3 * i + 1, 3 * i + 2], A[3 * i + 2, 3 * i + 2], B[3 * i + 2, i] = 1.0, -1.0, -2.0, 2.0
         if i:
             A[3 * i + 1, 3 * i - 1] = 1.0
-    return LinearPlant.from_statespace(
+    return sampled_plant(
         (A, B, np.eye(9), 0), 0.1, box=np.tile([5.0, 3.0, 3.0], 3), u_max=3.0,
         disturbance_bound=np.tile([0.0, disturbance, 0.001], 3), sensor_bound=0.02, initial_bound=0.02,
     )  # fmt: skip
@@ -74,8 +75,8 @@ QUICK = {
 }  # fmt: skip
 SLOW = {"room": pytest.mark.slow, "one end": pytest.mark.slow, "angle with a rate": pytest.mark.slow}
 LONG = {
-    "sensor": (lambda: LinearPlant(**PENDULUM | {"disturbance_bound": 1e-3, "sensor_bound": 0.2}), 0),
-    "age": (lambda: LinearPlant(**PENDULUM | {"disturbance_bound": 1e-3}), 25),
+    "sensor": (lambda: linear_plant(**PENDULUM | {"disturbance_bound": 1e-3, "sensor_bound": 0.2}), 0),
+    "age": (lambda: linear_plant(**PENDULUM | {"disturbance_bound": 1e-3}), 25),
     "servo": (lambda: servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.5], u_max=0.5), 0),
     "servo between samples": (lambda: servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.48], between_samples=4), 2),
     "tanks": (tanks, 2),
@@ -92,8 +93,8 @@ LONG = {
 def made(given):
     arguments = dict(given)
     du_max = arguments.pop("du_max", None)
-    plant = LinearPlant(**arguments)
-    return plant if du_max is None else plant.with_rate_limits(du_max)
+    plant = linear_plant(**arguments)
+    return plant if du_max is None else rate_limited(plant, du_max)
 
 
 def refusal(plant, contract):
@@ -156,7 +157,7 @@ def test_limits_that_bind_are_named():
 def test_less_age_is_not_named_where_a_state_is_not_seen(speed_only):
     chain = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     for limits in ({"box": [1.0, 1.0, 1.0]}, {"state_limits": ([-1.0, -1.0, -1.0], [2.0, 1.0, 1.0])}):
-        plant = LinearPlant.from_statespace(
+        plant = sampled_plant(
             (chain, [[0.0], [0.0], [1.0]], speed_only, 0), 0.1, u_max=1.0, disturbance_bound=1e-4,
             state_names=("place", "speed", "acceleration"), **limits, **QUIET,
         )  # fmt: skip
@@ -168,18 +169,18 @@ def test_less_age_is_not_named_where_a_state_is_not_seen(speed_only):
 
 def test_error_sets_that_no_age_has_are_told_from_those_of_less_age():
     seen_alone = {"A": np.eye(2), "H": [[0.0, 1.0]], "disturbance_bound": 1e-4}
-    unseen = LinearPlant(**PENDULUM | seen_alone)
+    unseen = linear_plant(**PENDULUM | seen_alone)
     with pytest.raises(ErrorSetError, match="the outputs do not show x1"):
         certified_error_set(unseen, ChannelContract(2))
     with pytest.raises(ErrorSetError, match="promise less age"):
         certified_error_set(
-            LinearPlant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5}), ChannelContract(400)
+            linear_plant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5}), ChannelContract(400)
         )
 
 
 @pytest.mark.slow
 def test_a_contract_is_named_where_a_stable_plant_has_none():
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.998]], B=[[0.01]], H=[[1.0]], dt=0.1, state_limits=([0.2], [0.9]), input_limits=([0.0], [1.0]),
         operating_state=[0.5], operating_input=[0.1], disturbance_bound=([[1.0]], [-0.001], [0.001]),
         sensor_bound=0.01, initial_bound=0.02,
@@ -190,7 +191,7 @@ def test_a_contract_is_named_where_a_stable_plant_has_none():
 
 
 def test_less_age_is_named_where_it_helps():
-    plant = LinearPlant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5})
+    plant = linear_plant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5})
     told = refusal(plant, ChannelContract(400))
     assert "promise less age" in str(told)
     assert f"there is a certificate for max_age = {told.details['max_age']} (asked: max_age = 400)" in str(told)

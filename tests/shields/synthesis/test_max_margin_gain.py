@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
-from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym import ChannelContract, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from shields import Infeasible, synthesize
+from shields import Infeasible
 from shields.errors import SynthesisInterrupted
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.diagnosis import with_age_that_helps
 from shields.synthesis.max_margin_gain import max_margin_gain
 from tests.certificates import feasible_age_not_sought
 from tests.plants import random_plant
+from tests.product import altered, library_plant, linear_plant, sampled_plant, synthesize
 from tests.verdicts import verified
 
 CONTRACT = ChannelContract(2, 1e-4)
@@ -26,9 +27,9 @@ def slow(*values):
 
 def radii_scaled(plant, factor):
     """The plant with the radii of all its uncertainty scaled."""
-    plant = replace(plant, gamma=factor**2 * plant.gamma)
+    plant = altered(plant, gamma=factor**2 * plant.gamma)
     covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
-    return replace(plant, **{name: factor**2 * getattr(plant, name) for name in covariances})
+    return altered(plant, **{name: factor**2 * getattr(plant, name) for name in covariances})
 
 
 @pytest.mark.slow
@@ -108,7 +109,7 @@ SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound
 @pytest.mark.slow
 def test_age_that_is_named_is_nearly_the_largest_that_synthesis_accepts():
     bounds = {"gamma": 1e-7, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    plant = LinearPlant(**PENDULUM | bounds)
+    plant = linear_plant(**PENDULUM | bounds)
     with pytest.raises(Infeasible, match="there is a certificate for max_age = ") as caught:
         synthesize(plant, contract=ChannelContract(40, 1e-3), safe_set="ellipsoid")
     age = caught.value.details["max_age"]
@@ -119,7 +120,9 @@ def test_age_that_is_named_is_nearly_the_largest_that_synthesis_accepts():
 
 
 def test_disturbance_that_exceeds_a_limit_alone_is_named():
-    plant = truck_trailer(gamma=0.0, disturbance_bound=2.0, process_noise_cov=np.zeros((2, 2)), sensor_bound=0.01)
+    plant = library_plant(
+        truck_trailer, gamma=0.0, disturbance_bound=2.0, process_noise_cov=np.zeros((2, 2)), sensor_bound=0.01
+    )
     exceeded = r"the disturbance of one step alone reaches [\d.]+ times the limit \|coupling stretch\| <= 2 m"
     with pytest.raises(Infeasible, match=exceeded):
         synthesize(plant)
@@ -128,7 +131,7 @@ def test_disturbance_that_exceeds_a_limit_alone_is_named():
 def drone(**changes):
     bounds = {"disturbance_bound": [1e-4, 5e-3], "sensor_bound": 2e-3, "initial_bound": [5e-3, 2e-2]} | changes
     model = ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
-    return LinearPlant.from_statespace(model, dt=0.02, box=[1.0, 2.0], u_max=4.0, **bounds)
+    return sampled_plant(model, dt=0.02, box=[1.0, 2.0], u_max=4.0, **bounds)
 
 
 def test_sensor_that_is_louder_than_the_box_is_wide_is_named():
@@ -152,7 +155,7 @@ def test_first_error_that_is_larger_than_the_box_is_named():
 
 
 def test_plant_that_no_gain_stabilizes_is_not_blamed_on_its_bounds():
-    plant = LinearPlant(**PENDULUM | SMALL | {"A": [[1.1, 0.0], [0.0, 0.5]]})
+    plant = linear_plant(**PENDULUM | SMALL | {"A": [[1.1, 0.0], [0.0, 0.5]]})
     told = "no gain stabilizes the plant: no input moves x1, which does not decay by itself"
     with pytest.raises(Infeasible, match=told) as caught:
         synthesize(plant, contract=ChannelContract(0))
@@ -165,7 +168,7 @@ def test_interrupted_search_for_feasible_ages_says_why_there_is_no_certificate()
             raise KeyboardInterrupt
 
     with pytest.raises(SynthesisInterrupted, match=r"at search for a max_age .* no certificate yet: \(I\)") as caught:
-        synthesize(truck_trailer(gamma=0.5), progress=progress)
+        synthesize(library_plant(truck_trailer, gamma=0.5), progress=progress)
     assert caught.value.certificate is None
 
 
@@ -181,7 +184,7 @@ def test_regulator_decays_as_fast_as_asked_for():
 def test_cart_pole_tolerates_at_least_the_measured_radii(full_state, age, radius):
     plant = cart_pole(full_state=full_state)
     half_widths, n = plant.half_widths, plant.n
-    plant = replace(
+    plant = altered(
         plant,
         process_noise_cov=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
         measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / truncation_energy(0.05, plant.p),

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym import ChannelContract
 from ncs_gym.processes.gym_pendulum import pendulum
-from shields import Infeasible, requirements, synthesize, verify
+from shields import Infeasible, requirements, verify
 from shields.synthesis import network_requirements
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.network_requirements import share_of
 from tests import plants
+from tests.product import altered, linear_plant, resampled, synthesize
 
 
 def servo(**changes):
@@ -78,16 +79,16 @@ def test_known_age_of_the_pendulum():
 
 def test_resampled_plant_is_the_model_sampled_at_that_period():
     direct = servo(dt=0.02)
-    resampled = servo().resampled(0.02)
-    assert np.array_equal(resampled.A, direct.A)
-    assert np.array_equal(resampled.B, direct.B)
+    sampled = resampled(servo(), 0.02)
+    assert np.array_equal(sampled.A, direct.A)
+    assert np.array_equal(sampled.B, direct.B)
     # A disturbance that is constant for two short steps is that of one long step.
     step, d = servo(), np.array([0.0, 0.5])
     twice = step.A @ d + d
-    assert resampled.nominal_disturbance.contains(twice * (1.0 - 1e-9))
-    assert not resampled.nominal_disturbance.contains(twice * 1.001)
-    assert servo().resampled(0.01) is not None
-    assert servo().resampled(0.01).fingerprint == servo().fingerprint
+    assert sampled.nominal_disturbance.contains(twice * (1.0 - 1e-9))
+    assert not sampled.nominal_disturbance.contains(twice * 1.001)
+    assert resampled(servo(), 0.01) is not None
+    assert resampled(servo(), 0.01).fingerprint == servo().fingerprint
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6))])
@@ -95,7 +96,7 @@ def test_certificate_of_a_tighter_problem_is_carried_over_to_a_looser_one(seed):
     """Random pairs of input limits, boxes and bounds of a stable plant."""
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(2, 2))
-    plant = LinearPlant(
+    plant = linear_plant(
         A=0.9 * A / np.abs(np.linalg.eigvals(A)).max(),
         B=rng.normal(size=(2, 1)),
         box=rng.uniform(0.5, 2.0, 2),
@@ -109,7 +110,7 @@ def test_certificate_of_a_tighter_problem_is_carried_over_to_a_looser_one(seed):
         tight = synthesize(plant, safe_set="ellipsoid")
     except Infeasible:
         pytest.skip("the tighter problem has no certificate")
-    looser = replace(plant, u_max=plant.u_max * rng.uniform(1.0, 20.0), disturbance_bound=0.7 * 0.005)
+    looser = altered(plant, u_max=plant.u_max * rng.uniform(1.0, 20.0), disturbance_bound=0.7 * 0.005)
     loose = carried_over(tight, looser, None)
     assert loose is not None
     assert loose.fingerprint == looser.fingerprint
@@ -129,8 +130,8 @@ def test_certificate_of_a_looser_problem_is_not_carried_over_to_a_tighter_one():
 def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
     model = {"A": [[1.0, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 0.1, "input_limits": (-1.0, 2.0)}
     model |= {"disturbance_bound": [0.02, 0.04], "sensor_bound": 0.01, "initial_bound": 0.01}
-    closed = LinearPlant(state_limits=([-1.0, -1.0], [2.0, 1.5]), **model)
-    free = LinearPlant(state_limits=([-1.0, -np.inf], [2.0, np.inf]), **model)
+    closed = linear_plant(state_limits=([-1.0, -1.0], [2.0, 1.5]), **model)
+    free = linear_plant(state_limits=([-1.0, -np.inf], [2.0, np.inf]), **model)
     for plant, kind in ((closed, "polytope"), (free, "certificate")):
         (certificate,), _ = requirements(plant, ages=[0, 1]).certificates
         assert certificate is not None

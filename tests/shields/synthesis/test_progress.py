@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shields import synthesize
 from shields.errors import SynthesisInterrupted
 from tests.plants import random_plant
+from tests.product import synthesize
 from tests.verdicts import verified
 
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from experiments.report.text_tables import certificate_line
-from ncs_gym import LinearPlant, cart_pole, truck_trailer
+from ncs_gym import cart_pole, truck_trailer
 from ncs_gym.plants.past_inputs import inputs_under_way
-from shields import synthesize, verify
+from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
 from tests.certificates import certificate_of
 from tests.plants import delayed, random_plant
+from tests.product import altered, linear_plant, synthesize
 
 
 def counted(C, L, reach):
@@ -24,7 +25,7 @@ def counted(C, L, reach):
 
 def test_largest_ellipse_fills_a_quarter_of_pi_whatever_the_units():
     for units in ([1.0, 1.0], [1e-4, 1e5]):
-        plant = replace(truck_trailer(), box=np.diag(1.0 / np.array(units)))
+        plant = altered(truck_trailer(), box=np.diag(1.0 / np.array(units)))
         assert share_of_box(plant, np.diag(np.square(units)))["share_of_box"] == pytest.approx(np.pi / 4.0, rel=1e-12)
 
 
@@ -35,13 +36,13 @@ def test_share_of_a_box_with_more_rows_than_states_agrees_with_counts(n, rows):
     root = rng.standard_normal((n, n))
     L = root @ root.T + np.eye(n)
     L /= np.einsum("ji,ik,jk->j", C, L, C).max()  # inside the box
-    share = share_of_box(replace(random_plant(0, n, 1), box=C), L)["share_of_box"]
+    share = share_of_box(altered(random_plant(0, n, 1), box=C), L)["share_of_box"]
     assert share == pytest.approx(counted(C, L, 1.0), abs=5e-3)
 
 
 def test_rows_that_say_nothing_new_change_nothing():
     plant = truck_trailer()
-    again = replace(plant, box=np.concatenate([plant.box_rows, 0.9 * plant.box_rows]))
+    again = altered(plant, box=np.concatenate([plant.box_rows, 0.9 * plant.box_rows]))
     L = np.diag([3.0, 1.0])
     assert share_of_box(again, L)["share_of_box"] == pytest.approx(share_of_box(plant, L)["share_of_box"], rel=1e-9)
 
@@ -49,7 +50,7 @@ def test_rows_that_say_nothing_new_change_nothing():
 def test_too_many_corners_are_a_reason_not_a_number(certificate):
     plant = random_plant(0, 6, 1)
     box = np.concatenate([np.eye(6), np.full((1, 6), 0.1)])
-    record = share_of_box(replace(plant, box=box), 0.5 * np.eye(6))
+    record = share_of_box(altered(plant, box=box), 0.5 * np.eye(6))
     assert set(record) == {"share_of_box_unknown"}
     text = size_of(replace(certificate, provenance=record))
     assert "unknown share of the safe box (a box of 7 rows in 6 dimensions" in text
@@ -62,7 +63,7 @@ def test_too_many_corners_are_a_reason_not_a_number(certificate):
 )
 def test_parallel_rows_bound_nothing_in_the_other_direction(rows):
     settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "u_max": 1.0}
-    plant = LinearPlant(**settings, box=rows, disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001)
+    plant = linear_plant(**settings, box=rows, disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001)
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
     assert "an unknown share of the safe box (the box is unbounded)" in " ".join(str(certificate).split())
@@ -70,13 +71,13 @@ def test_parallel_rows_bound_nothing_in_the_other_direction(rows):
 
 
 def test_unbounded_box_is_the_reason():
-    plant = replace(truck_trailer(), box=np.array([[0.5, 0.0]]))
+    plant = altered(truck_trailer(), box=np.array([[0.5, 0.0]]))
     assert share_of_box(plant, np.diag([1.0, 5.0])) == {"share_of_box_unknown": "the box is unbounded"}
 
 
 def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
     """States have no limits of their own: no points are drawn in between them."""
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9, 0.2], [-0.1, 0.9]], B=[[0.0], [0.3]], dt=0.1, box=[[1.0, 0.5], [-0.5, 1.0]], u_max=1.0,
         disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
     )  # fmt: skip
@@ -88,7 +89,7 @@ def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
 
 @pytest.mark.parametrize("limit", [([1.0, 1.0], -2.5, 2.5), ([1.0, 1.0], -1.1, 1.0)])
 def test_share_of_a_polytope_is_of_what_further_limits_leave_of_the_box(limit):
-    plant = LinearPlant(
+    plant = linear_plant(
         A=[[0.9, 0.4], [-0.3, 0.9]], B=[[0.0], [0.1]], dt=0.1, state_limits=([-1.0, -0.5], [0.8, 1.0]), u_max=0.5,
         output_limits=[limit], disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
     )  # fmt: skip
@@ -122,7 +123,7 @@ def test_plants_without_delay_have_no_input_under_way():
 
 
 def test_operating_point_shifts_nothing(certificate, loaded):
-    moved = replace(loaded, operating_state=[0.5, 0.1], operating_input=[0.2])
+    moved = altered(loaded, operating_state=[0.5, 0.1], operating_input=[0.2])
     assert share_of_box(moved, certificate.L) == share_of_box(loaded, certificate.L)
 
 

@@ -1,16 +1,16 @@
 import pickle
-from dataclasses import replace
 
 import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, LinearPlant, certified_error_set, truck_trailer
-from shields import Infeasible, SafetyShield, synthesize, verify
+from ncs_gym import Channel, ChannelContract, certified_error_set, truck_trailer
+from shields import Infeasible, verify
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import NAMED, named, random_plant
+from tests.product import altered, library_plant, linear_plant, safety_shield, sampled_plant, synthesize
 from tests.verdicts import verified
 
 OBLIQUE = np.array([[0.5, 0.0], [0.0, 0.5], [0.4, 0.4]])
@@ -35,7 +35,7 @@ def area_fraction(certificate, plant):
     ],
 )
 def test_truck_trailers_reach_the_measured_volumes(changes, fraction):
-    plant = truck_trailer(**changes)
+    plant = library_plant(truck_trailer, **changes)
     certificate = synthesize(plant, safe_set="ellipsoid")
     assert verified(certificate, plant).valid
     assert area_fraction(certificate, plant) >= fraction
@@ -60,7 +60,7 @@ def test_flat_disturbances_get_a_certificate_whatever_their_direction(rank, coun
     for _ in range(count):
         declared = random_plant(rank, 3, 1)
         torque = (0.02 * rng.standard_normal((3, rank)), 1.0)
-        plant = replace(declared, gamma=0.0, process_noise_cov=None, disturbance_bound=torque)
+        plant = altered(declared, gamma=0.0, process_noise_cov=None, disturbance_bound=torque)
         certificate = synthesize(plant)
         assert verified(certificate, plant).valid
 
@@ -74,15 +74,15 @@ def test_inputs_under_way_are_known_exactly_under_every_contract(whole):
     # Their errors are zero: error sets are flat in their directions, which float64 has to bear.
     system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
     for delay, age in ((1, 0), (1, 5), (3, 1)):
-        certified_error_set(LinearPlant.from_statespace(system, **CART, input_delay=delay), ChannelContract(age))
+        certified_error_set(sampled_plant(system, **CART, input_delay=delay), ChannelContract(age))
     if whole:
-        plant = LinearPlant.from_statespace(system, **CART, input_delay=1)
+        plant = sampled_plant(system, **CART, input_delay=1)
         assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
 
 
 def test_state_that_no_output_shows_is_named():
     system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[0.0, 1.0]], [[0.0]])
-    plant = LinearPlant.from_statespace(system, **CART, state_names=("place", "speed"))
+    plant = sampled_plant(system, **CART, state_names=("place", "speed"))
     with (
         feasible_age_not_sought(),
         pytest.raises(Infeasible, match="no error set exists: the outputs do not show place, whose errors"),
@@ -92,7 +92,7 @@ def test_state_that_no_output_shows_is_named():
 
 def test_box_with_more_rows_than_states_is_respected():
     angle = np.linspace(0.0, np.pi, 7)[:-1]
-    plant = truck_trailer(box=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
+    plant = library_plant(truck_trailer, box=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
     certificate = synthesize(plant, safe_set="ellipsoid")
     assert verified(certificate, plant).valid
     assert max(row @ certificate.L @ row for row in plant.box_rows) <= 1.0
@@ -104,7 +104,7 @@ def test_units_do_not_change_what_is_found():
     base = truck_trailer(mass=4000.0)
     units = np.diag([1e3, 1e-2])
     inverse = np.linalg.inv(units)
-    plant = LinearPlant(
+    plant = linear_plant(
         A=units @ base.A @ inverse,
         B=units @ base.B,
         box=base.box_rows @ inverse,
@@ -114,20 +114,22 @@ def test_units_do_not_change_what_is_found():
         process_noise_cov=units @ (2e-4 * np.eye(2)) @ units,
         measurement_noise_cov=1e-4 * np.eye(2),
     )
-    same = truck_trailer(mass=4000.0, gamma=0.0, process_noise_cov=2e-4 * np.eye(2), initial_cov=np.zeros((2, 2)))
+    same = library_plant(
+        truck_trailer, mass=4000.0, gamma=0.0, process_noise_cov=2e-4 * np.eye(2), initial_cov=np.zeros((2, 2))
+    )
     found, expected = (area_fraction(synthesize(each, safe_set="ellipsoid"), each) for each in (plant, same))
     assert found == pytest.approx(expected, abs=2e-3)
 
 
 @pytest.mark.parametrize("u_max", [1e6, slow(1e2), slow(1e4)])
 def test_input_limits_too_wide_to_bind_do_not_spoil_the_programs(u_max):
-    plant = replace(random_plant(3, 2, 1), u_max=u_max)
+    plant = altered(random_plant(3, 2, 1), u_max=u_max)
     assert area_fraction(synthesize(plant, safe_set="ellipsoid"), plant) > 0.9999
 
 
 @pytest.mark.slow
 def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
-    plant = truck_trailer(gamma=0.5)
+    plant = library_plant(truck_trailer, gamma=0.5)
     with (
         feasible_age_not_sought(),
         pytest.raises(Infeasible, match=r"disturbance and error radii shrink to .*%") as caught,
@@ -137,14 +139,14 @@ def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
     assert 0.0 < caught.value.shortfall < 1.0
     factor = (1.0 - caught.value.shortfall) ** 2 * 0.9
     zero = np.zeros((2, 2))
-    smaller = truck_trailer(gamma=factor * 0.5, process_noise_cov=zero, initial_cov=zero)
+    smaller = library_plant(truck_trailer, gamma=factor * 0.5, process_noise_cov=zero, initial_cov=zero)
     assert synthesize(smaller, safe_set="ellipsoid") is not None
     copy = pickle.loads(pickle.dumps(caught.value))
     assert (copy.binding, copy.shortfall) == (caught.value.binding, caught.value.shortfall)
 
 
 def test_unstable_plant_is_infeasible_for_want_of_an_error_bound():
-    plant = LinearPlant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
+    plant = linear_plant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
     with pytest.raises(Infeasible, match="spectral radius") as caught:
         synthesize(plant)
     assert caught.value.binding == "E1"
@@ -154,7 +156,7 @@ def test_unstable_plant_is_infeasible_for_want_of_an_error_bound():
 def test_weak_input_is_what_binds():
     # An unstable plant that a strong input can hold in the box, and a weak one cannot.
     def with_limit(u_max):
-        return LinearPlant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=4e-4)
+        return linear_plant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=4e-4)
 
     contract = ChannelContract(1)
     certificate = synthesize(with_limit(1.0), contract=contract, safe_set="ellipsoid")
@@ -177,7 +179,7 @@ def test_weak_input_is_what_binds():
     ],
 )
 def test_flat_and_absent_uncertainty_gets_a_certificate(bounds):
-    plant = truck_trailer(**bounds)
+    plant = library_plant(truck_trailer, **bounds)
     assert verified(synthesize(plant, safe_set="ellipsoid"), plant).valid
 
 
@@ -204,12 +206,13 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
             synthesize(plant, safe_set="ellipsoid")
         if answer is not None:  # the others of these are as the first
             return
+        oblique = library_plant(truck_trailer, box=OBLIQUE)
         with pytest.raises(Infeasible):
-            SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=truck_trailer(box=OBLIQUE), channel=Channel()))
+            safety_shield(gym.make("ncs_gym/TruckTrailer-v0", plant=oblique, channel=Channel()))
         # A polytope of no other rows than the box's needs no such program.
         assert verify(synthesize(plant), plant).valid
         with pytest.raises(Infeasible, match="largest ellipsoid"):
-            synthesize(truck_trailer(box=OBLIQUE))
+            synthesize(oblique)
 
 
 @pytest.mark.slow
@@ -239,7 +242,7 @@ def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(n, m
 def test_gain_that_hardly_matters_leaves_positive_multipliers(a, b, contract):
     """The multiplier of an error that no input answers to is tiny, and must not be rounded to zero."""
     bounds = {"disturbance_bound": 0.1, "sensor_bound": 0.003, "initial_bound": 0.01}
-    plant = LinearPlant(A=[[a]], B=[[b]], u_max=1.0, dt=0.1, box=[1.0], **bounds)
+    plant = linear_plant(A=[[a]], B=[[b]], u_max=1.0, dt=0.1, box=[1.0], **bounds)
     certificate = synthesize(plant, contract=contract and ChannelContract(contract))
     assert certificate.provenance["volume_of_box_ellipsoid"] > 0.9999
 

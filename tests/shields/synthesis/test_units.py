@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
-from shields import Infeasible, synthesize, verify
+from shields import Infeasible, verify
 from shields.synthesis.resting_point import needs_resting_point, resting_at
 from tests.plants import servo, small
+from tests.product import linear_plant, synthesize
 from tests.shields.polytope.limits import TANKS
 
 BOUNDS = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound": [0.01, 0.02]}
@@ -18,7 +19,7 @@ PLANTS = {
     "bearable": (servo(0.8), ChannelContract(1)),
     "refused": (small([[0.9, 0.1], [0.0, 0.8]], gamma=0.0, disturbance_bound=[1.0, 2.0], u_max=0.1), None),
     "tanks": (TANKS, ChannelContract(1)),
-    "free speed": (LinearPlant(box=[1.0, np.inf], **MODEL, **BOUNDS), ChannelContract(1)),
+    "free speed": (linear_plant(box=[1.0, np.inf], **MODEL, **BOUNDS), ChannelContract(1)),
 }
 
 
@@ -31,7 +32,7 @@ def in_units(plant: LinearPlant, state: np.ndarray, applied: np.ndarray, output:
         for name, unit in units.items()
         if (bound := getattr(plant, name)) is not None
     }
-    return LinearPlant(
+    return linear_plant(
         A=plant.A * state[:, None] / state,
         B=plant.B * state[:, None] / applied,
         H=plant.H * output[:, None] / state,
@@ -93,7 +94,7 @@ def test_middle_of_a_disturbance_rests_at_the_same_point_in_other_units(seed):
     low, high = np.array([0.0, -0.002]), np.array([0.004, 0.008])
 
     def plant(state: np.ndarray, applied: np.ndarray) -> LinearPlant:
-        return LinearPlant(
+        return linear_plant(
             A=np.array([[0.9, 0.1], [0.02, 0.95]]) * state[:, None] / state,
             B=np.array([[0.01], [0.1]]) * state[:, None] / applied,
             dt=0.1,

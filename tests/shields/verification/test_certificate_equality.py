@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shields import Certificate, synthesize
+from shields import Certificate
 from shields.json_documents import digest
 from tests.certificates import certificate_of, with_proof
 from tests.plants import named
+from tests.product import altered, synthesize
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +83,7 @@ def test_tolerated_scale_is_one_that_some_certificate_exists_for(loaded, certifi
     def scaled(factor):
         names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
         bounds = {name: factor**2 * getattr(loaded, name) for name in names}
-        return replace(loaded, gamma=factor**2 * loaded.gamma, **bounds)
+        return altered(loaded, gamma=factor**2 * loaded.gamma, **bounds)
 
     assert synthesize(scaled(0.99 * scale)).provenance["tolerated_scale"] == pytest.approx(1 / 0.99, rel=1e-2)
 

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, Remainder
-from shields import Certificate, CertificateError, SafetyFilter
+from shields import Certificate, CertificateError
 from shields.json_documents import document_of
 from shields.verification import require_valid
 from tests.certificates import certificate_of, with_proof
 from tests.plants import named
+from tests.product import safety_filter
 from tests.verdicts import assert_true, broken, verified
 
 # Plants of `named`, and what is kept; with a polytope, the ellipsoid is proved, too, but for the first and third servo.
@@ -378,7 +379,7 @@ def test_changed_part_is_noticed_by_the_right_conditions(name, conditions, chang
     with pytest.raises(CertificateError, match=words):
         require_valid(changed, plant)
     with pytest.raises(CertificateError):
-        SafetyFilter(changed, plant)
+        safety_filter(changed, plant)
 
 
 @pytest.mark.parametrize("name", CASES)

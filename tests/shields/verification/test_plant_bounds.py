@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields.paper import synthesize as paper_synthesis
 from tests.certificates import certificate_of
 from tests.plants import named
+from tests.product import altered, library_plant, paper_synthesis
 from tests.shields.verification.test_mutations import replaced
 from tests.verdicts import broken, verified
 
@@ -22,7 +22,7 @@ BOUNDS = {
 @pytest.fixture(scope="module")
 def designed():
     """Declared bounds beside covariances; those of bounds alone are among the mutations."""
-    plant = truck_trailer(4000.0, initial_cov=np.diag([1e-4, 0.0]), gamma=1e-4, **BOUNDS)
+    plant = library_plant(truck_trailer, 4000.0, initial_cov=np.diag([1e-4, 0.0]), gamma=1e-4, **BOUNDS)
     return plant, certificate_of(plant)
 
 
@@ -39,11 +39,11 @@ def test_sets_that_miss_a_declared_bound_make_a_certificate_invalid(designed, na
 
 
 def test_paper_certificate_proves_nothing_of_bounds_that_its_theorems_do_not_know():
-    small = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
+    small = library_plant(truck_trailer, gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
     paper = paper_synthesis(small)
     assert verified(paper, small).valid
     for name in BOUNDS:
-        plant = replace(small, **{name: 1e-4})
+        plant = altered(small, **{name: 1e-4})
         assert not verified(replace(paper, fingerprint=plant.fingerprint), plant).valid
 
 

@@ -9,6 +9,7 @@ from ncs_gym import ChannelContract, batch_reactor
 from shields import Certificate, CertificateError
 from shields.json_documents import document_of, write_document
 from tests.certificates import certificate_of, with_proof
+from tests.product import library_plant
 from tests.verdicts import verified
 
 
@@ -104,7 +105,7 @@ def test_file_that_says_two_things_of_the_largest_age_is_refused(promised, chang
 
 def test_certificate_for_other_outputs_does_not_fit(promised):
     _, certificate = promised
-    other = batch_reactor(H=np.eye(4), measurement_noise_cov=1e-6 * np.eye(4))
+    other = library_plant(batch_reactor, H=np.eye(4), measurement_noise_cov=1e-6 * np.eye(4))
     report = verified(replace(certificate, fingerprint=other.fingerprint), other)
     assert not report.valid
     assert "shapes" in next(condition.name for condition in report.conditions if not condition.holds)

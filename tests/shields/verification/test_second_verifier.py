@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from shields import verify
-from shields.paper import synthesize as paper_synthesis
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
 from tests.certificates import certificate_of
 from tests.plants import named
+from tests.product import library_plant, paper_synthesis
 from tests.second_verifier import verify as second_verifier
 from tests.second_verifier.bounds import keeps_enough
 from tests.second_verifier.exact import at_least_zero, definite, is_semidefinite, matrix
@@ -119,7 +119,7 @@ def test_large_limits_and_small_multipliers_are_judged_alike():
 def test_no_truncation_removes_more_than_delta(delta):
     """1 - delta as a float may be smaller than the number, which once made quantiles of small delta too small."""
     for factor in (1.0, 1.1, 1.3, 1.7, 1.9):
-        plant = truck_trailer(delta=min(delta * factor, 0.999))
+        plant = library_plant(truck_trailer, delta=min(delta * factor, 0.999))
         for noise in (plant.process_noise, plant.sensor_noise, plant.initial_noise):
             assert keeps_enough("chi-square", noise, plant).holds
 
@@ -134,7 +134,7 @@ def test_quantile_a_hair_too_small_is_noticed_by_the_second_verifier(certificate
 
 
 def test_paper_certificate_is_judged_by_both_up_to_its_boundary():
-    plant = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
+    plant = library_plant(truck_trailer, gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
     paper = paper_synthesis(plant)
     assert verified(paper, plant).valid
     for factor in np.geomspace(0.3, 1.1, 40):

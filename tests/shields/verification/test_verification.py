@@ -10,13 +10,14 @@ from ncs_gym import truck_trailer
 from shields.verification import Condition, Report
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.product import altered, library_plant
 from tests.shields.verification.test_mutations import with_multipliers
 from tests.verdicts import broken, verified
 
 
 def test_margins_of_several_inputs_agree_with_floating_point():
     # Large limits and a small multiplier s, so that the rounding of actions counts in (I) and in (U).
-    plant = replace(random_plant(3, 3, 2), u_max=[1e3, 2e3])
+    plant = altered(random_plant(3, 3, 2), u_max=[1e3, 2e3])
     certificate = with_multipliers(certificate_of(plant), rounding=1e-9)
     c, s = certificate, certificate.multipliers
     margins = {condition.name.split(" stays")[0]: condition.margin for condition in verified(c, plant).conditions}
@@ -75,9 +76,8 @@ def test_report_prints_conditions_that_differ_in_the_age_alone_once_and_every_br
 
 def test_only_positive_definiteness_excludes_a_flat_set():
     # Without L > 0 the point set {0} would be "invariant": only a plant without any disturbance could have it.
-    plant = truck_trailer(
-        gamma=0.0, process_noise_cov=np.zeros((2, 2)), initial_cov=np.zeros((2, 2)), measurement_noise_cov=np.eye(2)
-    )
+    noise = dict.fromkeys(("process_noise_cov", "initial_cov"), np.zeros((2, 2))) | {"measurement_noise_cov": np.eye(2)}
+    plant = library_plant(truck_trailer, gamma=0.0, **noise)
     certificate = certificate_of(plant)
     flat = replace(certificate, L=np.zeros((2, 2)), K=np.zeros((1, 2)))
     found = broken(flat, plant)

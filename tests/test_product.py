@@ -1,0 +1,51 @@
+"""Only tests of what constructors refuse make anything of the product themselves; the others ask `tests/product.py`."""
+
+import ast
+import inspect
+from pathlib import Path
+
+from ncs_gym import LinearPlant
+
+TESTS = Path(__file__).resolve().parent
+OWN_REFUSALS = {"ncs_gym/test_refusals.py", "hardening/test_invalid_settings.py", "shields/runtime/test_refusals.py"}
+CLASSES = {"LinearPlant", "NCSEnv", "NCSVectorEnv", "SafetyShield", "VectorSafetyShield", "SafetyFilter", "SafeLoop"}
+METHODS = {"from_statespace", "family", "resampled", "with_rate_limits"}
+FUNCTIONS = {"synthesize", "linear_model"}
+LIBRARY = {"truck_trailer", "cart_pole", "batch_reactor", "stirred_tank", "lane_keeping", "convoy"}
+OF_PLANTS = {*inspect.signature(LinearPlant).parameters} - {"dt"}
+
+
+def past_the_door(source):
+    """The lines of a program that make something of the product themselves."""
+    return sorted({node.lineno for node in ast.walk(ast.parse(source)) if makes(node)})
+
+
+def makes(node):
+    if isinstance(node, ast.ImportFrom):
+        of_product = (node.module or "").startswith(("ncs_gym", "shields"))
+        return of_product and FUNCTIONS & {each.name for each in node.names}
+    if not isinstance(node, ast.Call):
+        return False
+    *owner, name = ast.unparse(node.args[0] if ast.unparse(node.func) == "partial" else node.func).split(".")
+    given = {each.arg for each in node.keywords}
+    return (
+        name in CLASSES
+        or (owner and name in METHODS)
+        or (owner in (["ncs_gym"], ["shields"], ["shields", "paper"]) and name in FUNCTIONS)
+        or (name in LIBRARY and given & (OF_PLANTS | {None}))  # limits and bounds, not a mass
+        or (name == "replace" and given & (OF_PLANTS - {"A", "B", "between_samples"}))  # of other values, too
+        or (owner == ["gym"] and "plant" in given and "LinearNCS" in ast.unparse(node.args[0]))
+    )
+
+
+def test_nothing_but_refusals_goes_past_the_door():
+    found = {path.relative_to(TESTS).as_posix(): past_the_door(path.read_text()) for path in TESTS.rglob("*.py")}
+    assert all(found.pop(name) for name in OWN_REFUSALS | {"product.py"})
+    assert {name: lines for name, lines in found.items() if lines} == {}
+
+
+def test_every_way_past_the_door_is_found():
+    ways = """LinearPlant(**given); ncs_gym.NCSEnv(plant); partial(SafetyShield, env); plant.resampled(0.1)
+        from shields.paper import synthesize as own; shields.synthesize(plant); truck_trailer(gamma=0.0)
+        replace(plant, u_max=1.0); gym.make("ncs_gym/LinearNCS-v0", plant=plant)"""
+    assert all(past_the_door(way.strip()) for line in ways.splitlines() for way in line.split(";"))
