@@ -8,6 +8,7 @@ import pytest
 from benchmarks import published as script
 from experiments.commands.attack import attacked, worst_case
 from ncs_gym import certified_error_set
+from shields.synthesis.resting_point import farthest_from_limits
 from tests.certificates import certificate_of
 from tests.product import altered, linear_plant, vector_env, vector_shield
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
@@ -56,3 +57,9 @@ def test_error_sets_are_found_where_steps_are_short_or_inputs_weak(name):
     """A regulator that had to decay by a quarter in every step weighed errors by 1e8 to 1e11 here."""
     plant, contract = script.plant_of(name), script.contract_of_plant(name)
     assert certified_error_set(plant, contract).contract == contract
+
+
+def test_resting_point_is_near_the_operating_point_where_no_limit_sees_it():
+    """Of a drone whose position is free: 20 km away the rounding of rest was more than error sets have room for."""
+    rest = farthest_from_limits(script.plant_of("quad12_osqp"))
+    assert np.abs(rest.state).max() < 1.0

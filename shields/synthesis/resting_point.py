@@ -27,6 +27,8 @@ _MOST_TURNS = 6
 # How far a state without a limit is taken to go while a gain is sought, next to where a regulator lets it go.
 _GENEROUS = 2.0
 _STEPS_OF_REACH = 400
+# What limits see of a direction less than this, in which they are about 1 away, is rounding.
+_UNSEEN = 1e-9
 # A limit binds if more of what all nearest ones leave is due to it.
 _LEAST_PRICE = 1e-3
 
@@ -103,7 +105,11 @@ def farthest_equilibrium(plant: LinearPlant, needs: np.ndarray | None = None) ->
     numbers = np.concatenate([np.flatnonzero(above), np.flatnonzero(below)])
     prices = -found.ineqlin.marginals * needed[numbers, 0]  # they add up to 1
     binding = np.unique(numbers[prices > _LEAST_PRICE])
-    return Farthest(rest_at(plant, directions @ found.x[:-1]), float(found.x[-1]), binding)
+    # Where no limit sees a direction, such as a position, it is the equilibrium nearest to the operating point.
+    units = np.concatenate([plant.half_widths, plant.input_half])[:, None]
+    point, unseen = directions @ found.x[:-1], directions @ null_space(reached, rcond=_UNSEEN)
+    point = point - unseen @ np.linalg.lstsq(unseen / units, point / units[:, 0])[0]
+    return Farthest(rest_at(plant, point), float(found.x[-1]), binding)
 
 
 def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:
