@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from agents.agent_file import AGENT_FILES
 from benchmarks.commands import run
 from benchmarks.study_figures import ATTACKED, study_figures
 from experiments.analysis.episodes import episodes_table
@@ -105,7 +106,7 @@ def compare(
         found = compared(settings)
         environments[name] = environment(found.summary, found.episodes)
         switching = replace(settings, out=settings.out / "channels", episodes=channel_episodes, scenarios=(ATTACKED,))
-        channels[name] = channel_switches(switching, found)
+        channels[name] = channel_switches(switching, found, settings.out / "models")
     summary = {"environments": environments, "channels": channels, "versions": versions()}
     numbers.write_text(json.dumps(summary, allow_nan=False) + "\n", "utf-8")
 
@@ -152,11 +153,11 @@ def switched(channel: Channel, contract: ChannelContract | None, on: Sequence[st
     return changes
 
 
-def channel_switches(settings: CompareSettings, comparison: Comparison) -> list[dict[str, Any]]:
+def channel_switches(settings: CompareSettings, comparison: Comparison, models: Path) -> list[dict[str, Any]]:
     """Returns how many attacked episodes of each `arm` violate with no, each alone and all of `SWITCHES` on (`on`).
 
     The attack has the strongest disturbance, noise of full size, and bursts as long as the contract allows. Agents are
-    those of the comparison, trained with all of the environment's own impairments.
+    those of the comparison, in its folder of models, trained with all of the environment's own impairments.
     """
     env, results = registered_env(settings.env), by_arm(comparison.results)
     agents = {name: results[name][:MOST_AGENTS] for name in SWITCHED_AGENTS if name in settings.arms}
@@ -169,7 +170,8 @@ def channel_switches(settings: CompareSettings, comparison: Comparison) -> list[
             part = replace(settings, episodes=-(-settings.episodes // len(trained)))
             for index, agent in enumerate(trained):
                 run_of_agent = run_of_arm(part, loop, certificate, name, index, point)
-                runs.append(replace(run_of_agent, agent_files=agent.files))
+                files = {each: (models / f"{agent.arm}-{agent.index}" / each).read_bytes() for each in AGENT_FILES}
+                runs.append(replace(run_of_agent, agent_files=files))
         played = episodes_table(results_of(runs, settings.out, settings))
         for arm, attacked in played[played["scenario"] == ATTACKED].groupby("arm", sort=False):
             violating = int(attacked["violating"].sum())

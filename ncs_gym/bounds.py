@@ -49,8 +49,8 @@ class Box(UncertainSet):
 
     @cached_property
     def half(self) -> np.ndarray:
-        """Half-widths, shape (n,), or a number."""
-        return 0.5 * (self.high - self.low)
+        """Half-widths, shape (n,), or a number: the farther end from the middle, which rounding may have moved."""
+        return np.maximum(self.high - self.middle, self.middle - self.low)
 
     def sized(self, size: int) -> Any:  # noqa: D102
         if self.size is not None:
@@ -120,7 +120,10 @@ class Gaussian(UncertainSet):
 
 @dataclass(frozen=True, eq=False)
 class Through(UncertainSet):
-    """{E w : w in a set}, E of shape (n, q); half-widths of w are a set, too."""
+    """{E w : w in a set}, E of shape (n, q); half-widths of w are a set, too.
+
+    A Gaussian is refused, since what holds except with a probability must be seen as that: it has a covariance E P E'.
+    """
 
     E: Any
     set: Any
@@ -128,6 +131,8 @@ class Through(UncertainSet):
     def __post_init__(self) -> None:
         object.__setattr__(self, "E", as_matrix(self.E, (None, None), "E of a set through E"))
         object.__setattr__(self, "set", as_set(self.set).sized(self.E.shape[1]))
+        if isinstance(self.set, Gaussian) or (isinstance(self.set, Sum) and self.set.gaussian):
+            raise ValueError("a Gaussian through E is a Gaussian of covariance E P E': give that one")
         object.__setattr__(self, "size", len(self.E))
         object.__setattr__(self, "middle", self.E @ np.broadcast_to(self.set.middle, self.E.shape[1]))
         self._make_arrays_read_only()
@@ -208,6 +213,12 @@ def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.eye(inside.size) if E is None else E, inside.middle)]
 
 
+def require_about_zero(own: Any, name: str) -> None:
+    """Raises ValueError, calling a set by this name, if its middle, which an `ellipsoid` does not have, is not zero."""
+    if np.any(own.middle):
+        raise ValueError(f"{name} must have its middle at zero, got {shown(np.asarray(own.middle).tolist())}")
+
+
 KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Box, Ball, Ellipsoid, Gaussian, Through, Sum)}
 
 
@@ -240,9 +251,13 @@ class Bounds(ReadOnlyArrays):
     """What bounds the uncertainties of a plant: half-widths, a number or a vector, or sets; 0 says that there is none.
 
     Attributes:
-        disturbance: Of d in x+ = A x + B u + d.
-        sensor: Of v in y = H x + v.
-        first_error: Of the error of the first estimate.
+        disturbance: Of d in x+ = A x + B u + d. A set whose middle is not zero moves the point that deviations are
+            counted from (`LinearPlant`).
+        sensor: Of v in y = H x + v, about zero.
+        first_error: Of the error of the first estimate, about zero.
+
+    Raises:
+        ValueError: If one is no set, or that of sensors or of the first error is not about zero.
     """
 
     disturbance: Any
@@ -251,6 +266,8 @@ class Bounds(ReadOnlyArrays):
 
     def __post_init__(self) -> None:
         self._put(lambda value, _: as_set(value), (0, 0))
+        for name in ("sensor", "first_error"):
+            require_about_zero(getattr(self, name), f"Bounds({name}=...)")
 
     def sized(self, n: int, p: int) -> Bounds:
         """Returns the bounds of a plant with n states and p outputs, each of which is a sum of sets.

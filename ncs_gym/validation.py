@@ -6,10 +6,6 @@ import copy
 import math
 import sys
 import warnings
-from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cached_property
 from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, Self
@@ -72,40 +68,6 @@ class CopiedWhole:
 
     def __copy__(self) -> Self:
         return copy.deepcopy(self)
-
-
-@contextmanager
-def storing_nothing(shared: Any) -> Iterator[None]:
-    """Runs code of others with an object that many environments share.
-
-    Raises:
-        ValueError: If it stores something in the object, which the next environment would read.
-    """
-    before = _stored(shared)
-    yield
-    for name, (value, image) in _stored(shared).items():
-        if name not in before or before[name][0] is not value or before[name][1] != image:
-            raise ValueError(
-                f"{type(shared).__name__} stores {name!r} in itself, which all environments of a vector share: keep it "
-                "in what begin returns, which each episode has for itself"
-            )
-
-
-def _stored(shared: Any) -> dict[str, tuple[Any, Any]]:
-    """Returns the attributes of an object but those that are computed once, each with what shows a change inside."""
-
-    def image(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            return value.tobytes() if value.flags.writeable else None
-        entries = value.values() if isinstance(value, dict) else value
-        return list(map(id, entries)) if isinstance(value, list | dict | set | deque) else None
-
-    kind = type(shared)
-    return {
-        name: (value, image(value))
-        for name, value in vars(shared).items()
-        if not isinstance(getattr(kind, name, None), cached_property)
-    }
 
 
 def setting(name: str, kept_as: str | None = None) -> Any:

@@ -31,7 +31,7 @@ MODULES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*
 # Folders and modules of each package, from the bottom up: a row imports from itself and from rows above it.
 LAYERS = {
     "ncs_gym": (
-        {"exact", "installation", "reading", "validation"},
+        {"exact", "installation", "reading", "shared", "validation"},
         {"uncertainty", "plants", "model", "limits", "bounds"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},

@@ -2,11 +2,14 @@
 
 import json
 import re
+from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.agent_file import AGENT_FILES
 from benchmarks import study as script
 from benchmarks.study import (
     ENVS,
@@ -30,6 +33,7 @@ from benchmarks.study_figures import return_figure, study_figures
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.runs.loops import changed_channel
+from experiments.settings import CompareSettings
 from ncs_gym.envs.env import ncs_env
 from tests.experiments.results import run, summary_of
 from tests.workers import no_worker_processes
@@ -273,3 +277,26 @@ def test_a_small_study_shows_that_losses_decide_for_the_regulator_and_nothing_br
     assert all(each["episodes"] == 12 for each in rows)
     assert np.isfinite([arm["scenarios"]["attacked"]["return"] for arm in env["arms"].values()]).all()
     assert "CSTR-v0 lookahead" in network_table(summary) + all_tables(summary)
+
+
+def test_switched_impairments_are_met_by_the_agents_of_the_comparison(monkeypatch, tmp_path):
+    """The results of runs come without the agents' files, which are in the comparison's folder."""
+    arm, met = script.SWITCHED_AGENTS[0], []
+    results = [run(arm, index) for index in range(2)]
+    for each in results:
+        (folder := tmp_path / "models" / f"{arm}-{each.index}").mkdir(parents=True)
+        for name in AGENT_FILES:
+            (folder / name).write_bytes(f"{name} {each.index}".encode())
+
+    def played(runs, *rest):
+        met.extend(runs)
+        return [replace(result, scenarios={script.ATTACKED: result.episodes}) for result in results]
+
+    monkeypatch.setattr(script, "results_of", played)
+    settings = CompareSettings(env=ENVS[0], arms=(arm,), scenarios=(script.ATTACKED,), out=tmp_path / "channels")
+    script.channel_switches(settings, SimpleNamespace(results=results), tmp_path / "models")
+    agents = [each for each in met if each.arm == arm]
+    assert len(agents) == 2 * (len(SWITCHES) + 2)
+    assert not any(each.trains for each in met)
+    for each in agents:
+        assert each.agent_files == {name: f"{name} {each.index}".encode() for name in AGENT_FILES}

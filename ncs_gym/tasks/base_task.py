@@ -10,7 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import ReadOnlyArrays, guarded, shown, storing_nothing
+from ncs_gym.shared import begun_many, storing_nothing
+from ncs_gym.validation import ReadOnlyArrays, guarded, shown
 
 
 class Task(ReadOnlyArrays, ABC):
@@ -71,13 +72,7 @@ class Task(ReadOnlyArrays, ABC):
 
     def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
         """Returns the task states of `count` episodes along the last axis."""
-        with storing_nothing(self):
-            if self.vectorized:
-                return self.begin(rng, plant, count)
-            states = np.empty(count, dtype=object)
-            for episode in range(count):
-                states[episode] = self.begin(rng, plant)
-            return states
+        return begun_many(self, rng, plant, count)
 
     def advance_many(
         self, rng: np.random.Generator, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray

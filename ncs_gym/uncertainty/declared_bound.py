@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym.bounds import Ball, Through, as_set
+from ncs_gym.bounds import Ball, Through, as_set, require_about_zero
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_setting
 
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 
 def as_bound(value: Any, size: int, name: str) -> Ellipsoid:
-    """Returns the ellipsoid around `declared_set`."""
-    return declared_set(value, size, name).ellipsoid()
+    """Returns the ellipsoid around `declared_set`; raises ValueError unless its middle is zero."""
+    own = declared_set(value, size, name)
+    require_about_zero(own, name)
+    return own.ellipsoid()
 
 
 def declared_set(value: Any, size: int, name: str) -> Any:

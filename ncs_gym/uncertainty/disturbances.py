@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.shared import begun_many, storing_nothing
 from ncs_gym.uncertainty.declared_bound import diagonal_inside, sample_box
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, sum_gauge
 from ncs_gym.validation import (
@@ -26,7 +27,6 @@ from ncs_gym.validation import (
     as_setting,
     as_vector,
     shown,
-    storing_nothing,
 )
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.
@@ -84,13 +84,7 @@ class Disturbance(ReadOnlyArrays, ABC):
 
     def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
         """Returns the memories of `count` episodes along the last axis."""
-        with storing_nothing(self):
-            if self.vectorized:
-                return self.begin(rng, plant, count)
-            memories = np.empty(count, dtype=object)
-            for episode in range(count):
-                memories[episode] = self.begin(rng, plant)
-            return memories
+        return begun_many(self, rng, plant, count)
 
     def draw_many(
         self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, steps: np.ndarray, memory: Any

@@ -60,7 +60,7 @@ def certify(
     return certificate if verify(certificate, plant).valid else None
 
 
-class Ellipsoid(NamedTuple):
+class FoundEllipsoid(NamedTuple):
     """What a search for the largest ellipsoid found.
 
     Attributes:
@@ -83,7 +83,7 @@ def largest_ellipsoid(
     start: Certificate | None = None,
     alternations: int = ALTERNATIONS,
     tightened_boxes: tuple[np.ndarray, ...] = (),
-) -> Ellipsoid:
+) -> FoundEllipsoid:
     """Returns the largest set that alternation finds, verified.
 
     Args:
@@ -113,7 +113,7 @@ def largest_ellipsoid(
 
     found = largest_set(problem, SLACKS[0], report, near, alternations)
     if found is None:
-        return Ellipsoid(problem, None, None, _known_reason(plant, tightened_boxes))
+        return FoundEllipsoid(problem, None, None, _known_reason(plant, tightened_boxes))
     failure, K = None, None
     for slack in SLACKS:
         design = found if slack == SLACKS[0] else tightened(problem, found, slack)
@@ -125,15 +125,15 @@ def largest_ellipsoid(
         try:
             box_rows = _tightened_box(certificate, plant, tightened_boxes)
         except Infeasible as leaves:
-            return Ellipsoid(problem, None, K, leaves)
+            return FoundEllipsoid(problem, None, K, leaves)
         if box_rows is not None:
             boxes = (*tightened_boxes, box_rows)
             return largest_ellipsoid(plant, contract, search, start, alternations, boxes)
         verification = verify(certificate, plant)
         if verification.valid:
-            return Ellipsoid(problem, certificate, K, None)
+            return FoundEllipsoid(problem, certificate, K, None)
         failure = failure or _failed_verification(verification)
-    return Ellipsoid(problem, None, K, failure)
+    return FoundEllipsoid(problem, None, K, failure)
 
 
 def with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:

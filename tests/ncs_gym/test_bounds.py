@@ -1,12 +1,15 @@
 """The sets that bound what is uncertain: all answer the same questions, and each owns what it refuses."""
 
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through, as_set
+from ncs_gym.uncertainty.declared_bound import as_bound
+from tests.plants import small
 
 E = np.array([[1.0, 0.5], [0.0, 2.0], [0.3, 0.0]])
 SETS = {
@@ -82,6 +85,13 @@ def test_arrays_of_sets_cannot_be_written_to():
         (lambda: as_set({"Box": {"low": 0.0}}), "a set must be a number"),
         (lambda: as_set(None), "a set must be a number"),
         (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
+        (lambda: Through(E, Gaussian(np.eye(2), 0.1)), "a Gaussian of covariance E P E'"),
+        (lambda: Through(E, Ball(0.1) + Gaussian(np.eye(2), 0.1)), "a Gaussian of covariance E P E'"),
+        (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
+        (lambda: Bounds(0.1, 0.1, Box([0.0, -1.0], [0.2, 1.0])), r"first_error=...\) must have its middle at zero"),
+        (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
+        (lambda: as_bound(Box(0.0, 0.2), 1, "the remainder"), "the remainder must have its middle at zero"),
+        (lambda: small(np.eye(2), sensor_bound=Box(0.0, 0.2)), "must have its middle at zero"),
         (
             lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sized(3, 1),
             r"Bounds\(first_error=...\): a set in dimension 3 is needed",
@@ -91,6 +101,14 @@ def test_arrays_of_sets_cannot_be_written_to():
 def test_what_is_no_set_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_half_widths_reach_both_ends_where_rounding_moves_the_middle():
+    low = 1e6 + 1e-10 * np.arange(100.0)
+    box = Box(low, low + np.linspace(1e-9, 3e-9, 100))
+    exact = [[Fraction(each) for each in numbers.tolist()] for numbers in (box.low, box.high, box.middle, box.half)]
+    assert all(middle - half <= low and high <= middle + half for low, high, middle, half in zip(*exact, strict=True))
+    assert (0.5 * (box.high - box.low) < box.half).any()
 
 
 def test_bounds_have_no_defaults():
