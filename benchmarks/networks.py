@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -59,6 +58,7 @@ from ncs_gym.network import CommittedInputs
 from ncs_gym.registration import registered_ids
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Certificate, Infeasible, SafetyShield, VectorSafetyShield, certificate_for, synthesize
+from shields.paper.bounds import with_noise
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.initial_designs import initial_design
 from shields.synthesis.invariant_set_program import InvariantSetProgram
@@ -103,11 +103,11 @@ def _with_radius(plant: LinearPlant, radius: float) -> LinearPlant:
     """The plant with a disturbance of that fraction of the box, and a hundredth of it elsewhere."""
     half_widths, n = plant.half_widths, plant.n
     outputs = np.abs(plant.H) @ half_widths
-    return replace(
+    return with_noise(
         plant,
-        process_noise_cov=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
-        measurement_noise_cov=np.diag((0.01 * radius * outputs) ** 2) / truncation_energy(0.05, plant.p),
-        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / truncation_energy(0.05, n) * np.eye(n),
+        Q=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
+        R=np.diag((0.01 * radius * outputs) ** 2) / truncation_energy(0.05, plant.p),
+        P0=(0.01 * radius * half_widths.min()) ** 2 / truncation_energy(0.05, n) * np.eye(n),
     )
 
 

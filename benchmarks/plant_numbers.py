@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +22,13 @@ from benchmarks.commands import run
 from benchmarks.hashes import registered
 from benchmarks.published import plant_of, published
 from benchmarks.random_plants import badly_scaled_plant, random_plant, slow_and_fast_plant
-from ncs_gym import LinearPlant
+from ncs_gym import Ball, Bounds, Box, Limits, LinearPlant, Model, Through
 
 RANDOM, SAME_SET = 100, 1e-12
 EXACT = (
     *("A", "B", "H", "dt", "box", "box_ends", "input_ends", "mixed_rows", "mixed_ends", "gamma", "process_noise_cov"),
     *("measurement_noise_cov", "initial_cov", "operating_state", "operating_input", "step_offset", "own_limits"),
-    *("input_middle", "input_half", "reach", "between_samples", "continuous_model", "fingerprint"),
+    *("input_middle", "input_half", "reach", "between_samples", "continuous_model"),
 )
 SETS = (
     *("disturbance", "allowed_disturbance", "nominal_disturbance", "sensor_error", "nominal_sensor_error"),
@@ -99,27 +98,17 @@ def limited(seed: int) -> LinearPlant:
     x, u = rng.uniform(-3.0, 3.0, n), rng.uniform(-3.0, 3.0, m)
     of_x, of_u = rng.standard_normal(n), rng.standard_normal(m)
     E, widths = rng.standard_normal((n, 2)), rng.uniform(1e-3, 5e-3, 2)
-    settings = {
-        "operating_state": x,
-        "operating_input": u,
-        "state_limits": (x - rng.uniform(0.5, 2.0, n), np.where(rng.random(n) < 0.2, np.inf, x + 1.0)),
-        "input_limits": (u - rng.uniform(0.5, 2.0, m), u + rng.uniform(0.5, 2.0, m)),
-        "output_limits": [(of_x, of_x @ x - 1.0, of_x @ x + rng.uniform(1.0, 2.0))][: seed % 2],
-        "mixed_limits": [(of_x, of_u, of_x @ x + of_u @ u - 1.5, of_x @ x + of_u @ u + 1.0)][: seed // 2 % 2],
-        "disturbance_bound": (
-            (E, -widths, 1.5 * widths),
-            (E, widths),
-            widths[0],
-            np.full(n, widths[1]),
-        )[seed // 3 % 4],
-        "sensor_bound": 1e-3,
-        "initial_bound": np.full(n, 2e-3),
-        "offset": x - A @ x - B @ u if seed % 5 == 0 else None,
-        "input_delay": seed // 4 % 3 or None,
-        "du_max": 0.2 if seed // 7 % 3 == 1 else None,
-    }
-    plant = LinearPlant.from_statespace((A, B, np.eye(n), 0, 0.1), **settings)
-    return replace(plant, B=0.5 * plant.B, step_offset=None) if seed % 11 == 1 else plant
+    state = x - rng.uniform(0.5, 2.0, n), np.where(rng.random(n) < 0.2, np.inf, x + 1.0)
+    applied = u - rng.uniform(0.5, 2.0, m), u + rng.uniform(0.5, 2.0, m)
+    rows = [(of_x, None, of_x @ x - 1.0, of_x @ x + rng.uniform(1.0, 2.0))][: seed % 2]
+    rows += [(of_x, of_u, of_x @ x + of_u @ u - 1.5, of_x @ x + of_u @ u + 1.0)][: seed // 2 % 2]
+    disturbances = Through(E, Box(-widths, 1.5 * widths)), Through(E, widths), Ball(widths[0]), np.full(n, widths[1])
+    model = Model(A, B, np.eye(n), 0.1, (x, u), x - A @ x - B @ u if seed % 5 == 0 else None)
+    return LinearPlant(
+        model.with_delays(seed // 4 % 3),
+        Limits(state, applied, rows, 0.2 if seed // 7 % 3 == 1 else None),
+        Bounds(disturbances[seed // 3 % 4], Ball(1e-3), np.full(n, 2e-3)),
+    )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 
 from benchmarks.commands import run, table
 from experiments.commands.attack import attacked, channels_of, worst_case
-from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv
+from ncs_gym import Bounds, Box, Channel, ChannelContract, Limits, LinearPlant, Model, NCSVectorEnv, Through
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, Infeasible, VectorSafetyShield, synthesize, verify
@@ -54,20 +54,15 @@ def plant_of(name: str) -> LinearPlant:
     E = np.array(p["disturbance_matrix"])
     E = zero_order_hold(A, E, dt)[1] if is_continuous else E
     outputs = [
-        (row := each["row"], *(_end(each[side], infinite) + np.dot(row, state) for side, infinite in _SIDES.items()))
+        (row := each["row"], None, *(_end(each[side], end) + np.dot(row, state) for side, end in _SIDES.items()))
         for each in p["output_rows"]
     ]
-    return LinearPlant.from_statespace(
-        (A, p["B"], p["C"], 0) if is_continuous else (A, p["B"], p["C"], 0, dt),
-        dt,
-        operating_state=state,
-        operating_input=p["operating_input"],
-        state_limits=(low, high),
-        input_limits=(p["input_low"], p["input_high"]),
-        output_limits=outputs or None,
-        disturbance_bound=(E, p["disturbance_low"], p["disturbance_high"]),
-        sensor_bound=p["sensor_half_widths"],
-        initial_bound=p["first_error_half_widths"],
+    made = Model.sampled if is_continuous else Model
+    disturbance = Through(E, Box(p["disturbance_low"], p["disturbance_high"]))
+    return LinearPlant(
+        made(A, p["B"], p["C"], dt, (state, p["operating_input"])),
+        Limits((low, high), (p["input_low"], p["input_high"]), outputs),
+        Bounds(disturbance, sensor=p["sensor_half_widths"], first_error=p["first_error_half_widths"]),
     )
 
 

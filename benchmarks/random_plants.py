@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import ortho_group
 
-from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym import Ball, Bounds, ChannelContract, Gaussian, Limits, LinearPlant, Model
 
 # Step of `slow_and_fast_plant`, how its time constants are spread, and the units of its states and inputs.
 STEP, TIME_CONSTANTS, UNITS = 0.1, (0.03, 300.0), (1e-3, 1e3)
@@ -19,17 +19,13 @@ def random_plant(seed: int, n: int, m: int, p: int | None = None, gamma: float =
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((n, n))
     A *= rng.uniform(0.4, 0.9) / np.abs(np.linalg.eigvals(A)).max()
+    B, u_max = rng.standard_normal((n, m)), rng.uniform(0.5, 2.0, m)
+    H, sensed = (None, n) if p is None else (rng.standard_normal((p, n)), p)
+    noise = Gaussian(1e-5 * np.eye(n), 0.05)
     return LinearPlant(
-        A=A,
-        B=rng.standard_normal((n, m)),
-        box=np.eye(n),
-        u_max=rng.uniform(0.5, 2.0, m),
-        dt=0.1,
-        gamma=gamma,
-        H=None if p is None else rng.standard_normal((p, n)),
-        process_noise_cov=1e-5 * np.eye(n),
-        measurement_noise_cov=1e-4 * np.eye(n if p is None else p),
-        initial_cov=1e-5 * np.eye(n),
+        Model(A, B, H, 0.1),
+        Limits(state=np.ones(n), input=u_max),
+        Bounds(Ball(np.sqrt(gamma)) + noise, Gaussian(1e-4 * np.eye(sensed), 0.05), noise),
     )
 
 
@@ -38,7 +34,8 @@ def under_contracts(count: int) -> Iterator[tuple[LinearPlant, ChannelContract]]
     for seed in range(count):
         plant = random_plant(seed, *((2, 1, 1), (3, 2, 1), (4, 2, 2), (4, 1, 3), (5, 2, 2))[seed % 5])
         if seed % 2:
-            plant = replace(plant, A=plant.A * (1.0 + 0.02 * (seed % 7)) / plant.spectral_radius)
+            faster = replace(plant.model, A=plant.A * (1.0 + 0.02 * (seed % 7)) / plant.spectral_radius)
+            plant = replace(plant, model=faster)
         yield plant, ChannelContract(1 + seed % 4)
 
 
@@ -53,17 +50,12 @@ def badly_scaled_plant(seed: int, n: int, m: int, decades: float, radius: float,
     A = basis @ (np.diag(poles) + coupling * np.triu(rng.standard_normal((n, n)), 1)) @ basis.T
     state, put = 10.0 ** rng.uniform(-decades, decades, n), 10.0 ** rng.uniform(-decades, decades, m)
     size = 1e-2 * (1.0 - radius)  # of the noise in units of the box: what a slow plant can still reject
-    noise = size**2 * np.diag(state**2)
+    noise = Gaussian(size**2 * np.diag(state**2), 0.05)
+    B, u_max = state[:, None] * rng.standard_normal((n, m)) / put, put * rng.uniform(0.5, 2.0, m)
     return LinearPlant(
-        A=state[:, None] * A / state,
-        B=state[:, None] * rng.standard_normal((n, m)) / put,
-        box=np.diag(1.0 / state),
-        u_max=put * rng.uniform(0.5, 2.0, m),
-        dt=0.1,
-        gamma=float(size * state.min()) ** 2,
-        process_noise_cov=noise,
-        measurement_noise_cov=noise,
-        initial_cov=size**2 * float(state.min()) ** 2 * np.eye(n),
+        Model(state[:, None] * A / state, B, None, 0.1),
+        Limits(state=state, input=u_max),
+        Bounds(Ball(size * state.min()) + noise, noise, Gaussian(size**2 * float(state.min()) ** 2 * np.eye(n), 0.05)),
     )
 
 
@@ -85,12 +77,8 @@ def slow_and_fast_plant(seed: int, *, in_own_units: bool) -> LinearPlant:
     low_unit, high_unit = np.log(UNITS)
     units = np.exp(rng.uniform(low_unit, high_unit, n + m)) if in_own_units else np.ones(n + m)
     x, u = units[:n], units[n:]
-    return LinearPlant.from_statespace(
-        ((x[:, None] * A) / x, (x[:, None] * B) / u, np.eye(n), 0),
-        STEP,
-        state_limits=(x * low, x * high),
-        input_limits=(u * ends[0], u * ends[1]),
-        disturbance_bound=share * x * np.minimum(1.0, STEP * np.abs(modes).min() * 10.0),
-        sensor_bound=share * x,
-        initial_bound=share * x,
+    return LinearPlant(
+        Model.sampled((x[:, None] * A) / x, (x[:, None] * B) / u, None, STEP),
+        Limits(state=(x * low, x * high), input=(u * ends[0], u * ends[1])),
+        Bounds(share * x * np.minimum(1.0, STEP * np.abs(modes).min() * 10.0), share * x, share * x),
     )

@@ -306,7 +306,8 @@ def between_samples(ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: 
     show = table("id", *columns, first=26, width=7)
     for name in ids:
         env = _env(name)
-        plants = [env.plant, replace(env.plant, between_samples=points or POINTS.get(name, 8))]
+        limits = replace(env.plant.limits, between_samples=points or POINTS.get(name, 8))
+        plants = [env.plant, replace(env.plant, limits=limits)]
         found: list[tuple[Certificate, float]] = []
         for plant in plants:
             try:

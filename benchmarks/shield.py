@@ -23,9 +23,12 @@ from benchmarks.timing import Steps, microseconds, resident, timed
 from experiments.commands.attack import hostile_agents, starts, worst_case
 from ncs_gym import (
     Actuator,
+    Bounds,
     Channel,
     ChannelContract,
+    Limits,
     LinearPlant,
+    Model,
     NCSEnv,
     NCSVectorEnv,
     Packet,
@@ -35,7 +38,6 @@ from ncs_gym import (
 )
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, certificate_for, synthesize
@@ -222,14 +224,11 @@ def memory(steps: int = 100_000) -> None:
     sensors say is worth averaging over many samples, so that arrival histories hardly recur.
     """
     model = np.array([[0.0, 1.0, 0.0], [0.0, -2.0, 20.0], [0.0, -0.5, -10.0]]), np.array([[0.0], [0.0], [10.0]])
-    A, B = zero_order_hold(*model, 0.01)
-    bounds: dict[str, Any] = {
-        "disturbance_bound": [5e-4, 5e-3, 5e-3],
-        "sensor_bound": [2e-3, 0.01],
-        "initial_bound": [2e-3, 0.01, 0.01],
-    }
-    H = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    plant = LinearPlant(A=A, B=B, H=H, box=[1.0, 5.0, 3.0], u_max=5.0, dt=0.01, **bounds)
+    plant = LinearPlant(
+        Model.sampled(*model, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], 0.01),
+        Limits(state=[1.0, 5.0, 3.0], input=5.0),
+        Bounds(disturbance=[5e-4, 5e-3, 5e-3], sensor=[2e-3, 0.01], first_error=[2e-3, 0.01, 0.01]),
+    )
     channel, rng, x = Channel(loss=0.2, max_consecutive_losses=2), np.random.default_rng(0), np.zeros(3)
     loop = SafeLoop(synthesize(plant, contract=ChannelContract(2), safe_set="ellipsoid"), plant, channel)
     state, packets = ChannelState(channel, rng), []

@@ -18,10 +18,21 @@ import numpy as np
 from benchmarks.commands import run, table
 from benchmarks.random_plants import badly_scaled_plant, random_plant, slow_and_fast_plant
 from benchmarks.timing import timed
-from ncs_gym import LinearPlant, cart_pole, certified_error_set, convoy, lane_keeping, truck_trailer
+from ncs_gym import (
+    Ball,
+    Bounds,
+    LinearPlant,
+    cart_pole,
+    certified_error_set,
+    convoy,
+    family,
+    lane_keeping,
+    truck_trailer,
+)
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
 from shields import Certificate, Infeasible, synthesize, verify
+from shields.paper.bounds import with_noise
 from shields.synthesis import certification
 
 # Largest half-width of the error set of random plants, of 1.
@@ -54,7 +65,7 @@ def times(seeds: int = 3, largest: int = 12) -> None:
     plants: dict[str, list[LinearPlant]] = {}
     for mass in (1000.0, 4000.0):
         for gamma, Q, what in ((5e-4, 1e-4, ""), (2e-3, 4e-4, ", D radius doubled")):
-            plant = truck_trailer(mass=mass, gamma=gamma, process_noise_cov=Q * np.eye(2))
+            plant = with_noise(truck_trailer(mass=mass), gamma=gamma, Q=Q * np.eye(2))
             plants[f"truck-trailer, {mass:.0f} kg{what}"] = [plant]
     for n, m in ((2, 1), (4, 1), (4, 2), (6, 2), (8, 3), (12, 3)):
         if n <= largest:
@@ -71,9 +82,10 @@ def times(seeds: int = 3, largest: int = 12) -> None:
 
 def _with_little_room(plant: LinearPlant) -> LinearPlant:
     """Returns a plant with disturbances such that its error set has a largest half-width of ERROR_RADIUS."""
-    plant = LinearPlant(A=plant.A, B=plant.B, box=plant.box, u_max=1.0, dt=plant.dt, gamma=1e-3)
+    model, limits = replace(plant.model, H=None), replace(plant.limits, input=1.0)
+    plant = LinearPlant(model, limits, Bounds(disturbance=Ball(1e-3**0.5), sensor=0.0, first_error=0.0))
     radius = np.sqrt(np.diag(certified_error_set(plant).Sigma).max())
-    return replace(plant, gamma=1e-3 * (ERROR_RADIUS / radius) ** 2)
+    return with_noise(plant, gamma=1e-3 * (ERROR_RADIUS / radius) ** 2)
 
 
 def trust(plants: int = 20, most_states: int = 8) -> None:
@@ -144,7 +156,7 @@ class Varied:
     def family(self, plant: LinearPlant, share: float) -> LinearPlant:
         """Returns the family of all parameters within a share of their values."""
         ranges = {name: ((1.0 - share) * value, (1.0 + share) * value) for name, value in self.values.items()}
-        return LinearPlant.family(self.make, ranges, monotone=True)
+        return family(self.make, ranges, monotone=True)
 
 
 @dataclass(frozen=True)
@@ -155,9 +167,8 @@ class Gain:
 
     def family(self, plant: LinearPlant, share: float) -> LinearPlant:
         """Returns the hull of the plants with the smallest and the largest gain."""
-        plain = replace(plant, continuous_model=None)
-        ends = [replace(plain, B=factor * plant.B) for factor in (1.0 - share, 1.0 + share)]
-        return LinearPlant.family(ends, at_rest=True)
+        plain, factors = replace(plant.model, continuous=None), (1.0 - share, 1.0 + share)
+        return family([replace(plant, model=replace(plain, B=factor * plain.B)) for factor in factors], at_rest=True)
 
 
 _POLE, _MASS = {"pole_mass": 0.1, "length": 0.5}, {"mass": 4000.0}
@@ -186,7 +197,7 @@ def families(env: Sequence[str] = ()) -> None:
     For every environment, the largest common relative range +-r of some of its parameters for which an invariant
     ellipsoid is found under its contract, to a tenth of r or of a percent; a polytope alone may bear more. The input
     gain, by which B is multiplied, is a parameter of all plants; the hull of two of them is exact for it. The other
-    parameters are those of the functions that make the plants (`LinearPlant.family`, which checks on a grid that
+    parameters are those of the functions that make the plants (`ncs_gym.family`, which checks on a grid that
     entries are monotone in them). Takes about twenty minutes on one core.
     """
     largest = 0.5  # greater ranges are not tried

@@ -10,31 +10,23 @@ import gymnasium as gym
 import numpy as np
 from scipy.signal import cont2discrete
 
-import ncs_gym  # noqa: F401
-from ncs_gym import Channel, LinearPlant, contract_of
+from ncs_gym import Bounds, Channel, Limits, LinearPlant, Model, Through, contract_of
 from shields import SafetyShield, synthesize
 
 # Deviations of the levels [cm] from the operating point, by the voltages of two pumps [V]; two levels are measured.
 A = np.array([[-0.0159, 0, 0.0419, 0], [0, -0.0111, 0, 0.0333], [0, 0, -0.0419, 0], [0, 0, 0, -0.0333]])
 B = np.array([[0.0833, 0], [0, 0.0628], [0, 0.0479], [0.0312, 0]])
 C = np.eye(2, 4)
-dt = 3.0
-pump_error = cont2discrete((A, B, C, np.zeros((2, 2))), dt)[1]  # what 1 V more adds to the levels in a step
+pump_error = cont2discrete((A, B, C, np.zeros((2, 2))), 3.0)[1]  # what 1 V more adds to the levels in a step
 
-plant = LinearPlant.from_statespace(
-    (A, B, C, 0),
-    dt,
-    operating_state=[12.4, 12.7, 1.8, 1.4],
-    operating_input=[3.0, 3.0],
-    state_limits=(0.0, 20.0),
-    input_limits=(0.0, 10.0),
-    disturbance_bound=(pump_error, 0.1),
-    sensor_bound=0.1,
-    initial_bound=0.2,
-    state_names=["level 1", "level 2", "level 3", "level 4"],
-    state_units=["cm"] * 4,
-    input_names=["pump 1", "pump 2"],
-    input_units=["V"] * 2,
+plant = LinearPlant(
+    Model.sampled(A, B, C, dt=3.0, at=([12.4, 12.7, 1.8, 1.4], [3.0, 3.0])),
+    Limits(state=(np.zeros(4), np.full(4, 20.0)), input=(np.zeros(2), np.full(2, 10.0))),
+    Bounds(disturbance=Through(pump_error, 0.1), sensor=0.1, first_error=0.2),
+    {
+        "states": {"level 1": "cm", "level 2": "cm", "level 3": "cm", "level 4": "cm"},
+        "inputs": {"pump 1": "V", "pump 2": "V"},
+    },
 )
 channel = Channel(loss=0.3, send_period=2, max_consecutive_losses=2)  # LoRa, every 6 s
 contract = contract_of(channel)

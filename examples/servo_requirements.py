@@ -4,20 +4,18 @@ Takes about nine seconds on one core.
 """
 
 import shields
-from ncs_gym import LinearPlant
+from ncs_gym import Bounds, Limits, LinearPlant, Model
 
-# Angle and rate of a geared motor; the input is a voltage. With python-control: control.ss(A, B, C, 0).
-A, B, C, D = [[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], [[0.0]]
-servo = LinearPlant.from_statespace(
-    (A, B, C, D),
-    dt=0.002,
-    box=[0.2, 4.0],  # rad, rad/s
-    u_max=12.0,  # V
-    disturbance_bound=[0.0, 0.1],  # a load torque that changes the rate by 50 rad/s^2 [rad, rad/s per step]
-    sensor_bound=5e-4,  # encoder [rad]
-    initial_bound=[1e-3, 0.05],
-    state_names=["angle", "rate"],
-    state_units=["rad", "rad/s"],
+# Angle and rate of a geared motor; the input is a voltage. With python-control: Model.of(control.ss(A, B, C, 0), dt).
+servo = LinearPlant(
+    Model.sampled([[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]], dt=0.002),
+    Limits(state=[0.2, 4.0], input=12.0),
+    Bounds(
+        disturbance=[0.0, 0.1],  # a load torque that changes the rate by 50 rad/s^2 [rad, rad/s per step]
+        sensor=5e-4,  # encoder [rad]
+        first_error=[1e-3, 0.05],
+    ),
+    {"states": {"angle": "rad", "rate": "rad/s"}},
 )
 servo.save("servo.json")
 for sampled in (servo.resampled(0.005), servo.resampled(0.02)):

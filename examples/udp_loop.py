@@ -11,12 +11,14 @@ import json
 
 import numpy as np
 
-from ncs_gym import Actuator, Channel, Echo, LinearPlant, Packet
+from ncs_gym import Actuator, Bounds, Channel, Echo, Limits, LinearPlant, Model, Packet
 from shields import SafeLoop, synthesize
 
-SERVO = [[0.0, 1.0], [-4.0, -2.5]], [[0.0], [6.0]], np.eye(2), np.zeros((2, 1))  # angle [rad] and speed, voltage [V]
-bounds = {"disturbance_bound": [2e-3, 2e-2], "sensor_bound": [1e-3, 1e-2], "initial_bound": [1e-3, 1e-2]}
-plant = LinearPlant.from_statespace(SERVO, dt=0.05, box=[0.5, 2.0], u_max=3.0, **bounds)
+plant = LinearPlant(  # angle [rad] and speed by a voltage [V]
+    Model.sampled([[0.0, 1.0], [-4.0, -2.5]], [[0.0], [6.0]], None, dt=0.05),
+    Limits(state=[0.5, 2.0], input=3.0),
+    Bounds(disturbance=[2e-3, 2e-2], sensor=[1e-3, 1e-2], first_error=[1e-3, 1e-2]),
+)
 # The contract of both ways: of two datagrams in a row one arrives, a step later, or up to seven on a busy computer.
 network = Channel(loss=0.25, delay=1, jitter=6, max_consecutive_losses=1)
 loop = SafeLoop(synthesize(plant), plant, network, downlink=network, echo_age=9, on_unproved="ignore")

@@ -9,7 +9,7 @@ import gymnasium as gym
 from stable_baselines3 import PPO
 
 from agents import SB3VecEnv
-from ncs_gym import Channel, GymProcess, Regulation, contract_of, linear_model
+from ncs_gym import Bounds, Channel, GymProcess, Limits, Regulation, contract_of, linear_model
 from shields import VectorSafetyShield, synthesize
 
 parser = argparse.ArgumentParser()
@@ -23,10 +23,10 @@ def write_state(env, state):
 
 
 process = GymProcess(lambda: gym.make("Pendulum-v1"), lambda env: env.unwrapped.state, write_state)
-# The box: angle [rad] and rate [rad/s]; then the largest torque and the step. What the sensors and the first estimate
-# are off by is declared; what the linear model leaves out is bounded by sampling.
-noise = {"disturbance_bound": 0.0, "sensor_bound": [0.002, 0.01], "initial_bound": [0.005, 0.03]}
-plant = linear_model(process, [0.25, 1.5], 2.0, 0.05, **noise)
+# The limits: angle [rad] and rate [rad/s], and the torque. What the sensors and the first estimate are off by is
+# declared; what the linear model leaves out is bounded by sampling.
+limits = Limits(state=[0.25, 1.5], input=2.0)
+plant = linear_model(process, limits, Bounds(disturbance=0.0, sensor=[0.002, 0.01], first_error=[0.005, 0.03]), dt=0.05)
 channel = Channel(loss=0.3, max_consecutive_losses=2)
 certificate = synthesize(plant, contract=contract_of(channel))
 print(plant.remainder.sentence)

@@ -19,10 +19,10 @@ from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.networked import Networked, VectorNetworked
-from ncs_gym.plants.assumptions import NoNoiseWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.convoy import convoy
+from ncs_gym.plants.family import family
 from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.resting_point import MovedOperatingPointWarning
@@ -89,7 +89,6 @@ __all__ = [
     "NCSVectorEnv",
     "Networked",
     "NoEquilibriumWarning",
-    "NoNoiseWarning",
     "Packet",
     "PacketLog",
     "Process",
@@ -116,6 +115,7 @@ __all__ = [
     "certified_error_set",
     "contract_of",
     "convoy",
+    "family",
     "lane_keeping",
     "linear_model",
     "register_plant",

@@ -5,8 +5,9 @@ A number or a vector stands for half-widths per entry. Ellipsoids around sets ar
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -170,11 +171,9 @@ class Sum(UncertainSet):
         """The part that is a Gaussian; None if there is none."""
         return next((each for each in self.parts if isinstance(each, Gaussian)), None)
 
-    @property
-    def bounded(self) -> Sum | None:
-        """The sum of the other parts."""
-        others = tuple(each for each in self.parts if not isinstance(each, Gaussian))
-        return Sum(others) if others else None
+    def without(self, others: Sequence[Any]) -> Sum:
+        """Returns the sum of the parts that are not among others."""
+        return Sum(tuple(each for each in self.parts if not any(each is other for other in others)))
 
     def as_one(self, weight: np.ndarray) -> Any:
         """Returns the only part, or else the ellipsoid of the smallest tr(W P), which must be about zero.
@@ -219,30 +218,22 @@ def require_about_zero(own: Any, name: str) -> None:
         raise ValueError(f"{name} must have its middle at zero, got {shown(np.asarray(own.middle).tolist())}")
 
 
-KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Box, Ball, Ellipsoid, Gaussian, Through, Sum)}
-
-
-def document_of(value: Any) -> Any:
-    """Returns a set, or what one is made of, as JSON values."""
-    if type(value) in KINDS.values():
-        return {type(value).__name__: {each.name: document_of(getattr(value, each.name)) for each in fields(value)}}
-    return [*map(document_of, value)] if isinstance(value, tuple) else np.asarray(value).tolist()
-
-
 def as_set(value: Any) -> Any:
     """Returns the set that is given, that of a document, or the box of half-widths, a number or shape (n,).
 
     Raises:
         ValueError: If it is none of these.
     """
-    if isinstance(value, UncertainSet | Ellipsoid):
+    if isinstance(value, UncertainSet):
         return value
     name, content = next(iter(value.items()), ("", 0)) if isinstance(value, Mapping) and len(value) == 1 else ("", 0)
-    if name in KINDS and isinstance(content, Mapping) and {*content} == {each.name for each in fields(KINDS[name])}:
-        return KINDS[name](**content)
+    kinds: dict[str, Any] = UncertainSet.kinds
+    if name in kinds and isinstance(content, Mapping):
+        with suppress(TypeError):  # other entries than the set's
+            return kinds[name](**content)
     half = as_setting(value)
     if half is None or half.ndim > 1:
-        raise ValueError(f"a set must be a number, a vector of half-widths or a {', '.join(KINDS)}, got {shown(value)}")
+        raise ValueError(f"a set must be a number, a vector of half-widths or a {', '.join(kinds)}, got {shown(value)}")
     return Box(-half, half)
 
 

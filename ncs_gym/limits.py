@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.plants.between_samples import MOST_POINTS
 from ncs_gym.plants.hard_bounds import FREE_REACH, reach_in_steps
 from ncs_gym.validation import (
     LARGEST_NUMBER,
     SMALLEST_NUMBER,
     ReadOnlyArrays,
+    as_count,
     as_numbers,
     as_setting,
     as_vector,
@@ -87,7 +89,7 @@ def _from_center(limits: Any, center: np.ndarray, name: str, *, is_given: bool =
     if not ((low < center) & (center < high)).all():
         at_end, remedy = np.flatnonzero((low == center) | (center == high)), ""
         if not is_given:
-            remedy = f": limits are absolute, so give operating_{name.split()[0]}= (of a Model at=), around which it is"
+            remedy = ": limits are absolute, so give at=(state, input) of the Model, around which they are"
         elif len(at_end):
             remedy = (
                 f": entry {at_end[0] + 1} rests at its end, from where nothing can move it both ways; give an "
@@ -215,18 +217,17 @@ class Limits(ReadOnlyArrays):
             raise ValueError(f"rows of limits must be a list of (c_x, c_u, low, high), got {shown(self.rows)}")
         for name in ("state", "input", "rows", "rate"):
             object.__setattr__(self, name, frozen_inside(getattr(self, name)))
+        if self.between_samples is not None:
+            points = as_count(self.between_samples, "between_samples", low=1, high=MOST_POINTS)
+            object.__setattr__(self, "between_samples", points if points > 1 else None)
 
-    def within(self, model: Model, *, are_absolute: bool = True) -> Within:
+    def within(self, model: Model) -> Within:
         """Returns the limits in deviations from the point of a model.
-
-        Args:
-            model: The model.
-            are_absolute: Whether half-widths beside a point are refused.
 
         Raises:
             ValueError: If they are no limits of its states and inputs, or its point is not strictly within them.
         """
-        if are_absolute and any(model.is_given):
+        if any(model.is_given):
             for name in ("state", "input"):
                 if self._half_widths(name, model) is not None:
                     raise ValueError(
@@ -259,6 +260,30 @@ class Limits(ReadOnlyArrays):
             raise ValueError("limits of states are all infinite: give at least one finite one")
         return Within(box, inputs, joined(mixed))
 
+    def absolute(self, model: Model) -> Limits:
+        """Returns the same limits of a model about zero as pairs, which stay where they are beside any point."""
+        widths = {name: self._half_widths(name, model) for name in ("state", "input")}
+        return replace(self, **{name: (-each, each) for name, each in widths.items() if each is not None})
+
+    def change_within(self, half: np.ndarray) -> np.ndarray | None:
+        """Returns the largest change of each input, shape (m,), given half their range; None if any is allowed.
+
+        Raises:
+            ValueError: If `rate` is no such change, or limits nothing.
+        """
+        if self.rate is None:
+            return None
+        change = as_setting(self.rate)
+        if (
+            change is None
+            or change.shape not in ((), half.shape)
+            or not ((change >= SMALLEST_NUMBER) & (change < LARGEST_NUMBER)).all()
+        ):
+            raise ValueError(f"rate must be a positive number or shape {half.shape}, got {shown(self.rate)}")
+        if (change >= 2.0 * half).all():
+            raise ValueError(f"rate = {shown(self.rate)} limits nothing: inputs change by no more than their range")
+        return np.broadcast_to(change, half.shape).copy()
+
     def _half_widths(self, name: str, model: Model) -> np.ndarray | None:
         """Returns limits that are given as half-widths, shape (n,) or (m,); None for pairs and where there are none."""
         widths, size = as_setting(getattr(self, name)), len(getattr(model, name))
@@ -288,14 +313,12 @@ def _chosen(model: Model, inputs: np.ndarray) -> Rows:
     """Returns half-widths for states without limits: many times what inputs within ends (2, m) reach in n steps.
 
     Raises:
-        TypeError: If no input moves a state, so that nothing says how large it gets.
+        ValueError: If no input moves a state, so that nothing says how large it gets.
     """
     reach = reach_in_steps(model.A, model.B, np.abs(inputs).max(axis=0), np.zeros(len(model.A)))
     if not reach.all():
-        raise TypeError(f"LinearPlant needs limits: no input moves state {reach.argmin() + 1}, so give state_limits")
+        raise ValueError(f"Limits need state=: no input moves state {reach.argmin() + 1}, which none of them limits")
     widths = np.array([float(exact.rounded(FREE_REACH * each, 1)) for each in reach])
-    text = (
-        f"no state has a limit: half-widths {shown(widths.tolist())} were chosen, give box or state_limits for others"
-    )
+    text = f"no state has a limit: half-widths {shown(widths.tolist())} were chosen, give Limits(state=...) for others"
     warn_caller(text, ChosenLimitsWarning)
     return in_units_of_range(np.eye(len(widths)), -widths, widths)

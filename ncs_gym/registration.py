@@ -125,7 +125,7 @@ class Factory:
                 )
             read, own["contract"] = self.plant(), self.contract or contract_of(self.channel)
         if between_samples is not None:
-            read = replace(read, between_samples=between_samples)
+            read = replace(read, limits=replace(read.limits, between_samples=between_samples))
         own |= {"plant": read, "disturbance": self._disturbance(read)}
         if self.start is not None and getattr(read, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
@@ -334,18 +334,13 @@ def register_plant(
 
     With this in a module `tank.py`:
 
-        import numpy as np
-        from ncs_gym import Channel, LinearPlant, register_plant
+        from ncs_gym import Bounds, Channel, Limits, LinearPlant, Model, register_plant
 
+        A, B = [[0.98, 0.04], [0.0, 0.95]], [[0.0], [0.05]]  # levels of two tanks [m], by a valve [l/s]
         plant = LinearPlant(
-            A=[[0.98, 0.04], [0.0, 0.95]],  # levels of two tanks, deviations from the set point [m]
-            B=[[0.0], [0.05]],  # valve [l/s]
-            box=[0.3, 0.5],  # |x_1| <= 0.3 m, |x_2| <= 0.5 m at every step
-            u_max=2.0,
-            dt=1.0,
-            disturbance_bound=[0.001, 0.002],  # largest change per step by what is not modeled [m]
-            sensor_bound=0.01,
-            initial_bound=0.01,
+            Model(A, B, H=None, dt=1.0),
+            Limits(state=[0.3, 0.5], input=2.0),  # |x_1| <= 0.3 m, |x_2| <= 0.5 m at every step
+            Bounds(disturbance=[0.001, 0.002], sensor=0.01, first_error=0.01),  # per step what is not modeled does [m]
         )
         register_plant("Plants/Tanks-v0", plant, channel=Channel(loss=0.3, delay=2))
 

@@ -1,50 +1,238 @@
 """The one door through which tests make plants, loops, shields and certificates of the product.
 
-Where a constructor changes, this file translates; `tests/test_product.py` finds the calls that go past it.
+Where a constructor changes, this file translates; `tests/test_product.py` finds the calls that go past it. Tests
+describe a plant by its parts: `A`, `B`, `H`, `dt`, limits (`box`, `u_max`, ...) and bounds (`gamma`, covariances,
+`disturbance_bound`, ...), of which `described` makes the values of a `LinearPlant`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 import ncs_gym
 import shields
-from ncs_gym import LinearPlant
+from ncs_gym import Ball, Bounds, Box, Ellipsoid, Gaussian, Limits, LinearPlant, Model, Sum, Through
+from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from shields import Certificate
+
+_SOURCES = (
+    ("disturbance", "process_noise_cov", "disturbance_bound"),
+    ("sensor", "measurement_noise_cov", "sensor_bound"),
+    ("first_error", "initial_cov", "initial_bound"),
+)
 
 
 def linear_plant(**described: Any) -> LinearPlant:
     """A plant by its matrices, limits and bounds."""
-    return LinearPlant(**described)
+    model = Model(**{"H": None} | _of_model(described))
+    return _made(model, described)
 
 
 def sampled_plant(model: Any, dt: float | None = None, **described: Any) -> LinearPlant:
     """A plant sampled from a state-space model: (A, B, C, D), or an object that has them."""
-    return LinearPlant.from_statespace(model, dt, **described)
+    return _made(replace(Model.of(model, dt), **_of_model(described)), described)
 
 
 def library_plant(make: Callable[..., LinearPlant], *physical: Any, **described: Any) -> LinearPlant:
     """A plant of the library with limits and bounds that are not its own."""
-    return make(*physical, **described)
-
-
-def linear_model(process: Any, *limits: Any, **described: Any) -> LinearPlant:
-    """The linear model of a process, with what it leaves out."""
-    return ncs_gym.linear_model(process, *limits, **described)
-
-
-def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
-    """A plant of which several members, or ranges of parameters, are possible."""
-    return LinearPlant.family(members, ranges, **settings)
+    own = {
+        name: described.pop(name)
+        for name in ("dt", "mass", "speed", "full_state", "length", "pole_mass", "lag")
+        if name in described
+    }
+    return altered(make(*physical, **own), **described)
 
 
 def altered(plant: LinearPlant, **described: Any) -> LinearPlant:
     """The plant with other matrices, limits or bounds."""
-    return dataclasses.replace(plant, **described)
+    described = dict(described)
+    model = replace(plant.model, **_of_model(described))
+    limits, bounds, labels = (
+        _limits(plant, model, described),
+        _bounds(plant.bounds, described, model),
+        _labels(plant, described),
+    )
+    if described:
+        raise TypeError(f"no part of a plant: {sorted(described)}")
+    return replace(plant, model=model, limits=limits, bounds=bounds, labels=labels)
+
+
+def _made(model: Model, described: dict[str, Any]) -> LinearPlant:
+    limits = _limits(None, model, described)
+    plant = LinearPlant(
+        model, limits, _bounds(Bounds(*[Sum(())] * 3), described, model), _labels(None, described)
+    )
+    if described:
+        raise TypeError(f"no part of a plant: {sorted(described)}")
+    return plant
+
+
+def _of_model(described: dict[str, Any]) -> dict[str, Any]:
+    """Takes what belongs to a model out of a description."""
+    names = {"continuous_model": "continuous", "input_delay": "delays"}
+    own = {
+        names.get(name, name): described.pop(name) for name in [*described] if name in (*names, *"ABH", "dt", "offset")
+    }
+    if (delays := own.get("delays", 0)) is None:
+        own["delays"] = 0 if delays is None else delays
+    point = [described.pop(f"operating_{name}", None) for name in ("state", "input")]
+    return own | ({} if point == [None, None] else {"at": tuple(point)})
+
+
+def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) -> Limits:
+    """The limits of a description, those of a plant where it says nothing; in deviations but for pairs."""
+    names = ("box", "box_ends", "state_limits", "output_limits", "mixed_limits", "mixed_rows", "mixed_ends")
+    names += ("u_max", "input_limits", "input_ends", "du_max", "between_samples")
+    given = {name: described.pop(name) for name in names if name in described}
+    own = Limits(input=1.0) if plant is None else plant.limits
+    if any(model.is_given) and plant is not None:
+        own = _around(own, model)
+    point = np.concatenate([model.state, model.input])
+    of_states = [each for each in own.rows if each[1] is None]
+    mixed = [each for each in own.rows if each[1] is not None]
+    state, n = own.state, len(model.A)
+    if given.get("state_limits") is not None:
+        state, of_states = _pair(given["state_limits"], n), []
+        state = None if np.isinf(state).all() else state
+    if given.get("box") is not None:
+        box, ends = np.asarray(given["box"], dtype=float), given.get("box_ends")
+        ends = (
+            np.array([[-1.0], [1.0]]) * np.ones(len(box) if box.ndim == 2 else n) if ends is None else np.asarray(ends)
+        )
+        if box.ndim == 2:
+            state, of_states = (
+                None,
+                [(row, None, *(end + row @ model.state)) for row, end in zip(box, ends.T, strict=True)],
+            )
+        elif "box_ends" in given and given["box_ends"] is not None:
+            state, of_states = (model.state + ends[0] * box, model.state + ends[1] * box), []
+        else:
+            state, of_states = (model.state - box, model.state + box) if any(model.is_given) else box, []
+    elif given.get("box_ends") is not None and plant is not None:
+        rows = zip(plant.box, np.asarray(given["box_ends"]).T, strict=True)
+        state, of_states = None, [(row, None, *(end + row @ model.state)) for row, end in rows]
+    of_states = [*of_states, *((row, None, *ends) for row, *ends in given.get("output_limits") or ())]
+    if "mixed_limits" in given or "mixed_rows" in given or "mixed_ends" in given:
+        rows = given.get("mixed_rows", None if plant is None or "mixed_ends" not in given else plant.mixed_rows)
+        kept = mixed if "mixed_rows" not in given and "mixed_ends" not in given else []
+        mixed = [*kept, *(given.get("mixed_limits") or ())]
+        if rows is not None and len(rows):
+            ends = given.get("mixed_ends")
+            ends = np.array([[-1.0], [1.0]]) * np.ones(len(rows)) if ends is None else np.asarray(ends)
+            mixed = [(row[:n], row[n:], *(end + row @ point)) for row, end in zip(rows, ends.T, strict=True)] + mixed
+    inputs = own.input
+    if given.get("u_max") is not None:
+        widths = np.asarray(given["u_max"], dtype=float)
+        inputs = (model.input - widths, model.input + widths) if any(model.is_given) else widths
+    if given.get("input_limits") is not None:
+        inputs = _pair(given["input_limits"], len(model.input))
+    if given.get("input_ends") is not None:
+        inputs = tuple(model.input + np.asarray(each) for each in given["input_ends"])
+    rate, points = given.get("du_max", own.rate), given.get("between_samples", own.between_samples)
+    return Limits(state, inputs, (*of_states, *mixed), rate, points)
+
+
+def _pair(limits: Any, size: int) -> tuple[np.ndarray, ...]:
+    return tuple(np.broadcast_to(np.asarray(end, dtype=float), (size,)) for end in limits)
+
+
+def _around(limits: Limits, model: Model) -> Limits:
+    """Half-widths as pairs around the point of a model."""
+    pairs = {}
+    for name, point in (("state", model.state), ("input", model.input)):
+        value = getattr(limits, name)
+        if value is not None and not (isinstance(value, tuple) and len(value) == 2 and np.ndim(value[0])):
+            widths = np.asarray(value, dtype=float)
+            if widths.shape in ((), point.shape):
+                pairs[name] = (point - widths, point + widths)
+    return replace(limits, **pairs)
+
+
+def _bounds(bounds: Bounds, described: dict[str, Any], model: Model) -> Bounds:
+    """The bounds of a description, given ones where it says nothing."""
+    made, delta = {}, described.pop("delta", None)
+    for name, covariance, bound in _SOURCES:
+        parts = Sum((getattr(bounds, name),)).parts
+        balls = [each for each in parts if isinstance(each, Ball) and name == "disturbance"]
+        noises = [each for each in parts if isinstance(each, Gaussian)]
+        left_out = [each for each in parts if each.is_left_out]
+        others = [each for each in parts if not any(each is one for one in (*balls, *noises, *left_out))]
+        if name == "disturbance" and "gamma" in described:
+            balls = [Ball(np.sqrt(gamma))] if (gamma := described.pop("gamma")) else []
+        if name == "disturbance" and "remainder" in described:
+            left_out = [] if (remainder := described.pop("remainder")) is None else [remainder]
+        if covariance in described:
+            noise = described.pop(covariance)
+            noises = [] if noise is None else [Gaussian(noise, 0.05 if delta is None else delta)]
+        elif delta is not None:
+            noises = [Gaussian(each.covariance, delta) for each in noises]
+        elif name == "sensor":
+            noises = [_fitting(each, len(model.H)) for each in noises]
+        if bound in described:
+            others = _others(described.pop(bound), len(model.A) if name == "disturbance" else None)
+        made[name] = Sum((*balls, *noises, *others, *left_out))
+    return Bounds(**made)
+
+
+def _fitting(noise: Gaussian, p: int) -> Gaussian:
+    """Sensor noise of the library, of as many outputs as there are now."""
+    return noise if len(noise.covariance) == p else Gaussian(noise.covariance[0, 0] * np.eye(p), noise.delta)
+
+
+def _others(value: Any, n: int | None) -> list[Any]:
+    """The set of a declared bound: a radius, half-widths, an ellipsoid, or (E, w) or (E, low, high) through E."""
+    if value is None:
+        return []
+    if isinstance(value, tuple | list) and len(value) in (2, 3) and getattr(value[0], "ndim", np.ndim(value[0])) == 2:
+        return [Through(value[0], value[1] if len(value) == 2 else Box(*value[1:]))]
+    if isinstance(value, UncertainSet) or np.ndim(value):
+        return [value]
+    return [Ball(value) if n is None else Ellipsoid(np.square(value) * np.eye(n))]
+
+
+def _labels(plant: LinearPlant | None, described: dict[str, Any]) -> Mapping[str, Any] | None:
+    labels = dict((plant and plant.labels) or {})
+    for kind, letter in (("state", "x"), ("input", "u")):
+        names, units = (described.pop(f"{kind}_{part}", None) for part in ("names", "units"))
+        if names or units:
+            own = labels.get(f"{kind}s", {})
+            names = names or [*own] or [f"{letter}{i + 1}" for i in range(len(units))]
+            labels[f"{kind}s"] = dict(zip(names, units or [*own.values()] or [""] * len(names), strict=True))
+    return labels or None
+
+
+def linear_model(process: Any, box: Any = None, u_max: Any = None, dt: Any = None, **described: Any) -> LinearPlant:
+    """The linear model of a process, with what it leaves out."""
+    described |= {} if box is None else {"box": box}
+    described |= {} if u_max is None else {"u_max": u_max}
+    A, B = described.pop("A", None), described.pop("B", None)
+    sizes = [("operating_state", "box", "state_limits"), ("operating_input", "u_max", "input_limits")]
+    n, m = (
+        max((np.shape(part)[-1] for name in names if name in described for part in _parts(name, described[name])), default=1)
+        for names in sizes
+    )
+    model = Model(
+        np.zeros((n, n)), np.zeros((n, m)), None, dt, **{k: v for k, v in _of_model(described).items() if k == "at"}
+    )
+    limits, bounds = _limits(None, model, described), _bounds(Bounds(*[Sum(())] * 3), described, model)
+    labels = _labels(None, described)
+    if A is not None or B is not None:
+        described["matrices"] = (A, B)
+    return ncs_gym.linear_model(process, limits, bounds, dt, at=model.at, labels=labels, **described)
+
+
+def _parts(name: str, value: Any) -> list[np.ndarray]:
+    return [np.atleast_1d(each) for each in (value if name.endswith("limits") else [value])]
+
+
+def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
+    """A plant of which several members, or ranges of parameters, are possible."""
+    return ncs_gym.family(members, ranges, **settings)
 
 
 def resampled(plant: LinearPlant, dt: float) -> LinearPlant:
@@ -52,9 +240,10 @@ def resampled(plant: LinearPlant, dt: float) -> LinearPlant:
     return plant.resampled(dt)
 
 
-def rate_limited(plant: LinearPlant, largest: Any, **settings: Any) -> LinearPlant:
-    """The plant whose inputs change by so much from one step to the next at most."""
-    return plant.with_rate_limits(largest, **settings)
+def rate_limited(plant: LinearPlant, largest: Any, per: str = "step") -> LinearPlant:
+    """The plant whose inputs change by so much from one step to the next, or per second, at most."""
+    rate = np.asarray(largest) * (plant.dt if per == "second" else 1.0)
+    return replace(plant, limits=replace(plant.limits, rate=rate))
 
 
 def loop_env(plant: LinearPlant, *channel: Any, **settings: Any) -> ncs_gym.NCSEnv:

@@ -11,7 +11,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from ncs_gym import LinearPlant, NCSVectorEnv
-from ncs_gym.plants.past_inputs import inputs_under_way
 from shields import Certificate
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
@@ -51,7 +50,7 @@ class CertaintyEquivalentFilter:
 
     def __init__(self, certificate: Certificate, plant: LinearPlant, margin: float = 0.0) -> None:
         self._filter = SafetyFilter(certificate, plant)
-        unknown, back = np.arange(plant.n) < plant.n - inputs_under_way(plant), np.linalg.pinv(plant.A)
+        unknown, back = np.arange(plant.n) < plant.n - plant.past, np.linalg.pinv(plant.A)
         off = margin**2 * np.where(np.outer(unknown, unknown), certificate.L, 0.0)
         self._assumed = self._filter.errors_of_many((back @ off @ back.T)[None])
 

@@ -56,6 +56,6 @@ def _problem(settings: SynthesizeSettings) -> tuple[LinearPlant, ChannelContract
     else:
         plant, own, input_delay = LinearPlant.load(settings.plant), None, 0
     if settings.between_samples is not None:
-        plant = replace(plant, between_samples=settings.between_samples)
+        plant = replace(plant, limits=replace(plant.limits, between_samples=settings.between_samples))
     contract = changed_contract(own, settings.max_age, settings.quantization_step)
     return plant, contract, input_delay if contract == own else 0

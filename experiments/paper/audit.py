@@ -28,7 +28,7 @@ from experiments.paper.counterexample import (
 from experiments.paper.late_packets import STARTS, STEPS, discarded, largest_error, replayed, taken_as_current
 from experiments.paper.paper_example import PaperExample
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from shields.paper.bounds import PaperBounds, PaperModel, safety_margin, uplink_error_bound
+from shields.paper.bounds import PaperBounds, PaperModel, safety_margin, uplink_error_bound, with_noise
 from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_scale
 from shields.paper.optimization_problem import OptimizationProblem
 from shields.verification.rational_matrix import Matrix, to_float
@@ -294,9 +294,9 @@ def feasibility(example: PaperExample) -> Claim:
     """Returns the row about OP as printed, and under the most charitable readings of its bounds."""
     plant = example.plant
     scan = FeasibilityScan(plant)
-    best, still = scan.best(plant), scan.best(replace(plant, gamma=0.0))
+    best, still = scan.best(plant), scan.best(with_noise(plant, gamma=0.0))
     fails = best.ratio < 1.0
-    gamma = largest_gamma(scan, replace(plant, process_noise_cov=np.zeros((2, 2))))
+    gamma = largest_gamma(scan, with_noise(plant, Q=np.zeros((2, 2))))
     tail = truncation_energy(1.0 - plant.delta, plant.n)
     model = PaperModel(plant, quantile=tail)
     at_tail = scan.best(plant, model)
@@ -354,7 +354,7 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
     Raises:
         ArithmeticError: If the solver finds no optimum.
     """
-    plant = replace(example.plant, u_max=u_max)
+    plant = replace(example.plant, limits=replace(example.plant.limits, input=u_max))
     # The smallest rho, to two digits, that (C7) allows for the printed set.
     rho = float(np.ceil(100.0 * np.linalg.cond(example.L)) / 100.0)
     g_bar = (example.kappa * rho) ** 0.5

@@ -6,7 +6,6 @@ The gain is the printed one; noise, disturbance, channel and starts are the same
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,6 +17,7 @@ from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.registration import CASE_STUDY_CHANNEL
+from shields.paper.bounds import with_noise
 
 # As in Section 5.
 STARTS, STEPS = 100, 200
@@ -98,7 +98,7 @@ def largest_error(
     """
     plant, channel, rng = example.plant, CASE_STUDY_CHANNEL, np.random.default_rng(seed)
     if noise_variance is not None:
-        plant = replace(plant, measurement_noise_cov=noise_variance * np.eye(2))
+        plant = with_noise(plant, R=noise_variance * np.eye(2))
     state = Ellipsoid(example.L).sample(rng, STARTS).T
     process = PlantSimulation(plant, example.disturbance, False, STARTS)
     memory, network = process.begin(rng, STARTS), VectorChannelState(channel, rng, STARTS)

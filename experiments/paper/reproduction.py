@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gymnasium as gym
 import matplotlib
@@ -17,6 +17,7 @@ from experiments.settings.certificates import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
 from ncs_gym.registration import CASE_STUDY_BOX
 from shields import paper, synthesize
+from shields.paper.bounds import with_noise
 from shields.paper.feasibility import FeasibilityScan, largest_scale
 
 _ENV = "ncs_gym/TruckTrailer-v0"
@@ -88,12 +89,8 @@ def designs() -> list[StateFeedback]:
     plant = example.plant
     ours = synthesize(plant, safe_set="ellipsoid")
     scale = _OP_SCALE * largest_scale(FeasibilityScan(plant), plant)
-    scaled = replace(
-        plant,
-        gamma=scale * plant.gamma,
-        process_noise_cov=scale * plant.process_noise_cov,
-        initial_cov=scale * plant.initial_cov,
-    )
+    Q, P0 = scale * plant.process_noise_cov, scale * plant.initial_cov
+    scaled = with_noise(plant, gamma=scale * plant.gamma, Q=Q, P0=P0)
     op = paper.synthesize(scaled, dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
     box = BoxDisturbance((1.0 - 1e-9) * scale**0.5 * np.asarray(CASE_STUDY_BOX.half_widths))
     return [

@@ -138,7 +138,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             proved then holds but for a probability that `bound_violation_probability` bounds (docs/shield.md); or
             "extreme" for sensor noise and first errors as large as assumed, in random directions.
         process: What really moves (docs/beyond_linear.md); by default the plant's own equations, or those of a member
-            of its family (`LinearPlant.family`), another one in every episode.
+            of its family (`ncs_gym.family`), another one in every episode.
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's
             settings guarantee.

@@ -13,7 +13,6 @@ from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
@@ -70,7 +69,7 @@ def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid
             if is_bounded
             else np.linalg.pinv(gram) * np.outer(widths, widths)
         )
-        past = plant.n - inputs_under_way(plant)
+        past = plant.n - plant.past
         shape[past:], shape[:, past:] = 0.0, 0.0
         return Ellipsoid(shape)
     if expect(initial_set, Ellipsoid, "initial_set").dim != plant.n:

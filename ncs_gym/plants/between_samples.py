@@ -123,7 +123,7 @@ def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float,
     if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
         raise ValueError(
             "continuous_model is not the one that A and B were sampled from: make the plant by "
-            "LinearPlant.from_statespace, or give continuous_model=None"
+            "Model.sampled, or give continuous=None"
         )
 
 

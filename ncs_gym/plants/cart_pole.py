@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import noise_in_proportion, sampled_model
+from ncs_gym.plants.statespace import noise_in_proportion
 
 GRAVITY = 9.81
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box; no gamma, so that every state has
@@ -22,7 +22,6 @@ def cart_pole(
     length: float = 0.5,
     dt: float = 0.02,
     full_state: bool = True,
-    **bounds: Any,
 ) -> LinearPlant:
     """Returns an inverted pendulum on a cart, linearized upright, by exact zero-order hold.
 
@@ -36,7 +35,6 @@ def cart_pole(
         length: Of the rod [m].
         dt: Step [s].
         full_state: Measure all states; False measures position and angle.
-        bounds: Other arguments of `LinearPlant`.
     """
     A = np.zeros((4, 4))
     A[0, 1] = A[2, 3] = 1.0
@@ -46,14 +44,12 @@ def cart_pole(
     half_widths = np.array([2.4, 3.0, 0.2, 2.0])
     H = np.eye(4) if full_state else np.eye(4)[[0, 2]]
     disturbance = DISTURBANCE_FRACTION if full_state else 0.4 * DISTURBANCE_FRACTION
-    noise = noise_in_proportion(half_widths, H, disturbance, SENSOR_FRACTION, bounds.get("delta", 0.05))
-    defaults = {
-        "box": half_widths,
-        "u_max": 10.0,
-        "H": H,
-        "state_names": ("position", "speed", "angle", "angular rate"),
-        "state_units": ("m", "m/s", "rad", "rad/s"),
-        "input_names": ("force",),
-        "input_units": ("N",),
-    }
-    return LinearPlant(**sampled_model(A, B, dt) | defaults | noise | bounds)
+    return LinearPlant(
+        Model.sampled(A, B, H, dt),
+        Limits(state=half_widths, input=10.0),
+        noise_in_proportion(half_widths, H, disturbance, SENSOR_FRACTION),
+        {
+            "states": {"position": "m", "speed": "m/s", "angle": "rad", "angular rate": "rad/s"},
+            "inputs": {"force": "N"},
+        },
+    )

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ncs_gym.bounds import Ball, Bounds, Through
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import sampled_model, zero_order_hold
 
 
-def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
+def convoy(dt: float = 0.1, lag: float = 0.3) -> LinearPlant:
     """Returns a vehicle that follows another one at a wanted distance, by exact zero-order hold.
 
     e' = w - v, v' = (u - v)/lag. x = (e [m], v [m/s]): how much farther than wanted the leader is, and the follower's
@@ -21,19 +21,13 @@ def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
     Args:
         dt: Step [s].
         lag: Time constant of the drive [s].
-        bounds: Other arguments of `LinearPlant`, in the place of these.
     """
     motion = np.array([[0.0, -1.0], [0.0, -1.0 / lag]])
     drive, leader = np.array([[0.0], [1.0 / lag]]), np.array([[1.0], [0.0]])
-    defaults = {
-        "box": [1.0, 2.0],
-        "u_max": 2.0,
-        "disturbance_bound": (zero_order_hold(motion, leader, dt)[1], 0.45),
-        "sensor_bound": 1e-3,
-        "initial_bound": 0.02,
-        "state_names": ("distance error", "speed"),
-        "state_units": ("m", "m/s"),
-        "input_names": ("speed asked for",),
-        "input_units": ("m/s",),
-    }
-    return LinearPlant(**sampled_model(motion, drive, dt) | defaults | bounds)
+    model = Model.sampled(motion, drive, None, dt)
+    return LinearPlant(
+        model,
+        Limits(state=[1.0, 2.0], input=2.0),
+        Bounds(disturbance=Through(model.held(leader), 0.45), sensor=Ball(1e-3), first_error=Ball(0.02)),
+        {"states": {"distance error": "m", "speed": "m/s"}, "inputs": {"speed asked for": "m/s"}},
+    )

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
 from ncs_gym.validation import counted
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ def described(plant: LinearPlant) -> str:
     radius = f"spectral radius {plant.spectral_radius:.6g}"
     stable = f"stable ({radius})"
     unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
-    own = plant.n - inputs_under_way(plant)  # past inputs are known, and their rows limit nothing: inputs have limits
+    own = plant.n - plant.past  # past inputs are known, and their rows limit nothing: inputs have limits
     states = plant.state_names[:own], plant.state_units[:own]
     extents = {
         "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix))[:own], *states),
@@ -39,7 +38,7 @@ def described(plant: LinearPlant) -> str:
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [row_limit(plant, j) for j in np.flatnonzero(~is_row_of_past_input(plant)).tolist()],
+        "safe box": [row_limit(plant, j) for j in np.flatnonzero(~plant.is_past_row).tolist()],
         "input limits": [
             _between(name, low, high, center, unit)
             for name, low, high, center, unit in zip(

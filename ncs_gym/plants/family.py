@@ -10,135 +10,121 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import reduce
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.limits import in_units_of_range
-from ncs_gym.plants.past_inputs import inputs_under_way, is_row_of_past_input
-from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.bounds import Ball, Bounds, Gaussian, Sum
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.family import Family, entry_name, grid_size, matrices_of
-from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import as_flag, as_names, as_number, shown
 
-if TYPE_CHECKING:
-    from ncs_gym.plants.linear_plant import LinearPlant
-
-P = TypeVar("P", bound="LinearPlant")
-
-# Growth of the bound for the rounding of sums, and room for that of a function's entries, in units of the largest one
-# of their row where that varies.
-ROUNDING, ROOM = 1e-9, 1e-12
+# Room for the rounding of a function's entries, in units of the largest one of their row where that varies.
+ROOM = 1e-12
 MOST_PARAMETERS = 6
-# In what members may differ; the plant of the middle has no model in continuous time.
-_OWN = ("A", "B", "continuous_model", "step_offset")
 # What is the same of all members, but was rounded around other operating points, agrees to this, relatively.
 _ROUNDED = ("box", "box_ends", "input_ends", "mixed_rows", "mixed_ends")
 SAME = 1e-9
+# What is exactly the same of all members, beside their disturbances.
+_SAME = (
+    *("H", "dt", "past", "between_samples", "gamma", "process_noise_cov", "measurement_noise_cov", "initial_cov"),
+    *("delta", "sensor_bound", "initial_bound", "state_names", "state_units", "input_names", "input_units"),
+)
 # Bounds of disturbances that hold this rounding agree to this, relative to the terms of a step.
 SAME_BOUND = 1e-8
 
 
-def plant_of_middle(
-    kind: type[P],
-    members: Sequence[P] | Callable[..., P],
-    ranges: Mapping[str, Any] | None,
+def family(
+    members: Sequence[LinearPlant] | Callable[..., LinearPlant],
+    ranges: Mapping[str, Any] | None = None,
     *,
-    monotone: bool,
-    at_rest: bool,
-) -> P:
-    """Returns what `LinearPlant.family` does, of plants of this class."""
+    monotone: bool = False,
+    at_rest: bool = False,
+) -> LinearPlant:
+    """Returns the plant of the middle of a family, with a proved bound on what it leaves out of any member.
+
+    A certificate for it covers every member, also one that moves from one to another (docs/shield_proof.md, "Plants
+    that vary"). An environment draws a member for every episode; what the bound allows is not drawn beside.
+
+    Args:
+        members: Two plants or more that differ in A and B alone, and in where they rest, whose convex hull is
+            covered: the vertices. Or a function of parameters given by name that returns such plants. Deviations
+            of the middle are counted from the middle of their operating points.
+        ranges: Lowest and highest value of each parameter of the function, up to 6 of them.
+        monotone: Whether every entry of A and B is monotone in each parameter while the others stay, anywhere in
+            the ranges. That is yours to prove; it bounds the entries by those of the corners, and is checked on a
+            grid. Needed for a function. Where members rest at different points, it is also about A x + B u + c - x
+            at the middle of these.
+        at_rest: Whether every member is at rest at its own operating point, with c as `offset` in absolute
+            coordinates: A x + B u + c = x. Needed where members differ in what acts on operating points that are
+            not zero; a model of deviations does not say it.
+
+    Raises:
+        ValueError: If members differ in anything else, are proved between samples or have a remainder, a claim of
+            monotone entries is contradicted or missing, a state that matters has no limit, or an argument is wrong.
+    """
     at_rest, monotone = as_flag(at_rest, "at_rest"), as_flag(monotone, "monotone")
     if callable(members):
-        family, plants = _of_function(kind, members, ranges, monotone)
+        found, plants = _of_function(members, ranges, monotone)
     elif ranges is None and not monotone:
-        family, plants = _of_plants(kind, members)
+        found, plants = _of_plants(members)
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
-    rest_matters = _rest_matters(family, plants)
+    rest_matters = _rest_matters(found, plants)
     if rest_matters and not at_rest:
         raise ValueError(
             "the members differ in what acts on an operating point that is not zero (the middle of a disturbance with "
-            "two ends moves it, too): say at_rest=True if each is at rest at its own one, as LinearPlant(offset=...) "
-            "checks of a model in absolute coordinates"
+            "two ends moves it, too): say at_rest=True if each is at rest at its own one, as Model(offset=...) checks of "
+            "a model in absolute coordinates"
         )
-    first = _around_center(plants[0], _center_of(plants))
-    middle = 0.5 * (family.members.min(axis=0) + family.members.max(axis=0))  # exact where all are the same
-    return replace(
-        first,
-        A=middle[:, : first.n],
-        B=middle[:, first.n : -1],
-        continuous_model=None,
-        disturbance_bound=_covering(plants),
-        remainder=replace(family, at_rest=rest_matters),
-    )
+    first, n = _around_center(plants[0], _center_of(plants)), len(plants[0].model.A)
+    own = np.array([np.hstack([each.model.A, each.model.B]) for each in plants])
+    middle = 0.5 * (own.min(axis=0) + own.max(axis=0))  # exact where all are the same
+    model = replace(first.model, A=middle[:, :n], B=middle[:, n:], offset=None, continuous=None)
+    bounds, cover = first.bounds, _covering(plants)
+    if cover is not first.disturbance_bound:
+        bounds = _with_bound(first, cover)
+    remainder = Remainder(Ellipsoid(np.zeros((n, n))), True, "", replace(found, at_rest=rest_matters))
+    return LinearPlant(model, first.limits, replace(bounds, disturbance=bounds.disturbance + remainder), first.labels)
 
 
-def bound_of_family(plant: LinearPlant, family: Family) -> Ellipsoid:
-    """Returns what the plant leaves out of every member of a family, shape (n, n).
-
-    Past inputs keep the limits of inputs only where they are that for every member, and undisturbed.
-
-    Raises:
-        ValueError: If members are of another size, or differ in what an unlimited state does.
-    """
-    n, size = plant.n, (plant.n, plant.n + plant.m + 1)
-    if family.members.shape[1:] != size:
-        raise ValueError(f"the members of the family must be [A, B, s] of shape {size}, got {family.members.shape[1:]}")
-    listed = family.members if family.interval is None else family.interval
-    off = np.abs(listed - np.column_stack([plant.A, plant.B, np.zeros(n)]))
-    if family.interval is not None:
-        off = off.max(axis=0, keepdims=True)
-    disturbed = off.any(axis=(0, 2)) | (plant.gamma > 0.0) | (plant.process_noise_cov.diagonal() > 0.0)
-    if plant.disturbance_bound is not None:
-        disturbed |= plant.disturbance_bound.shape_matrix.diagonal() > 0.0
-    reach = np.append(plant.reach_with(inputs_under_way(plant, disturbed)), 1.0)
-    return _around(plant, _largest(reach, off, plant.state_names))
+def _with_bound(plant: LinearPlant, bound: Ellipsoid | None) -> Bounds:
+    """Returns the bounds of a plant with another ellipsoid in place of what is no ball and no Gaussian, (n, n)."""
+    kept = [each for each in plant.bounds.disturbance.parts if isinstance(each, Ball | Gaussian)]
+    n = len(plant.model.A)
+    others = [] if bound is None else [Ellipsoid(bound.shape_matrix[:n, :n])]
+    return replace(plant.bounds, disturbance=Sum((*kept, *others)))
 
 
-def _rest_matters(family: Family, plants: list[P]) -> bool:
+def _rest_matters(family: Family, plants: list[LinearPlant]) -> bool:
     """Returns whether members differ in what acts on their operating points."""
     differs = np.ptp(family.members[..., :-1], axis=0).any(axis=0)
     return bool(np.any(_resting_points(plants)[:, differs]))
 
 
-def _resting_points(plants: list[P]) -> np.ndarray:
+def _resting_points(plants: list[LinearPlant]) -> np.ndarray:
     """Returns state and input that the deviations of each are counted from, shape (N, n + m)."""
     return np.array([np.concatenate([each.operating_state, each.operating_input]) for each in plants])
 
 
-def _center_of(plants: list[P]) -> np.ndarray:
+def _center_of(plants: list[LinearPlant]) -> np.ndarray:
     """Returns state and input in the middle of the operating points, shape (n + m,)."""
     points = _resting_points(plants)
     return 0.5 * (points.min(axis=0) + points.max(axis=0))  # exact where all are the same
 
 
-def _around_center(plant: P, center: np.ndarray) -> P:
+def _around_center(plant: LinearPlant, center: np.ndarray) -> LinearPlant:
     """Returns a plant whose limits are those in deviations from another state and input, shape (n + m,)."""
-    moved, n = center - _resting_points([plant])[0], plant.n
-    if not moved.any():
+    if not (center - _resting_points([plant])[0]).any():
         return plant
-    input_ends = plant.input_ends - moved[n:]
-    stored = is_row_of_past_input(plant)
-    ends = np.where(stored, plant.box_ends, plant.box_ends - exact.product(plant.box, moved[:n]))
-    if (past := np.flatnonzero(stored)).size:
-        ends[:, past] = np.tile(input_ends / plant.input_half, len(past) // plant.m)
-    box = in_units_of_range(plant.box, *ends)
-    mixed = in_units_of_range(plant.mixed_rows, *(plant.mixed_ends - exact.product(plant.mixed_rows, moved)))
-    return replace(
-        plant,
-        operating_state=center[:n],
-        operating_input=center[n:],
-        box=box.rows,
-        box_ends=np.stack([box.low, box.high]),
-        input_ends=input_ends,
-        mixed_rows=mixed.rows,
-        mixed_ends=np.stack([mixed.low, mixed.high]),
-    )
+    point = center[: len(plant.model.A)], center[plant.n :]
+    bounds = _with_bound(plant, plant.disturbance_bound)
+    model, limits = replace(plant.model, at=point, offset=None), plant.limits.absolute(plant.model)
+    return replace(plant, model=model, limits=limits, bounds=bounds)
 
 
 def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
@@ -181,20 +167,20 @@ def _terms(plant: LinearPlant) -> np.ndarray:
     return reach[: plant.n] + exact.product(np.abs(np.hstack([plant.A, plant.B])), reach)
 
 
-def _of_plants(kind: type[P], members: Any) -> tuple[Family, list[P]]:
+def _of_plants(members: Any) -> tuple[Family, list[LinearPlant]]:
     """Returns the family of plants, and the plants."""
     if not isinstance(members, (list, tuple)) or len(members) < 2:
         raise ValueError(
             f"a family must be a list of two plants or more, or a function of ranges, got {shown(members)}"
         )
     plants = list(members)
-    _require_alike(kind, plants)
+    _require_alike(plants)
     center, matrices = _center_of(plants), _matrices(plants)
     family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices, center=center)
     return family, plants
 
 
-def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monotone: bool) -> tuple[Family, list[P]]:
+def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bool) -> tuple[Family, list[LinearPlant]]:
     """Returns the family of a function, and the plants of its corners."""
     if not isinstance(ranges, Mapping) or not 1 <= len(ranges) <= MOST_PARAMETERS:
         raise ValueError(
@@ -210,7 +196,7 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     ends = [_ends(name, value) for name, value in ranges.items()]
     corners = [np.array(corner) for corner in itertools.product(*ends)]
     plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
-    _require_alike(kind, plants)
+    _require_alike(plants)
     matrices = _matrices(plants)
     varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
     reach = np.max([each.reach for each in plants], axis=0)
@@ -231,17 +217,17 @@ def _of_function(kind: type[P], function: Callable[..., P], ranges: Any, monoton
     return family, plants
 
 
-def _matrices(plants: list[P]) -> np.ndarray:
+def _matrices(plants: list[LinearPlant]) -> np.ndarray:
     """Returns [A, B, s] of plants around the middle of their operating points, shape (N, n, n + m + 1)."""
     shape = plants[0].n, plants[0].n + plants[0].m + 1
     return np.array([matrices_of(each, shape, _center_of(plants)) for each in plants])
 
 
-def _terms_of_step(plants: list[P], matrices: np.ndarray) -> np.ndarray:
+def _terms_of_step(plants: list[LinearPlant], matrices: np.ndarray) -> np.ndarray:
     """Returns the largest sum of terms that s of a member is made of, shape (n,); zero for past inputs."""
     n, sizes = plants[0].n, np.abs(_resting_points(plants)) + np.abs(_center_of(plants))
     terms = [exact.product(np.abs(each[:, :-1]), size) + size[:n] for each, size in zip(matrices, sizes, strict=True)]
-    return np.max(terms, axis=0) * (np.arange(n) < n - min(map(inputs_under_way, plants)))
+    return np.max(terms, axis=0) * (np.arange(n) < n - plants[0].past)
 
 
 def _ends(name: str, value: Any) -> tuple[float, float]:
@@ -253,19 +239,19 @@ def _ends(name: str, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def _require_alike(kind: type[P], plants: list[P]) -> None:
+def _require_alike(plants: list[LinearPlant]) -> None:
     """Raises ValueError unless all are plants that differ in A and B alone, and in where they rest."""
     for each in plants:
-        _require_member(kind, plants[0], each)
+        _require_member(plants[0], each)
     first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
     for number, each in enumerate(plants):
         _Shared(first, cover, f"member {number}")(each)
 
 
-def _require_member(kind: type[P], first: P, plant: Any) -> None:
+def _require_member(first: LinearPlant, plant: Any) -> None:
     """Raises ValueError unless a plant can be a member of a family, and has the sizes of its first one."""
-    if not isinstance(plant, kind):
-        raise ValueError(f"the members of a family must be of type {kind.__name__}, got {shown(plant)}")
+    if not isinstance(plant, LinearPlant):
+        raise ValueError(f"the members of a family must be plants, got {shown(plant)}")
     if plant.remainder is not None:
         raise ValueError("a member of a family has a remainder of its own, for which no bound of the family is proved")
     if plant.between_samples is not None:
@@ -289,14 +275,13 @@ class _Shared:
 
     def __call__(self, plant: Any) -> None:
         """Raises ValueError unless a plant, counted from where the first one is, has all that members share."""
-        _require_member(type(self.first), self.first, plant)
+        _require_member(self.first, plant)
         moved = _around_center(plant, _resting_points([self.first])[0])
-        for entry in fields(moved):
-            one, other = getattr(self.first, entry.name), getattr(moved, entry.name)
-            tolerance = SAME if entry.name in _ROUNDED else 0.0
-            if entry.name not in (*_OWN, "disturbance_bound") and not _is_same(one, other, tolerance):
+        for name in (*_ROUNDED, *_SAME):
+            one, other = getattr(self.first, name), getattr(moved, name)
+            if not _is_same(one, other, SAME if name in _ROUNDED else 0.0):
                 raise ValueError(
-                    f"the members of a family may differ in A and B alone, and {self.name} has another {entry.name}"
+                    f"the members of a family may differ in A and B alone, and {self.name} has another {name}"
                 )
         _require_covered(self.first, self.cover, plant, self.name)
 
@@ -327,34 +312,3 @@ def _check_monotone(family: Family, room: np.ndarray) -> None:
                 f"{entry_name(wrong)} is not monotone in {name} from {low[axis]:g} to {high[axis]:g}, as monotone=True "
                 "says: give a smaller range, or the list of plants whose convex hull holds yours"
             )
-
-
-def _largest(reach: np.ndarray, off: np.ndarray, state_names: Sequence[str]) -> np.ndarray:
-    """Returns the half-widths of what the middle leaves out, shape (n,).
-
-    Args:
-        reach: w, the largest |x_j|, |u_j| and 1, shape (n + m + 1,); infinite for an unlimited state.
-        off: How far entries of [A, B, s] are from the middle, shape (N, n, n + m + 1).
-        state_names: Names of the states.
-
-    Raises:
-        ValueError: If members differ in what an unlimited state does.
-    """
-    differs = off.any(axis=(0, 1))
-    if free := np.flatnonzero(differs & np.isinf(reach)).tolist():
-        raise ValueError(
-            f"the members differ in what {state_names[free[0]]} does, which no row of the box with two ends "
-            "limits: give it limits, if generous ones"
-        )
-    reach = np.where(differs, reach, 0.0)
-    return (1.0 + ROUNDING) * np.max([exact.product(each, reach) for each in off], axis=0)
-
-
-def _around(plant: LinearPlant, sizes: np.ndarray) -> Ellipsoid:
-    """Returns the ellipsoid of the smallest tr(W P) around a box of half-widths, shape (n,)."""
-    n = plant.n
-    sides = [as_bound((np.eye(n)[:, [i]], [size]), n, "the remainder") for i, size in enumerate(sizes.tolist()) if size]
-    if not sides:
-        return Ellipsoid(np.zeros((n, n)))
-    shapes = (each.shape_matrix for each in sides)
-    return Ellipsoid(reduce(lambda one, other: outer_sum(one, other, plant.relative_weight), shapes))

@@ -6,14 +6,14 @@ They are the same numbers on every machine (`ncs_gym.exact`).
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import Bounds, Sum
+from ncs_gym.bounds import Ball, Sum
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
-from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from ncs_gym.validation import ReadOnlyArrays, read_only
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
@@ -24,8 +24,60 @@ FLAT_INFLATION = 1e-12
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
+# Of what is truncated where nothing is.
+DELTA = 0.05
 # A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
 FREE_REACH = 100.0
+
+
+class Source(NamedTuple):
+    """What is declared of one uncertainty, in the dimension of the plant: the sum of all.
+
+    Attributes:
+        ball: Squared radius of a ball.
+        noise: Truncated Gaussian noise, whose covariance is zero where there is none.
+        bound: An ellipsoid around what else is declared; None if nothing is.
+    """
+
+    ball: float
+    noise: TruncatedGaussian
+    bound: Ellipsoid | None
+
+    def ellipsoids(self) -> list[Ellipsoid]:
+        """Returns the bounds that add up to the whole one, in dimension n."""
+        ball = Ellipsoid(self.ball * np.eye(len(self.noise.covariance)))
+        return [ball, self.noise.bound, *([] if self.bound is None else [self.bound])]
+
+    def drawn(self, rng: np.random.Generator, count: int | None, *, truncated: bool) -> np.ndarray:
+        """Returns noise, truncated or not, plus a uniform point of the bound unless that is one, (n,) or (count, n)."""
+        samples = self.noise.sample(rng, count, truncated=truncated)
+        if self.bound is None or not self.bound.shape_matrix.any():
+            return samples
+        return samples + self.bound.sample(rng, count)
+
+
+def source_of(declared: Any, weight: np.ndarray, past: int = 0, *, keeps_ball: bool = False) -> Source:
+    """Returns what a sum of sets declares of the own states of a plant, or of its outputs.
+
+    Args:
+        declared: The sum.
+        weight: W, by which a sum of several sets becomes one ellipsoid.
+        past: How many past inputs follow, of which nothing is uncertain.
+        keeps_ball: Whether a `Ball` stands for itself, which it cannot beside past inputs.
+
+    Raises:
+        ValueError: If a set is in another dimension, or one with two different ends is added to others.
+    """
+    size, gaussian = len(weight), declared.gaussian
+    covariance, delta = (np.zeros((size, size)), DELTA) if gaussian is None else (gaussian.covariance, gaussian.delta)
+    noise = TruncatedGaussian(np.pad(covariance, (0, past)), truncation_energy(delta, size), past)
+    others = [each for each in declared.parts if each is not gaussian]
+    balls = [each for each in others if isinstance(each, Ball)] if keeps_ball and not past else []
+    others = tuple(each for each in others if each not in balls)
+    bound = Sum(others).sized(size).as_one(weight).ellipsoid() if others else None
+    if bound is not None and past:
+        bound = Ellipsoid(np.pad(bound.shape_matrix, (0, past)))
+    return Source(float(np.square(sum(each.radius for each in balls))), noise, bound)
 
 
 class HardBounds(ReadOnlyArrays):
@@ -37,15 +89,53 @@ class HardBounds(ReadOnlyArrays):
     n: int
     m: int
     p: int
+    past: int
     largest_input: np.ndarray
-    gamma: float
-    bounds: Bounds
-    remainder: Remainder | None
+    of_disturbance: Source
+    of_sensor: Source
+    of_first_error: Source
+    remainder: Any
 
     @property
+    def gamma(self) -> float:
+        """Squared radius of the ball that disturbances add."""
+        return self.of_disturbance.ball
+
+    @property
+    def process_noise_cov(self) -> np.ndarray:
+        """Q, shape (n, n); zero where no Gaussian is declared."""
+        return self.of_disturbance.noise.covariance
+
+    @property
+    def measurement_noise_cov(self) -> np.ndarray:
+        """R, shape (p, p), alike."""
+        return self.of_sensor.noise.covariance
+
+    @property
+    def initial_cov(self) -> np.ndarray:
+        """P0, shape (n, n), alike."""
+        return self.of_first_error.noise.covariance
+
+    @property
+    def disturbance_bound(self) -> Ellipsoid | None:
+        """What holds the other disturbances; None if no other set is declared."""
+        return self.of_disturbance.bound
+
+    @property
+    def sensor_bound(self) -> Ellipsoid | None:
+        """What holds other sensor noise, alike."""
+        return self.of_sensor.bound
+
+    @property
+    def initial_bound(self) -> Ellipsoid | None:
+        """What holds another error of the first estimate, alike."""
+        return self.of_first_error.bound
+
+    @cached_property
     def remainder_bound(self) -> Ellipsoid | None:
         """What holds the remainder of a model, shape (n, n); None if there is none."""
-        return None if self.remainder is None else self.remainder.bound
+        bound = None if self.remainder is None else self.remainder.bound
+        return bound if bound is None or not self.past else Ellipsoid(np.pad(bound.shape_matrix, (0, self.past)))
 
     @cached_property
     def weight(self) -> np.ndarray:
@@ -55,9 +145,10 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def reach_from_rest(self) -> np.ndarray:
         """How far inputs take each state in n steps at most, from about as far as noise does in one, shape (n,)."""
-        sums = self.bounds.disturbance, self.bounds.first_error
-        bounded = [each.ellipsoid().shape_matrix for part in sums for each in part.parts if each is not part.gaussian]
-        noise = [np.diag(each) for each in (*(part.gaussian.covariance for part in sums), *bounded)]
+        sources = self.of_disturbance, self.of_first_error
+        bounded = [ball_or for each in sources for ball_or in each.ellipsoids() if ball_or is not each.noise.bound]
+        shapes = [*(each.noise.covariance for each in sources), *(each.shape_matrix for each in bounded)]
+        noise = [np.diag(each) for each in shapes]
         reach = np.sqrt(np.sum(noise, axis=0))
         return read_only(reach_in_steps(self.A, self.B, self.largest_input, reach))
 
@@ -79,17 +170,17 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def process_noise(self) -> TruncatedGaussian:
         """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
-        return self.bounds.disturbance.gaussian.noise
+        return self.of_disturbance.noise
 
     @cached_property
     def sensor_noise(self) -> TruncatedGaussian:
         """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
-        return self.bounds.sensor.gaussian.noise
+        return self.of_sensor.noise
 
     @cached_property
     def initial_noise(self) -> TruncatedGaussian:
         """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
-        return self.bounds.first_error.gaussian.noise
+        return self.of_first_error.noise
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
@@ -118,12 +209,12 @@ class HardBounds(ReadOnlyArrays):
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         W = self.relative_weight
-        return ellipsoid_around_sum(W, self.bounds.disturbance.ellipsoid(W), self.remainder_bound)
+        return ellipsoid_around_sum(W, *self.of_disturbance.ellipsoids(), self.remainder_bound)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return self.bounds.sensor.ellipsoid()
+        return ellipsoid_around_sum(np.eye(self.p), *self.of_sensor.ellipsoids())
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -143,8 +234,9 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def nominal_initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
-        ball, bounded = Ellipsoid(self.initial_radius_squared * np.eye(self.n)), self.bounds.first_error.bounded
-        return ellipsoid_around_sum(self.relative_weight, ball, bounded and bounded.ellipsoid(self.relative_weight))
+        unknown = np.arange(self.n) < self.n - self.past
+        ball = Ellipsoid(self.initial_radius_squared * np.diag(unknown.astype(float)))
+        return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -165,37 +257,26 @@ class HardBounds(ReadOnlyArrays):
         noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
         """
 
-        def summed(source: Sum, divisor: float) -> np.ndarray:
-            bounded = [each.ellipsoid().shape_matrix / divisor for each in source.parts if each is not source.gaussian]
-            return np.sum([source.gaussian.covariance, *bounded], axis=0)
+        def summed(source: Source, divisor: float) -> np.ndarray:
+            shapes = [each.shape_matrix / divisor for each in source.ellipsoids() if each is not source.noise.bound]
+            return np.sum([source.noise.covariance, *shapes], axis=0)
 
-        Q, R = summed(self.bounds.disturbance, 1.0), summed(self.bounds.sensor, self.p + 2)
-        P0 = summed(self.bounds.first_error, self.n + 2)
-        Q = Q if self.remainder is None else Q + self.remainder.bound.shape_matrix
+        Q, R = summed(self.of_disturbance, 1.0), summed(self.of_sensor, self.p + 2)
+        P0 = summed(self.of_first_error, self.n + 2)
+        Q = Q if self.remainder_bound is None else Q + self.remainder_bound.shape_matrix
         return read_only(Q), read_only(R), read_only(P0)
 
     def sample_sensor_noise(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
         """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
-        return _drawn(self.bounds.sensor, rng, count, truncated=truncated)
+        return self.of_sensor.drawn(rng, count, truncated=truncated)
 
     def sample_initial_error(
         self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
     ) -> np.ndarray:
         """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
-        return _drawn(self.bounds.first_error, rng, count, truncated=truncated)
-
-
-def _drawn(source: Sum, rng: np.random.Generator, count: int | None, *, truncated: bool) -> np.ndarray:
-    """Returns noise, truncated or not, shape (n,) or (count, n), plus uniform points of the bounds that are no points.
-
-    Of a set other than an ellipsoid the points are those of the ellipsoid around it.
-    """
-    samples = source.gaussian.noise.sample(rng, count, truncated=truncated)
-    for bound in (each.ellipsoid() for each in source.parts if each is not source.gaussian):
-        samples = samples + bound.sample(rng, count) if bound.shape_matrix.any() else samples
-    return samples
+        return self.of_first_error.drawn(rng, count, truncated=truncated)
 
 
 def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:

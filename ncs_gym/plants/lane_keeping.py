@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ncs_gym.bounds import Bounds, Through
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import sampled_model, zero_order_hold
 
 
-def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> LinearPlant:
+def lane_keeping(dt: float = 0.05, speed: float = 20.0) -> LinearPlant:
     """Returns a car that keeps its lane at constant speed, by exact zero-order hold.
 
     e' = speed psi + w, psi' = u. x = (e [m], psi [rad]): the offset from the middle of the lane and the heading; u is
@@ -20,19 +20,13 @@ def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> Linear
     Args:
         dt: Step [s].
         speed: Of the car [m/s].
-        bounds: Other arguments of `LinearPlant`, in the place of these.
     """
     motion = np.array([[0.0, speed], [0.0, 0.0]])
     turn, push = np.array([[0.0], [1.0]]), np.array([[1.0], [0.0]])
-    defaults = {
-        "box": [0.5, 0.1],
-        "u_max": 0.4,
-        "disturbance_bound": (zero_order_hold(motion, push, dt)[1], 0.4),
-        "sensor_bound": [1e-3, 2e-4],
-        "initial_bound": [1e-2, 2e-3],
-        "state_names": ("offset", "heading"),
-        "state_units": ("m", "rad"),
-        "input_names": ("yaw rate",),
-        "input_units": ("rad/s",),
-    }
-    return LinearPlant(**sampled_model(motion, turn, dt) | defaults | bounds)
+    model = Model.sampled(motion, turn, None, dt)
+    return LinearPlant(
+        model,
+        Limits(state=[0.5, 0.1], input=0.4),
+        Bounds(disturbance=Through(model.held(push), 0.4), sensor=[1e-3, 2e-4], first_error=[1e-2, 2e-3]),
+        {"states": {"offset": "m", "heading": "rad"}, "inputs": {"yaw rate": "rad/s"}},
+    )

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from contextlib import suppress
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from ncs_gym.plants import between_samples
-from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.validation import ReadOnlyArrays, read_only
-
-if TYPE_CHECKING:
-    from ncs_gym.plants.linear_plant import LinearPlant
 
 
 class LimitValues(ReadOnlyArrays):
@@ -29,6 +24,7 @@ class LimitValues(ReadOnlyArrays):
     dt: float
     n: int
     m: int
+    past: int
     continuous_model: np.ndarray | None
     between_samples: int | None
 
@@ -94,16 +90,12 @@ class LimitValues(ReadOnlyArrays):
 
         Of states that are past inputs those are the inputs' limits, which they never leave.
         """
-        return self.reach_with(inputs_under_way(cast("LinearPlant", self)))
-
-    def reach_with(self, past: int) -> np.ndarray:
-        """Returns what `reach` is if so many of the last states are past inputs."""
         two_ends = np.isfinite(self.box_ends).all(axis=0)
         limited, reach = self.box[two_ends].any(axis=0), np.full(self.n, np.inf)
         with suppress(ZeroDivisionError):  # rows that limit a sum alone
             reach[limited] = between_samples.widest(self.box[:, limited], self.box_ends)
         reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
-        reach[self.n - past :] = np.tile(self.largest_input, past // self.m)
+        reach[self.n - self.past :] = np.tile(self.largest_input, self.past // self.m)
         return read_only(np.concatenate([reach, self.largest_input]))
 
     @cached_property

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import pushes_of
-from ncs_gym.limits import Within
+from ncs_gym.limits import Rows, Within
 from ncs_gym.model import EQUILIBRIUM_PRECISION, Model
 from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -23,58 +23,61 @@ class MovedOperatingPointWarning(UserWarning):
     """A disturbance with two different ends moves the point that deviations are counted from."""
 
 
-def at_rest(model: Model, within: Within, disturbance: Any, step_offset: np.ndarray) -> dict[str, Any]:
-    """Returns the fields of `LinearPlant` about limits, operating point and declared disturbances.
+class Rest(NamedTuple):
+    """Where deviations are counted from, and the limits from there.
 
-    Where the middle of a disturbance, E w, is not zero, deviations are counted from (x, u) with x = A x + B u + E w, of
-    such points that nearest to the model's in units of the limits. What a point lacks of an equilibrium by rounding is
-    added to the bound.
+    Attributes:
+        within: The limits in deviations.
+        state, input: The point, shapes (n,) and (m,).
+        step_offset: Sizes of the constant that it rests under, shape (n,).
+        lacking: What it lacks of an equilibrium by rounding, in size, shape (n,).
+    """
+
+    within: Within
+    state: np.ndarray
+    input: np.ndarray
+    step_offset: np.ndarray
+    lacking: np.ndarray
+
+
+def at_rest(model: Model, within: Within, disturbance: Any) -> Rest:
+    """Returns where a plant rests: at the point of its model, moved to where the middle of the disturbance does.
+
+    Where that middle, E w, is not zero, this is an (x, u) with x = A x + B u + E w, of such points that nearest to the
+    model's in units of the limits.
 
     Args:
         model: The model.
         within: Limits in deviations from its point.
-        disturbance: A set without Gaussian, in the dimension of the state; None if nothing is declared.
-        step_offset: Sizes of the constant that the point rests under, shape (n,).
+        disturbance: A set in the dimension of the state.
 
     Raises:
         ValueError: If no such point lies within the limits.
     """
     (box, inputs, mixed), lacking = within, np.abs(model.lacking)
-    state, applied, ends = model.state, model.input, np.stack(within.box[1:])
-    mixed_ends, bound = np.stack(mixed[1:]), disturbance
-    pushes = pushes_of(disturbance)
-    if pushes:
-        E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
-        x, u, missing = _resting(model, within, E, middle)
-        ends, inputs = ends - exact.product(box.rows, x), inputs - u[None]
-        mixed_ends = mixed_ends - exact.product(mixed.rows, np.concatenate([x, u]))
-        state, applied, lacking = state + x, applied + u, np.abs(missing) + lacking
-        if not all(((each[0] < 0.0) & (each[1] > 0.0)).all() for each in (ends, inputs, mixed_ends)):
-            raise ValueError(
-                f"disturbance_bound: the middle of this disturbance moves the operating point to "
-                f"{shown(state.tolist())} with input {shown(applied.tolist())}, which is not strictly within the limits"
-            )
-        shown_point = [[float(f"{each:.6g}") for each in around] for around in (state, applied)]
-        warn_caller(
-            "deviations are counted from the state {} and the input {}, where the middle of the disturbance rests "
-            "(plant.operating_state)".format(*map(shown, shown_point)),
-            MovedOperatingPointWarning,
+    if not (pushes := pushes_of(disturbance)):
+        return Rest(within, model.state, model.input, model.step_offset, lacking)
+    E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
+    x, u, missing = _resting(model, within, E, middle)
+    state, applied = model.state + x, model.input + u
+    moved = Within(
+        Rows(box.rows, *(np.stack(box[1:]) - exact.product(box.rows, x))),
+        inputs - u[None],
+        Rows(mixed.rows, *(np.stack(mixed[1:]) - exact.product(mixed.rows, np.concatenate([x, u])))),
+    )
+    if not all(((each[0] < 0.0) & (each[1] > 0.0)).all() for each in (moved.box[1:], moved.inputs, moved.mixed[1:])):
+        raise ValueError(
+            f"the middle of this disturbance moves the operating point to {shown(state.tolist())} with input "
+            f"{shown(applied.tolist())}, which is not strictly within the limits"
         )
-        step_offset = np.abs(step_offset) + exact.product(np.abs(E), np.abs(middle))
-    if lacking.any() or pushes:
-        declared = Ellipsoid(np.zeros((len(state),) * 2)) if bound is None else bound.ellipsoid()
-        bound = _with_residual(declared, lacking, box.rows)
-    return {
-        "disturbance_bound": bound,
-        "box": box.rows,
-        "box_ends": ends,
-        "input_ends": inputs,
-        "mixed_rows": mixed.rows,
-        "mixed_ends": mixed_ends,
-        "operating_state": state,
-        "operating_input": applied,
-        "step_offset": step_offset,
-    }
+    shown_point = [[float(f"{each:.6g}") for each in around] for around in (state, applied)]
+    warn_caller(
+        "deviations are counted from the state {} and the input {}, where the middle of the disturbance rests "
+        "(plant.operating_state)".format(*map(shown, shown_point)),
+        MovedOperatingPointWarning,
+    )
+    step_offset = model.step_offset + exact.product(np.abs(E), np.abs(middle))
+    return Rest(moved, state, applied, step_offset, np.abs(missing) + lacking)
 
 
 def _resting(
@@ -103,8 +106,7 @@ def _resting(
     terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(middle) + np.abs(x)
     if not (np.abs(missing_at(x, u)) <= EQUILIBRIUM_PRECISION * terms).all():
         raise ValueError(
-            "disturbance_bound: no state stays where it is under the middle of this disturbance, "
-            f"{shown((E @ middle).tolist())} per step, whatever the input: give symmetric ends around zero"
+            f"no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} per step, whatever the input: give symmetric ends around zero"
         )
     x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
     return x, u, missing_at(x, u)
@@ -121,11 +123,9 @@ def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
     return np.rint(values / steps) * steps
 
 
-def _with_residual(bound: Ellipsoid, missing: np.ndarray, rows: np.ndarray) -> Ellipsoid:
+def with_residual(bound: Ellipsoid, missing: np.ndarray, rows: np.ndarray) -> Ellipsoid:
     """Returns a bound of d with what a point lacks of an equilibrium, doubled; rows, (k, n), give the units."""
     n = len(missing)
-    if not missing.any():
-        return bound
     gram = exact.product(rows.T, rows)
     lacking = np.diag(n * np.square(2.0 * np.abs(missing)))
     return Ellipsoid(outer_sum(bound.shape_matrix, lacking, gram + np.eye(n) * np.trace(gram) / n))

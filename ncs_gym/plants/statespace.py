@@ -1,4 +1,4 @@
-"""Models in continuous time and from elsewhere: sampled exactly, as arguments of `LinearPlant`."""
+"""Models in continuous time and from elsewhere: sampled exactly."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.bounds import Bounds, Gaussian
+from ncs_gym.plants.hard_bounds import DELTA
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from ncs_gym.validation import shown
 
@@ -35,31 +37,19 @@ def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray
     return sampled[:n, :n], sampled[:n, n:]
 
 
-def sampled_model(A: np.ndarray, B: np.ndarray, dt: float) -> dict[str, Any]:
-    """Returns A, B, dt and continuous_model of `LinearPlant` for a model in continuous time, A (n, n) and B (n, m)."""
-    sampled_A, sampled_B = zero_order_hold(A, B, dt)
-    return {"A": sampled_A, "B": sampled_B, "dt": dt, "continuous_model": np.concatenate([A, B], axis=1)}
-
-
-def noise_in_proportion(
-    half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float, delta: float = 0.05
-) -> dict[str, Any]:
-    """Returns covariances of `LinearPlant` whose truncated noise is in proportion to the safe box.
+def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
+    """Returns Gaussian noise, of which 95 % count, whose bounds are in proportion to the safe box.
 
     Args:
         half_widths: Of the safe box, shape (n,).
         H: Output matrix, shape (p, n).
         disturbance: Bound of process noise, as a fraction of the half-widths.
-        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs.
-        delta: Probability mass that the truncation of each Gaussian removes.
+        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs; of the first error in each
+            state, of the smallest half-width.
     """
-    n = len(half_widths)
-    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(n, half_widths.min())
-    return {
-        "process_noise_cov": np.diag(np.square(disturbance * half_widths)) / truncation_energy(delta, n),
-        "measurement_noise_cov": np.diag(np.square(sensor * outputs)) / truncation_energy(delta, len(H)),
-        "initial_cov": np.diag(np.square(sensor * smallest)) / truncation_energy(delta, n),
-    }
+    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
+    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
+    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))
 
 
 def matrices_of(sys: Any) -> tuple[Any, Any, Any, Any, Any]:

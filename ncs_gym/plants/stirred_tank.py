@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ncs_gym.bounds import Ball, Bounds, Through
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import sampled_model, zero_order_hold
 
 
-def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
+def stirred_tank(dt: float = 3.0) -> LinearPlant:
     """Returns the continuous stirred-tank reactor of Seborg et al. at its unstable point, by exact zero-order hold.
 
     x = (concentration [cmol/L], temperature [K]) and u the temperature of the coolant [K], |u| <= 20, all in
@@ -22,20 +22,14 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
 
     Args:
         dt: Step [s].
-        bounds: Other arguments of `LinearPlant`, in the place of these.
     """
     # Given per minute.
     reaction = np.array([[-2.0, -3.57], [2.092, 4.38]]) / 60.0
     coolant, feed = np.array([[0.0], [2.092]]) / 60.0, np.array([[0.0], [1.0]]) / 60.0
-    defaults = {
-        "box": [10.0, 5.0],
-        "u_max": 20.0,
-        "disturbance_bound": (zero_order_hold(reaction, feed, dt)[1], 2.0),
-        "sensor_bound": 0.02,
-        "initial_bound": 0.1,
-        "state_names": ("concentration", "temperature"),
-        "state_units": ("cmol/L", "K"),
-        "input_names": ("coolant temperature",),
-        "input_units": ("K",),
-    }
-    return LinearPlant(**sampled_model(reaction, coolant, dt) | defaults | bounds)
+    model = Model.sampled(reaction, coolant, None, dt)
+    return LinearPlant(
+        model,
+        Limits(state=[10.0, 5.0], input=20.0),
+        Bounds(disturbance=Through(model.held(feed), 2.0), sensor=Ball(0.02), first_error=Ball(0.1)),
+        {"states": {"concentration": "cmol/L", "temperature": "K"}, "inputs": {"coolant temperature": "K"}},
+    )

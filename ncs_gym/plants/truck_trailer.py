@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ncs_gym.bounds import Ball, Bounds, Gaussian
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import sampled_model
-from ncs_gym.validation import as_matrix, as_number
+from ncs_gym.validation import as_number
 
 
 def truck_trailer(
-    mass: float = 1000.0, stiffness: float = 4500.0, damping: float = 4600.0, dt: float = 0.5, **bounds: Any
+    mass: float = 1000.0, stiffness: float = 4500.0, damping: float = 4600.0, dt: float = 0.5
 ) -> LinearPlant:
     """Returns the truck with a spring-damper-coupled trailer of Liu et al. Section 5.
 
@@ -26,28 +26,18 @@ def truck_trailer(
         stiffness: Of the coupling [N/m].
         damping: Of the coupling [N s/m].
         dt: Duration of a step [s].
-        bounds: Other arguments of `LinearPlant`, in the place of these.
 
     Raises:
-        ValueError: If mass, stiffness or dt is not positive, damping is negative, or a bound is wrong.
+        ValueError: If mass, stiffness or dt is not positive, or damping is negative.
     """
     mass = as_number(mass, "mass", low=0.0, low_open=True)
     stiffness = as_number(stiffness, "stiffness", low=0.0, low_open=True)
     damping = as_number(damping, "damping", low=0.0)
-    dt = as_number(dt, "dt", low=0.0, low_open=True)
     coupling, push = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]]), np.array([[0.0], [1.0]])
-    given = {name: value for name, value in bounds.items() if value is not None}
-    p = len(as_matrix(given["H"], (None, 2), "H")) if "H" in given else 2
-    defaults = {
-        "box": [2.0, 2.0],
-        "u_max": 4.0,
-        "gamma": 5e-4,
-        "process_noise_cov": 1e-4 * np.eye(2),
-        "measurement_noise_cov": 1e-4 * np.eye(p),
-        "initial_cov": 1e-4 * np.eye(2),
-        "state_names": ("coupling stretch", "stretch rate"),
-        "state_units": ("m", "m/s"),
-        "input_names": ("truck acceleration",),
-        "input_units": ("m/s^2",),
-    }
-    return LinearPlant(**sampled_model(coupling, push, dt) | defaults | given)
+    noise = Gaussian(1e-4 * np.eye(2), 0.05)
+    return LinearPlant(
+        Model.sampled(coupling, push, None, dt),
+        Limits(state=[2.0, 2.0], input=4.0),
+        Bounds(disturbance=Ball(np.sqrt(5e-4)) + noise, sensor=noise, first_error=noise),
+        {"states": {"coupling stretch": "m", "stretch rate": "m/s"}, "inputs": {"truck acceleration": "m/s^2"}},
+    )

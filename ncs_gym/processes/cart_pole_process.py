@@ -9,6 +9,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from ncs_gym.bounds import Bounds
+from ncs_gym.limits import Limits
 from ncs_gym.plants.cart_pole import GRAVITY, cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.linearization import linear_model
@@ -100,8 +102,6 @@ def nonlinear_cart_pole() -> LinearPlant:
 def sampled_cart_pole() -> LinearPlant:
     """Returns the same model, found anew."""
     tangent = cart_pole()
-    names = ("state_names", "state_units", "input_names", "input_units")
-    bounds = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), NOISE * tangent.half_widths)
-    same = {name: getattr(tangent, name) for name in names}
-    half_widths, limits = np.round(tangent.half_widths, 9), tangent.u_max
-    return linear_model(CartPoleProcess(), half_widths, limits, tangent.dt, samples=SAMPLES, **bounds, **same)
+    noise = NOISE * tangent.half_widths
+    limits, bounds = Limits(state=np.round(tangent.half_widths, 9), input=tangent.u_max), Bounds(noise, noise, noise)
+    return linear_model(CartPoleProcess(), limits, bounds, tangent.dt, labels=tangent.labels, samples=SAMPLES)

@@ -10,10 +10,12 @@ import numpy as np
 from flint import arb
 
 from ncs_gym import exact
+from ncs_gym.bounds import Bounds, Through
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.process import Process
-from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import as_number
 
@@ -73,7 +75,7 @@ def _write(env: Any, state: np.ndarray) -> None:
     env.state = state
 
 
-def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGTH, **bounds: Any) -> LinearPlant:
+def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGTH) -> LinearPlant:
     """Returns the linear model of `Pendulum-v1` for |angle| <= 0.25 rad and |rate| <= 1.5 rad/s, |u| <= 2 N m.
 
     The environment computes rate+ = rate + dt (a sin(angle) + b u) and angle+ = angle + dt rate+ with a = 3 g / (2 l)
@@ -85,16 +87,10 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
         gravity: [m/s^2].
         mass: [kg].
         length: [m].
-        bounds: Other arguments of `LinearPlant`, beside those that the proof is about.
 
     Raises:
-        ValueError: If an argument is one of these, or the environment would clip a rate.
+        ValueError: If the environment would clip a rate.
     """
-    if changed := sorted(set(PROVED_FOR) & set(bounds)):
-        raise ValueError(
-            f"the remainder of pendulum() is proved for its own {', '.join(PROVED_FOR[:-1])}, which "
-            f"{', '.join(changed)} would replace: ncs_gym.linear_model finds the model of another box"
-        )
     pull, gain = 3.0 * gravity / (2.0 * length), 3.0 / (mass * (length * length))
     (sine,) = exact.nearest(lambda: [arb(ANGLE).sin()])
     ratio = sine / ANGLE
@@ -108,23 +104,12 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
     left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING)
     left_out = max(left_out * (1.0 + ROUNDING), left_out + STEP_ROUNDING * fastest)
     direction = np.array([[STEP], [1.0]])
-    settings = {
-        "A": np.array([[1.0, STEP], [0.0, 1.0]]) + slope * np.outer(direction, [1.0, 0.0]),
-        "B": STEP * gain * direction,
-        "box": [ANGLE, RATE],
-        "u_max": TORQUE,
-        "dt": STEP,
-        "disturbance_bound": 0.0,
-        "sensor_bound": [0.002, 0.01],
-        "initial_bound": [0.005, 0.03],
-        "remainder": Remainder(
-            as_bound((direction, left_out), 2, "the remainder"),
-            proved=True,
-            basis=f"sin(angle) / angle lies between {ratio:.6f} and 1 for angles up to {ANGLE} rad",
-        ),
-        "state_names": ("angle", "angular rate"),
-        "state_units": ("rad", "rad/s"),
-        "input_names": ("torque",),
-        "input_units": ("N m",),
-    }
-    return LinearPlant(**settings | bounds)
+    basis = f"sin(angle) / angle lies between {ratio:.6f} and 1 for angles up to {ANGLE} rad"
+    remainder = Remainder(Through(direction, left_out).ellipsoid(), True, basis)
+    A = np.array([[1.0, STEP], [0.0, 1.0]]) + slope * np.outer(direction, [1.0, 0.0])
+    return LinearPlant(
+        Model(A, STEP * gain * direction, None, STEP),
+        Limits(state=[ANGLE, RATE], input=TORQUE),
+        Bounds(disturbance=remainder, sensor=[0.002, 0.01], first_error=[0.005, 0.03]),
+        {"states": {"angle": "rad", "angular rate": "rad/s"}, "inputs": {"torque": "N m"}},
+    )

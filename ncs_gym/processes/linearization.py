@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.bounds import Bounds, Box, Sum
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import FunctionProcess, LinearProcess, Process
-from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import rounded_up
@@ -19,7 +22,6 @@ from ncs_gym.validation import (
     as_matrix,
     as_number,
     as_setting,
-    as_vector,
     counted,
     shown,
     warn_caller,
@@ -46,10 +48,8 @@ NO_EQUILIBRIUM = 1e-6
 DIGITS = 9
 
 
-# Arguments of `LinearPlant` for the point that deviations are counted from, and for where states and inputs may be.
-_POINT = "operating_state", "operating_input"
-_ROWS = "output_limits", "mixed_limits", "mixed_rows", "mixed_ends"
-_OF_FRAME = "state_limits", "input_limits", "box_ends", "input_ends", *_ROWS, *_POINT
+# Where nothing is uncertain.
+_NOTHING = Bounds(disturbance=0.0, sensor=0.0, first_error=0.0)
 
 
 class _Region(NamedTuple):
@@ -90,15 +90,18 @@ class _Steps(NamedTuple):
 
 def linear_model(
     process: Process | Callable[[np.ndarray, np.ndarray], np.ndarray],
-    box: Any = None,
-    u_max: Any = None,
-    dt: float | None = None,
+    limits: Limits,
+    bounds: Bounds,
+    dt: float,
     *,
+    at: tuple[Any, Any] | None = None,
+    H: Any = None,
+    labels: Mapping[str, Any] | None = None,
+    matrices: tuple[Any, Any] | None = None,
     jacobian_bounds: tuple[Any, Any] | None = None,
     samples: int = 20_000,
     safety_factor: float = 1.25,
     seed: int = 0,
-    **settings: Any,
 ) -> LinearPlant:
     """Returns x+ = A x + B u + r + d as a plant, r in a bound on what A x + B u leaves out within the limits.
 
@@ -110,16 +113,18 @@ def linear_model(
     Args:
         process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
             f(0, 0) = 0.
-        box: Half-widths of the safe box, shape (n,), where limits are symmetric; otherwise give `state_limits`. Every
-            state needs two finite ends.
-        u_max: Input limits, a number for one input or shape (m,), where they are symmetric; otherwise `input_limits`.
+        limits: Of which every state needs two finite ends.
+        bounds: Of what is uncertain beside the remainder.
         dt: Duration of a step [s].
+        at: State and input that deviations are counted from, as of a `Model`; they also say how many of each there are,
+            which otherwise the limits do.
+        H: Output matrix, shape (p, n); the identity by default.
+        labels: As of a `LinearPlant`.
+        matrices: A and B, in place of fitted ones.
         jacobian_bounds: Smallest and largest values of [df/dx, df/du] within the limits, two arrays (n, n + m).
         samples: Number of steps that are sampled.
         safety_factor: Of a sampled bound, >= 1.
         seed: Seed of the samples.
-        settings: Other arguments of `LinearPlant`, limits around an operating point as well. A and B, given together,
-            are taken in place of fitted ones; a disturbance is declared beside the remainder.
 
     Warns:
         NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far.
@@ -132,14 +137,14 @@ def linear_model(
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
     moving = process if isinstance(process, Process) else FunctionProcess(process)
-    limits = {"box": None if box is None else as_vector(box, None, "box"), "u_max": u_max, "dt": dt}
-    frame = _frame(limits | {name: settings[name] for name in _OF_FRAME if name in settings})
-    region, point = _Region.of(frame), {name: getattr(frame, name) for name in _POINT}
-    given = {
-        name: as_matrix(settings.pop(name), getattr(frame, name).shape, name) for name in ("A", "B") if name in settings
-    }
-    if len(given) == 1 or (given and jacobian_bounds is not None):
-        raise ValueError("give A and B together, or jacobian_bounds, whose middle they are, or neither")
+    if not isinstance(limits, Limits):
+        raise ValueError(f"limits must be Limits, got {shown(limits)}")
+    n, m = (_size_of(each, of) for each, of in zip((limits.state, limits.input), at or (None, None), strict=True))
+    own = replace(limits, rate=None)
+    frame = LinearPlant(Model(np.zeros((n, n)), np.zeros((n, m)), None, dt, at), own, _NOTHING)
+    region = _Region.of(frame)
+    if matrices is not None and jacobian_bounds is not None:
+        raise ValueError("give matrices, or jacobian_bounds, whose middle they are")
     rng = np.random.default_rng(as_count(seed, "seed", low=0))
     drawn, fresh, origin, spread = _steps_of(moving, frame, region, as_count(samples, "samples", low=100), rng)
     widths = region.half[: frame.n]
@@ -152,7 +157,8 @@ def linear_model(
         A, B, bound = _from_jacobians(jacobian_bounds, region, origin)
         basis = "from bounds on its Jacobian"
     else:
-        A, B = (given["A"], given["B"]) if given else fitted_matrices(*drawn, widths)
+        A, B = fitted_matrices(*drawn, widths) if matrices is None else matrices
+        A, B = as_matrix(A, (n, n), "A of matrices"), as_matrix(B, (n, m), "B of matrices")
         factor = as_number(safety_factor, "safety_factor", low=1.0)
         bound = Ellipsoid(factor**2 * surrounding_shape(_left_out(A, B, drawn), widths))
         basis = f"from {counted(samples, 'sample')} with safety factor {factor:g}"
@@ -170,36 +176,19 @@ def linear_model(
             f"the remainder of the linear model alone moves state {reached.argmax() + 1} by {reached.max():.3g} "
             "half-widths of the box in one step: shrink the box, the input limits or dt"
         )
-    remainder = Remainder(bound, jacobian_bounds is not None, basis)
-    plant = LinearPlant(**limits | {"A": A, "B": B, "remainder": remainder} | settings)
-    if any(not np.array_equal(getattr(plant, name)[: len(at)], at) for name, at in point.items()):
-        raise ValueError(
-            "the remainder was bounded around the operating point that was given, from which the middle of "
-            "disturbance_bound moves: give symmetric ends, and let the process hold the middle"
-        )
-    return plant
+    model = Model(A, B, H, dt, at)
+    remainder = Remainder(bound, jacobian_bounds is not None, basis, None, LinearPlant(model, own, _NOTHING).region)
+    return LinearPlant(model, limits, replace(bounds, disturbance=Sum((bounds.disturbance, remainder))), labels)
 
 
 class NoEquilibriumWarning(UserWarning):
     """The point that deviations are counted from does not stay where it is."""
 
 
-def _frame(limits: dict[str, Any]) -> LinearPlant:
-    """Returns a plant with these limits, A = 0 and B = 0, of which nothing else is declared.
-
-    Args:
-        limits: Of `LinearPlant`, with None for those that are not given.
-    """
-    n = _size_of(limits["box"], limits.get("operating_state"), limits.get("state_limits"))
-    m = _size_of(limits["u_max"], limits.get("operating_input"), limits.get("input_limits"))
-    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
-    return LinearPlant(A=np.zeros((n, n)), B=np.zeros((n, m)), **limits, **quiet)
-
-
-def _size_of(vector: Any, point: Any, pair: Any) -> int:
-    """Returns how many entries limits and an operating point have, some of which may be numbers."""
-    ends = list(pair) if isinstance(pair, (tuple, list, np.ndarray)) else []
-    numbers = [as_setting(each) for each in (vector, point, *ends) if each is not None]
+def _size_of(limits: Any, point: Any) -> int:
+    """Returns how many entries limits and a point have, some of which may be numbers."""
+    given = [limits] if as_setting(limits) is not None else limits if isinstance(limits, tuple) else []
+    numbers = [as_setting(each) for each in (point, *([] if point is not None else given))]
     return max((each.size for each in numbers if each is not None), default=1)
 
 
@@ -292,7 +281,7 @@ def _from_jacobians(
     farthest = np.maximum(-region.low, region.high)
     sizes = np.abs(origin) + exact.product(np.maximum(high - middle, middle - low), farthest)
     sizes = np.where(sizes > 0.0, sizes * (1.0 + ROUNDING), 0.0)
-    return middle[:, :n], middle[:, n:], as_bound(sizes, n, "the remainder")
+    return middle[:, :n], middle[:, n:], Box(-sizes, sizes).ellipsoid()
 
 
 def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> float:

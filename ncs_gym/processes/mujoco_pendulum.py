@@ -11,7 +11,9 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
+from ncs_gym.bounds import Bounds
 from ncs_gym.installation import install_command
+from ncs_gym.limits import Limits
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.linearization import linear_model
@@ -86,12 +88,10 @@ def sampled_inverted_pendulum() -> LinearPlant:
     Raises:
         ModuleNotFoundError: If MuJoCo is missing.
     """
-    names = {
-        "state_names": ("position", "angle", "speed", "angular rate"),
-        "state_units": ("m", "rad", "m/s", "rad/s"),
-        "input_names": ("force",),
-        "input_units": ("100 N",),
+    noise = 5e-4 * np.array(BOX)
+    labels = {
+        "states": {"position": "m", "angle": "rad", "speed": "m/s", "angular rate": "rad/s"},
+        "inputs": {"force": "100 N"},
     }
-    half_widths = np.array(BOX)
-    bounds = {"disturbance_bound": 0.0, "sensor_bound": 5e-4 * half_widths, "initial_bound": 5e-4 * half_widths}
-    return linear_model(InvertedPendulumProcess(), BOX, LARGEST, STEP, **bounds, **names)
+    limits, bounds = Limits(state=BOX, input=LARGEST), Bounds(disturbance=0.0, sensor=noise, first_error=noise)
+    return linear_model(InvertedPendulumProcess(), limits, bounds, STEP, labels=labels)

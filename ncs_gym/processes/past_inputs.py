@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ncs_gym.bounds import Bounds
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.past_inputs import inputs_under_way, without_past_inputs
 from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process
 
 
@@ -19,7 +20,7 @@ def opened_for(process: Process, plant: LinearPlant, size: int | None) -> Proces
     Raises:
         ValueError: If the process does not fit the plant.
     """
-    if isinstance(process, LinearProcess | FamilyProcess) or not inputs_under_way(plant):
+    if isinstance(process, LinearProcess | FamilyProcess) or not plant.past:
         return process.opened(plant, size)
     return _BesidePastInputs(process, plant, size)
 
@@ -28,7 +29,7 @@ class _BesidePastInputs(Process):
     """Moves x by a process, and the inputs under way by one step: (x, u_{k-d}, .., u_{k-1}), the oldest input first."""
 
     def __init__(self, process: Process, plant: LinearPlant, size: int | None) -> None:
-        self._plant, self._is_late = without_past_inputs(plant)
+        self._plant, self._is_late = _without_past_inputs(plant), plant.model.delays > 0
         self._inner = process.opened(self._plant, size)
         self.vectorized, self.is_written = size is not None, self._inner.is_written
 
@@ -65,3 +66,11 @@ class _BesidePastInputs(Process):
 
     def close(self) -> None:
         self._inner.close()
+
+
+def _without_past_inputs(plant: LinearPlant) -> LinearPlant:
+    """Returns the plant of the own states alone, of which nothing uncertain is declared."""
+    point = plant.operating_state[: plant.n - plant.past], plant.operating_input
+    model = replace(plant.model, at=point, offset=None, delays=0)
+    limits = replace(plant.limits.absolute(plant.model), rate=None)
+    return LinearPlant(model, limits, Bounds(disturbance=0.0, sensor=0.0, first_error=0.0), plant.labels)

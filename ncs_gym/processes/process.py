@@ -16,7 +16,7 @@ from ncs_gym.validation import as_flag, as_setting, shown
 class Process:
     """What really moves; the plant is the certified model of it (docs/beyond_linear.md).
 
-    Where states of the plant are past inputs (`input_delay`, `du_max`), the environment keeps these: a process moves
+    Where states of the plant are past inputs (delays, limits of rates), the environment keeps these: a process moves
     the others, with the input that acts, and gets a plant of them alone.
 
     A process is a setting: one object may serve any number of environments. What keeps something at run time returns
@@ -65,7 +65,7 @@ class Process:
             ValueError: If there are no such parameters.
         """
         if given is not None:
-            raise ValueError("options['parameters'] is for the plant of a family (LinearPlant.family)")
+            raise ValueError("options['parameters'] is for the plant of a family (ncs_gym.family)")
         return None
 
     def choose(self, rng: np.random.Generator, chosen: np.ndarray | None, fixed: np.ndarray | None) -> None:
@@ -134,7 +134,7 @@ class LinearProcess(Process):
 
 @dataclass(frozen=True)
 class FamilyProcess(Process):
-    """The equations of another member of the plant's family in every episode (`LinearPlant.family`)."""
+    """The equations of another member of the plant's family in every episode (`ncs_gym.family`)."""
 
     vectorized: ClassVar[bool] = True
 
@@ -145,7 +145,7 @@ class FamilyProcess(Process):
             ValueError: If the plant is that of no family.
         """
         if plant.members is None:
-            raise ValueError("FamilyProcess is for the plant of a family: make it by LinearPlant.family")
+            raise ValueError("FamilyProcess is for the plant of a family: make it by ncs_gym.family")
         return _Members(plant, plant.members, size)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, Annotation, ConvexSet, EpisodeRecord
@@ -36,7 +35,7 @@ def ends_of(plant: LinearPlant, index: int) -> np.ndarray:
 
 def limited_states(plant: LinearPlant) -> list[int]:
     """Returns the indices of the states with limits of their own, but for past inputs."""
-    return [i for i in range(plant.n - inputs_under_way(plant)) if np.isfinite(plant.own_limits[:, i]).any()]
+    return [i for i in range(plant.n - plant.past) if np.isfinite(plant.own_limits[:, i]).any()]
 
 
 class PhasePlane:
@@ -47,7 +46,7 @@ class PhasePlane:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        own, limited = plant.n - inputs_under_way(plant), limited_states(plant)
+        own, limited = plant.n - plant.past, limited_states(plant)
         chosen, self._is_timed = sorted([*set(range(own)).difference(limited), *limited][-2:]), own == 1
         self._axes = np.eye(2, plant.n, k=-1) if self._is_timed else np.eye(plant.n)[chosen]
         time = [("time", "steps", np.array([-RECENT_STEPS, 0.0]), np.array([-np.inf, np.inf]))] * self._is_timed

@@ -9,7 +9,6 @@ from typing import ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.past_inputs import is_row_of_past_input
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_covariance
 
@@ -56,7 +55,7 @@ class Regulation(Task):
 
 @lru_cache(maxsize=64)
 def _costs(task: Regulation, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
-    box = plant.box[~is_row_of_past_input(plant)]
+    box = plant.box[~plant.is_past_row]
     Q = box.T @ box if task.state_cost is None else task.state_cost
     R = np.diag(0.01 / plant.input_half**2) if task.input_cost is None else task.input_cost
     return Q, R

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ncs_gym.plants.past_inputs import inputs_are_late
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_count, as_number
 
@@ -79,8 +78,8 @@ class SpeedTracking(Task):
     def check(self, plant):  # noqa: D102
         if self.input_index >= plant.m:
             return f"input_index must be < {plant.m}, got {self.input_index}"
-        if inputs_are_late(plant):
-            return "inputs of a plant with input_delay act later than the task's speed moves: give it as a downlink"
+        if plant.model.delays:
+            return "inputs of a plant with delays act later than the task's speed moves: give it as a downlink"
         if (center := float(plant.operating_input[self.input_index])) != 0.0:
             return f"the input is an acceleration, which the operating point must count from zero, got {center:g}"
         return ""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -35,10 +35,19 @@ class UncertainSet(ReadOnlyArrays, ABC):
     Attributes:
         size: n; None while a number stands for as many entries as there are (see `sized`).
         middle: Shape (n,): zero but for boxes with two different ends.
+        is_left_out: Whether it bounds what a model leaves out of the process, which holds only inside the limits.
+        kinds: The classes of sets, by their names in documents.
     """
 
     size: int | None = None
     middle: Any = 0.0
+    is_left_out: ClassVar[bool] = False
+    kinds: ClassVar[dict[str, type[UncertainSet]]] = {}
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Makes documents of sets know the class."""
+        super().__init_subclass__(**keywords)
+        UncertainSet.kinds[cls.__name__] = cls
 
     def sized(self, size: int) -> Any:
         """Returns the set of vectors with so many entries; raises ValueError if it has another number of them."""
@@ -58,12 +67,14 @@ class UncertainSet(ReadOnlyArrays, ABC):
         """Returns a point, shape (n,), or `count` of them, (count, n): uniform, or what a truncated Gaussian draws."""
         return self.ellipsoid().sample(rng, count)
 
+    def of_plant(self, plant: Any) -> Self:
+        """Returns the set as a part of what this plant declares; raises ValueError if it belongs to another one."""
+        return self
+
     @property
     def document(self) -> dict[str, Any]:
         """The set as JSON values, every number exact, which `as_set` reads."""
-        from ncs_gym.bounds import document_of
-
-        return document_of(self)
+        return {type(self).__name__: {each.name: document_of(getattr(self, each.name)) for each in fields(self)}}  # type: ignore[arg-type]
 
     def __add__(self, other: Any) -> Any:
         from ncs_gym.bounds import Sum
@@ -71,6 +82,28 @@ class UncertainSet(ReadOnlyArrays, ABC):
         return Sum((self, other))
 
     __radd__ = __add__
+
+
+def document_of(value: Any) -> Any:
+    """Returns a set, or what values of a plant are made of, as JSON values in which infinity is the text "inf"."""
+    if isinstance(value, UncertainSet):
+        return value.document
+    if isinstance(value, tuple | list):
+        return [*map(document_of, value)]
+    if isinstance(value, dict):
+        return {name: document_of(each) for name, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return document_of(value.tolist())
+    return str(value) if isinstance(value, float) and np.isinf(value) else value
+
+
+def read_back(value: Any) -> Any:
+    """Returns JSON values of `document_of` with their infinite numbers."""
+    if isinstance(value, list):
+        return [*map(read_back, value)]
+    if isinstance(value, dict):
+        return {name: read_back(each) for name, each in value.items()}
+    return float(value) if isinstance(value, str) and value in ("inf", "-inf") else value
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.bounds import Box
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import ReadOnlyArrays, as_flag, as_matrix, as_names, as_numbers, read_only, shown
 
 if TYPE_CHECKING:
@@ -19,11 +22,13 @@ if TYPE_CHECKING:
 
 # Plants of a function at about so many points of the ranges check that its entries are monotone.
 GRID = 256
+# Growth of the bound for the rounding of sums.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Family(ReadOnlyArrays):
-    """Plants x+ = A_i x + B_i u + s_i + d, told apart by parameters (`LinearPlant.family`).
+    """Plants x+ = A_i x + B_i u + s_i + d, told apart by parameters (`ncs_gym.family`).
 
     All are in deviations from one point; s_i is the step of a member there, which is at rest at another one.
 
@@ -76,6 +81,44 @@ class Family(ReadOnlyArrays):
             raise ValueError("a family of a function needs its interval, and the check of its members")
         object.__setattr__(self, "at_rest", as_flag(self.at_rest, "at_rest"))
         self._make_arrays_read_only()
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """What a file holds: all but the function, so that a family read from one is that of the members listed."""
+        return {name: getattr(self, name) for name in ("names", "parameters", "members", "interval", "at_rest")}
+
+    def bound_for(self, plant: LinearPlant) -> Ellipsoid:
+        """Returns what the plant of the middle leaves out of every member, in the dimension of its own states.
+
+        Raises:
+            ValueError: If members are of another size, move past inputs otherwise, or differ in what an unlimited state
+                does.
+        """
+        n, size = plant.n, (plant.n, plant.n + plant.m + 1)
+        if self.members.shape[1:] != size:
+            raise ValueError(
+                f"the members of the family must be [A, B, s] of shape {size}, got {self.members.shape[1:]}"
+            )
+        listed = self.members if self.interval is None else self.interval
+        off = np.abs(listed - np.column_stack([plant.A, plant.B, np.zeros(n)]))
+        if self.interval is not None:
+            off = off.max(axis=0, keepdims=True)
+        own = n - plant.past
+        if off[:, own:].any():
+            raise ValueError("the members of the family must have the past inputs of the plant of the middle")
+        differs, reach = off.any(axis=(0, 1)), np.append(plant.reach, 1.0)
+        if free := np.flatnonzero(differs & np.isinf(reach)).tolist():
+            raise ValueError(
+                f"the members differ in what {plant.state_names[free[0]]} does, which no row of the box with two ends "
+                "limits: give it limits, if generous ones"
+            )
+        reach = np.where(differs, reach, 0.0)
+        sizes = (1.0 + ROUNDING) * np.max([exact.product(each, reach) for each in off], axis=0)[:own]
+        sides = [Box(-row, row).ellipsoid().shape_matrix for row in np.diag(sizes) if row.any()]
+        if not sides:
+            return Ellipsoid(np.zeros((own, own)))
+        weight = plant.relative_weight[:own, :own]
+        return Ellipsoid(reduce(lambda one, other: outer_sum(one, other, weight), sides))
 
     @property
     def basis(self) -> str:

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
-from dataclasses import InitVar, dataclass, field
-from typing import ClassVar, Self
+from dataclasses import InitVar, dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.bounds import as_set
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, document_of
 from ncs_gym.uncertainty.family import Family
 from ncs_gym.validation import as_flag, require_short_text, shown
 
 
 @dataclass(frozen=True, eq=False)
-class Remainder:
+class Remainder(UncertainSet):
     """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits (both in common ones).
 
-    The remainder that a plant keeps knows the model, the box and the limits of that plant, and no plant of others takes
-    it over. Whether its bound is proved has to be said again with `dataclasses.replace`. Of a family, the plant that
-    keeps it works the bound out of the members itself.
+    It is a part of `Bounds.disturbance`. The one that a plant keeps belongs to the model and the limits of that plant,
+    and no plant of others takes it over. Whether its bound is proved has to be said again with `dataclasses.replace`.
+    Of a family, the plant works the bound out of the members itself.
 
     Attributes:
         bound: E(R) around the remainder, in units of the state.
         proved: Whether the bound follows from the equations of the process; False if it was found by sampling, so that
             every certificate *assumes* it.
         basis: Where the bound comes from, in a phrase.
-        family: The plants that the process is one of, of which each episode has another (`LinearPlant.family`); None if
-            it is something else.
+        family: The plants that the process is one of, of which each episode has another (`ncs_gym.family`); None if it
+            is something else.
+        belongs_to: `LinearPlant.region` of the plant that it belongs to; None before any has it.
         is_proved: `proved`.
 
     Raises:
@@ -39,43 +40,54 @@ class Remainder:
     proved: InitVar[bool]
     basis: str
     family: Family | None = None
+    belongs_to: str | None = None
     is_proved: bool = field(init=False)
-    _model: ClassVar[Mapping[str, np.ndarray] | None] = None
+    is_left_out: ClassVar[bool] = True
 
     def __post_init__(self, proved: bool) -> None:
+        if isinstance(self.bound, Mapping):  # of a document
+            object.__setattr__(self, "bound", as_set(self.bound))
+        if isinstance(self.family, Mapping):
+            object.__setattr__(self, "family", Family(**self.family))
         if not isinstance(self.bound, Ellipsoid):
             raise ValueError(f"the bound of a remainder must be an Ellipsoid, got {shown(self.bound)}")
         object.__setattr__(self, "is_proved", as_flag(proved, "proved"))
+        object.__setattr__(self, "size", self.bound.dim)
         if not isinstance(self.basis, str):
             raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
         require_short_text(self.basis, "the basis of a remainder")
         if not isinstance(self.family, Family | None):
             raise ValueError(f"the family of a remainder must be a Family, got {shown(self.family)}")
 
-    def of_model(self, model: Mapping[str, np.ndarray]) -> Self:
-        """Returns the same remainder, which from now on belongs to this model alone.
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        return self.bound
 
-        Args:
-            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max, dt and
-                mixed_limits, of which there may be more, a row each.
+    def of_plant(self, plant: Any) -> Remainder:
+        """Returns the same remainder, which from now on belongs to this plant alone; that of a family anew.
 
         Raises:
-            ValueError: If it belongs to another model.
+            ValueError: If it belongs to another plant.
         """
-        if self._model is not None:
-            own = dict(self._model)
-            if all((model["mixed_limits"] == row).all(axis=1).any() for row in own["mixed_limits"]):
-                own["mixed_limits"] = model["mixed_limits"]
-            others = [name for name, value in model.items() if not np.array_equal(value, own[name])]
-            if others:
-                raise ValueError(
-                    f"the remainder belongs to a plant with another {', '.join(others)}: find the model anew by "
-                    "ncs_gym.linear_model, or give Remainder(bound, proved, basis) anew if it holds for this plant, too"
-                )
-            return self
-        own = copy.copy(self)
-        object.__setattr__(own, "_model", {name: np.array(value) for name, value in model.items()})
-        return own
+        if self.family is not None:
+            return Remainder(self.family.bound_for(plant), True, self.family.basis, self.family)
+        if self.belongs_to not in (None, plant.region):
+            raise ValueError(
+                "the remainder belongs to a plant with another model or other limits: find the model anew by "
+                "ncs_gym.linear_model, or give Remainder(bound, proved, basis) anew if it holds for this plant, too"
+            )
+        return self if self.belongs_to else replace(self, proved=self.is_proved, belongs_to=plant.region)
+
+    @property
+    def numbers(self) -> list[tuple[str, Any]]:
+        """What identifies a plant with it."""
+        members = [] if self.family is None else [("members", self.family.members)]
+        return [("remainder", self.bound.shape_matrix), ("proved", self.is_proved), *members]
+
+    @property
+    def document(self) -> dict[str, Any]:  # noqa: D102
+        family = None if self.family is None else self.family.document
+        values = {"bound": self.bound, "proved": self.is_proved, "basis": self.basis, "family": family}
+        return {"Remainder": document_of(values | {"belongs_to": self.belongs_to})}
 
     @property
     def sentence(self) -> str:

@@ -26,10 +26,12 @@ class TruncatedGaussian(ReadOnlyArrays):
     Attributes:
         covariance: Shape (n, n), of the Gaussian before truncation.
         energy: The largest squared Mahalanobis norm that is kept (`truncation_energy`).
+        known: How many of the last entries are known, and zero.
     """
 
     covariance: np.ndarray
     energy: float
+    known: int = 0
 
     def __post_init__(self) -> None:
         self._make_arrays_read_only()
@@ -41,8 +43,10 @@ class TruncatedGaussian(ReadOnlyArrays):
 
     @cached_property
     def factor(self) -> np.ndarray | None:
-        """G with G G' = covariance; None when there is no noise (then no random number is drawn)."""
-        return Ellipsoid(self.covariance).factor if np.any(self.covariance) else None
+        """G with G G' = covariance, a column per unknown entry; None without noise: no random number is drawn then."""
+        unknown = len(self.covariance) - self.known
+        factor = Ellipsoid(self.covariance[:unknown, :unknown]).factor if np.any(self.covariance) else None
+        return None if factor is None else np.pad(factor, ((0, self.known), (0, 0)))
 
     def sample(self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True) -> np.ndarray:
         """Returns one draw, shape (n,), or `count` of them, shape (count, n), by rejection.
@@ -61,7 +65,7 @@ class TruncatedGaussian(ReadOnlyArrays):
 
     def _normals(self, rng: np.random.Generator, count: int, energy: float) -> np.ndarray:
         """Returns standard normal columns, shape (n, count), each with a sum of squares of at most `energy`."""
-        normals = rng.standard_normal((self.covariance.shape[0], count))
+        normals = rng.standard_normal((len(self.covariance) - self.known, count))
         rejected = np.flatnonzero(~(np.square(normals).sum(axis=0) <= energy))
         while rejected.size:
             again = rng.standard_normal((len(normals), rejected.size))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ball, Bounds, Gaussian, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, truncation_energy
 from ncs_gym.validation import as_covariance, as_matrix, as_number
 
@@ -117,6 +117,30 @@ class PaperBounds:
     epsilon_up: float
     epsilon: float
     alpha: float
+
+
+def with_noise(
+    plant: LinearPlant,
+    *,
+    gamma: float | None = None,
+    Q: np.ndarray | None = None,
+    R: np.ndarray | None = None,
+    P0: np.ndarray | None = None,
+) -> LinearPlant:
+    """Returns a plant with a ball of disturbances and Gaussian noise, as the paper has them, some of them others.
+
+    Args:
+        plant: The plant, of which nothing else is declared.
+        gamma: Squared radius of the ball, in place of its own.
+        Q: Covariance of process noise, shape (n, n), alike.
+        R: Of sensor noise, shape (p, p), alike.
+        P0: Of the first error, shape (n, n), alike.
+    """
+    own = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
+    given = zip((Q, R, P0), own, strict=True)
+    Q, R, P0 = (Gaussian(kept if new is None else new, plant.delta) for new, kept in given)
+    ball = Ball(np.sqrt(plant.gamma if gamma is None else gamma))
+    return replace(plant, bounds=Bounds(disturbance=ball + Q, sensor=R, first_error=P0))
 
 
 def unknown_bounds(plant: LinearPlant) -> list[str]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ncs_gym import LinearPlant
-from shields.paper.bounds import SMALLEST_GAP, PaperBounds, PaperModel
+from shields.paper.bounds import SMALLEST_GAP, PaperBounds, PaperModel, with_noise
 from shields.paper.optimization_problem import OptimizationProblem
 
 # The domain {0 < kappa < 1, 1 <= rho < 1 / kappa} is scanned at these kappa and these fractions of the way from 1 to
@@ -145,15 +145,15 @@ def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], 
 
 def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:
     """Returns the largest gamma for which OP is feasible, all else being as it is; 0.0 if there is none."""
-    return scan.largest(lambda gamma: replace(plant, gamma=gamma), max(plant.gamma, 1e-12))
+    return scan.largest(lambda gamma: with_noise(plant, gamma=gamma), max(plant.gamma, 1e-12))
 
 
 def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
     """Returns the largest common factor on gamma, Q and P0 for which OP is feasible; 0.0 if there is none."""
-    names = ("gamma", "process_noise_cov", "initial_cov")
-    return scan.largest(lambda factor: replace(plant, **{name: factor * getattr(plant, name) for name in names}), 1.0)
+    gamma, Q, P0 = plant.gamma, plant.process_noise_cov, plant.initial_cov
+    return scan.largest(lambda by: with_noise(plant, gamma=by * gamma, Q=by * Q, P0=by * P0), 1.0)
 
 
 def largest_noise_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
     """Returns the largest factor on Q for which OP is feasible, gamma being as it is; 0.0 if there is none."""
-    return scan.largest(lambda factor: replace(plant, process_noise_cov=factor * plant.process_noise_cov), 1.0)
+    return scan.largest(lambda factor: with_noise(plant, Q=factor * plant.process_noise_cov), 1.0)

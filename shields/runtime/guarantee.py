@@ -10,7 +10,6 @@ import numpy as np
 from ncs_gym.network.contract import largest_age
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
-from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.validation import shown, warn_caller
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
@@ -124,7 +123,7 @@ class GuaranteeMonitor:
         self._largest_age = largest_age(certificate.contract) - self._input_delay
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
-        self._under_way = inputs_under_way(plant) if self._is_local else 0
+        self._under_way = plant.past if self._is_local else 0
         self._limits = np.tile([plant.input_middle, plant.input_half], self._under_way // plant.m)
 
     def start(self, known_inside: Any, unmoved: Any, report: LoopObservation, *, is_first: bool = True) -> MonitorState:

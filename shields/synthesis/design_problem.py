@@ -206,7 +206,7 @@ def design_problem(
             "(E1) cannot hold: without packets the estimation error grows for ever, because the spectral radius of A "
             f"is {plant.spectral_radius:.6g}, not below 1: give contract=ChannelContract(max_age=...), or --max-age, "
             "the age in steps that the newest sample never exceeds (if A is that of a model in continuous time, make "
-            "the plant by LinearPlant.from_statespace)",
+            "the plant by Model.sampled)",
             "E1",
             plant.spectral_radius - 1.0,
         ) from error

@@ -14,7 +14,6 @@ from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.estimation.error_sets import ErrorSetError
 from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
 from ncs_gym.plants.hard_bounds import FREE_REACH
-from ncs_gym.plants.past_inputs import is_row_of_past_input
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
@@ -201,7 +200,7 @@ def _limits_exceeded(plant: LinearPlant) -> str:
 
 def _limits_out_of_reach(plant: LinearPlant) -> str:
     """Returns which limits nothing comes near, and which mislead the search, as the rest of a sentence."""
-    alone = (np.count_nonzero(plant.box, axis=1) == 1) & ~is_row_of_past_input(plant)
+    alone = (np.count_nonzero(plant.box, axis=1) == 1) & ~plant.is_past_row
     out_of_reach = np.abs(plant.box) @ (FREE_REACH * plant.reach_from_rest) < 1.0
     names = [row_limit(plant, j) for j in np.flatnonzero(alone & out_of_reach).tolist()]
     if not names:

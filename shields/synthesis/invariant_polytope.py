@@ -15,7 +15,6 @@ import numpy as np
 from scipy.stats import qmc
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.plants.past_inputs import inputs_under_way
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
@@ -202,10 +201,10 @@ def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object]
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
     """Returns the share of the safe box's volume that a polytope fills, to about three digits.
 
-    None where a state has no limits of its own; where the last states are past inputs (`LinearPlant.from_statespace`)
+    None where a state has no limits of its own; where the last states are past inputs
     of the others, with past inputs at the operating one.
     """
-    points, past = points_of_box(plant, _POINTS_LOG2), inputs_under_way(plant)
+    points, past = points_of_box(plant, _POINTS_LOG2), plant.past
     if points is not None:
         points[:, plant.n - past :] = 0.0
         return float((polytope.gauge(points) <= 1.0).mean())
@@ -221,9 +220,9 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
 def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
     """Returns what part of its range the last input has in a polytope, the least one of several inputs.
 
-    None where the last states are no past inputs (`LinearPlant.with_rate_limits`).
+    None where the last states are no past inputs.
     """
-    if not inputs_under_way(plant):
+    if not plant.past:
         return None
     m, axes = plant.m, np.eye(plant.n)[-plant.m :]
     ends = polytope.support(np.concatenate([axes, -axes]))
@@ -237,7 +236,7 @@ def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
     None where the box is no product of intervals. Past inputs are within their limits, not in the wider rows that the
     box has for them.
     """
-    rows, past = plant.box, inputs_under_way(plant)
+    rows, past = plant.box, plant.past
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n and rows.any(axis=0).all()
     if not is_product or not np.isfinite(plant.box_ends).all():
         return None

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.plants.past_inputs import inputs_under_way
 
 # A box with more rows than states is a polytope, whose corners are too many to count in more dimensions or with more
 # rows than this.
@@ -19,7 +18,7 @@ _MOST_DIMENSIONS, _MOST_ROWS = 5, 30
 def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
     """Returns the record, for a certificate, of the share of the safe box's volume that E(L) fills.
 
-    Where the last states are inputs under way (`LinearPlant.from_statespace(input_delay=...)`) the box is that of the
+    Where the last states are inputs under way (`Model.with_delays`) the box is that of the
     others, and what counts is which of its states are in E(L) with no input under way.
 
     Args:
@@ -37,7 +36,7 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
         return {"share_of_box_unknown": "the volume of limits with two ends that are no box is not computed"}
     if exact.rank(plant.box) < plant.n:
         return {"share_of_box_unknown": "the box is unbounded"}
-    stored = inputs_under_way(plant)
+    stored = plant.past
     if not stored:
         share = _share(plant.box, L)
         return {"share_of_box_unknown": _reason(plant.box)} if share is None else {"share_of_box": share}
