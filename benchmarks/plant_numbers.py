@@ -100,7 +100,7 @@ def limited(seed: int) -> LinearPlant:
     E, widths = rng.standard_normal((n, 2)), rng.uniform(1e-3, 5e-3, 2)
     state = x - rng.uniform(0.5, 2.0, n), np.where(rng.random(n) < 0.2, np.inf, x + 1.0)
     applied = u - rng.uniform(0.5, 2.0, m), u + rng.uniform(0.5, 2.0, m)
-    rows = [(of_x, None, of_x @ x - 1.0, of_x @ x + rng.uniform(1.0, 2.0))][: seed % 2]
+    rows: list[Any] = [(of_x, None, of_x @ x - 1.0, of_x @ x + rng.uniform(1.0, 2.0))][: seed % 2]
     rows += [(of_x, of_u, of_x @ x + of_u @ u - 1.5, of_x @ x + of_u @ u + 1.0)][: seed // 2 % 2]
     disturbances = Through(E, Box(-widths, 1.5 * widths)), Through(E, widths), Ball(widths[0]), np.full(n, widths[1])
     model = Model(A, B, np.eye(n), 0.1, (x, u), x - A @ x - B @ u if seed % 5 == 0 else None)

@@ -46,7 +46,9 @@ class Box(UncertainSet):
         self._make_arrays_read_only()
         if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
             allowed = f"0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
-            raise ValueError(f"half-widths of a box must be {allowed}, got {shown(self.half.tolist())}")
+            raise ValueError(
+                f"half-widths of a box must be {allowed}, with low <= high, got {shown(self.half.tolist())}"
+            )
 
     @cached_property
     def half(self) -> np.ndarray:

@@ -104,7 +104,7 @@ def _from_center(limits: Any, center: np.ndarray, name: str, *, is_given: bool =
     nearly = finite & (np.abs(low + high) <= NEARLY_SYMMETRIC * nearest)
     low, high = np.where(nearly, -nearest, low), np.where(nearly, nearest, high)
     size = np.where(np.isfinite([low, high]), np.abs([low, high]), 1.0)
-    if not ((size >= SMALLEST_NUMBER) & (size < LARGEST_NUMBER)).all():
+    if not ((size > SMALLEST_NUMBER) & (size < LARGEST_NUMBER)).all():
         raise ValueError(f"{name} must be finite numbers of usual size, or infinite, got {shown(limits)}")
     return low, high
 
@@ -289,7 +289,7 @@ class Limits(ReadOnlyArrays):
         widths, size = as_setting(getattr(self, name)), len(getattr(model, name))
         if widths is None or widths.shape not in ((), (size,)):
             return None
-        fits = (widths >= SMALLEST_NUMBER) & (widths < LARGEST_NUMBER) | (widths == np.inf)
+        fits = (widths > SMALLEST_NUMBER) & (widths < LARGEST_NUMBER) | (widths == np.inf)
         if not fits.all() or not np.isfinite(widths).any():
             raise ValueError(
                 f"{name} limits must be positive half-widths of shape ({size},), or a pair (low, high) of vectors, got "

@@ -18,6 +18,7 @@ import ncs_gym
 import shields
 from ncs_gym import Ball, Bounds, Box, Ellipsoid, Gaussian, Limits, LinearPlant, Model, Sum, Through
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
+from ncs_gym.validation import as_setting
 from shields import Certificate
 
 _SOURCES = (
@@ -64,9 +65,7 @@ def altered(plant: LinearPlant, **described: Any) -> LinearPlant:
 
 def _made(model: Model, described: dict[str, Any]) -> LinearPlant:
     limits = _limits(None, model, described)
-    plant = LinearPlant(
-        model, limits, _bounds(Bounds(*[Sum(())] * 3), described, model), _labels(None, described)
-    )
+    plant = LinearPlant(model, limits, _bounds(Bounds(*[Sum(())] * 3), described, model), _labels(None, described))
     if described:
         raise TypeError(f"no part of a plant: {sorted(described)}")
     return plant
@@ -80,8 +79,8 @@ def _of_model(described: dict[str, Any]) -> dict[str, Any]:
     }
     if (delays := own.get("delays", 0)) is None:
         own["delays"] = 0 if delays is None else delays
-    point = [described.pop(f"operating_{name}", None) for name in ("state", "input")]
-    return own | ({} if point == [None, None] else {"at": tuple(point)})
+    point = tuple(described.pop(f"operating_{name}", None) for name in ("state", "input"))
+    return own | ({} if all(each is None for each in point) else {"at": point})
 
 
 def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) -> Limits:
@@ -89,6 +88,8 @@ def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) 
     names = ("box", "box_ends", "state_limits", "output_limits", "mixed_limits", "mixed_rows", "mixed_ends")
     names += ("u_max", "input_limits", "input_ends", "du_max", "between_samples")
     given = {name: described.pop(name) for name in names if name in described}
+    if plant is not None and plant.limits.rate is not None and "mixed_ends" in given:
+        given |= _without_rates(plant, given)
     own = Limits(input=1.0) if plant is None else plant.limits
     if any(model.is_given) and plant is not None:
         own = _around(own, model)
@@ -100,7 +101,7 @@ def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) 
         state, of_states = _pair(given["state_limits"], n), []
         state = None if np.isinf(state).all() else state
     if given.get("box") is not None:
-        box, ends = np.asarray(given["box"], dtype=float), given.get("box_ends")
+        box, ends = as_setting(given["box"]), given.get("box_ends")
         ends = (
             np.array([[-1.0], [1.0]]) * np.ones(len(box) if box.ndim == 2 else n) if ends is None else np.asarray(ends)
         )
@@ -135,6 +136,16 @@ def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) 
         inputs = tuple(model.input + np.asarray(each) for each in given["input_ends"])
     rate, points = given.get("du_max", own.rate), given.get("between_samples", own.between_samples)
     return Limits(state, inputs, (*of_states, *mixed), rate, points)
+
+
+def _without_rates(plant: LinearPlant, given: dict[str, Any]) -> dict[str, Any]:
+    """What a description says of coupled rows and of rates, which are the last of these; nothing is a loose rate."""
+    if given["mixed_ends"] is None:
+        return {"du_max": 1.99 * plant.input_half}
+    own, n = len(plant.mixed_rows) - plant.m, plant.n - plant.past
+    rows = np.hstack([plant.mixed_rows[:own, :n], plant.mixed_rows[:own, plant.n :]])
+    rate = plant.limits.rate * given["mixed_ends"][1][own:]
+    return {"du_max": rate, "mixed_rows": rows, "mixed_ends": np.asarray(given["mixed_ends"])[:, :own]}
 
 
 def _pair(limits: Any, size: int) -> tuple[np.ndarray, ...]:
@@ -210,10 +221,13 @@ def linear_model(process: Any, box: Any = None, u_max: Any = None, dt: Any = Non
     """The linear model of a process, with what it leaves out."""
     described |= {} if box is None else {"box": box}
     described |= {} if u_max is None else {"u_max": u_max}
-    A, B = described.pop("A", None), described.pop("B", None)
+    A, B, delays = described.pop("A", None), described.pop("B", None), described.pop("input_delay", 0)
     sizes = [("operating_state", "box", "state_limits"), ("operating_input", "u_max", "input_limits")]
     n, m = (
-        max((np.shape(part)[-1] for name in names if name in described for part in _parts(name, described[name])), default=1)
+        max(
+            (np.shape(part)[-1] for name in names if name in described for part in _parts(name, described[name])),
+            default=1,
+        )
         for names in sizes
     )
     model = Model(
@@ -223,7 +237,8 @@ def linear_model(process: Any, box: Any = None, u_max: Any = None, dt: Any = Non
     labels = _labels(None, described)
     if A is not None or B is not None:
         described["matrices"] = (A, B)
-    return ncs_gym.linear_model(process, limits, bounds, dt, at=model.at, labels=labels, **described)
+    plant = ncs_gym.linear_model(process, limits, bounds, dt, at=model.at, labels=labels, **described)
+    return replace(plant, model=plant.model.with_delays(delays)) if delays else plant
 
 
 def _parts(name: str, value: Any) -> list[np.ndarray]:

@@ -45,7 +45,6 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.plants.old_arguments import _OldLimits
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
@@ -109,7 +108,7 @@ VALUES = [
     Through(np.eye(2), np.ones(2)),
     Sum((Box(np.zeros(2), np.ones(2)), Ball(1.0))),
 ]
-PASSING = {Annotation, _OldLimits}  # made anew for every frame, or for every plant of old arguments
+PASSING = {Annotation}  # made anew for every frame
 
 
 def arrays_in(value):

@@ -171,8 +171,8 @@ def test_nothing_is_compiled_at_first_use():
 import sys, gymnasium, numpy, ncs_gym, shields
 shields.paper.synthesize
 import experiments.commands.attack
-quiet = dict(sensor_bound=0.0, initial_bound=0.0)
-plant = ncs_gym.LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-6, **quiet)
+model, limits = ncs_gym.Model([[0.9]], [[1.0]], None, dt=0.1), ncs_gym.Limits(state=[1.0], input=1.0)
+plant = ncs_gym.LinearPlant(model, limits, ncs_gym.Bounds(disturbance=1e-3, sensor=0.0, first_error=0.0))
 certificate = shields.synthesize(plant)
 env = shields.SafetyShield(gymnasium.make("ncs_gym/LinearNCS-v0", plant=plant), certificate)
 many = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, plant=plant), certificate)

@@ -9,13 +9,12 @@ from ncs_gym import LinearPlant
 TESTS = Path(__file__).resolve().parent
 OWN_REFUSALS = {
     *("ncs_gym/test_refusals.py", "hardening/test_invalid_settings.py", "shields/runtime/test_refusals.py"),
-    "ncs_gym/test_values.py",  # that both constructors make the same plant
+    "ncs_gym/test_values.py",  # what follows from the values of a plant
 }
 CLASSES = {"LinearPlant", "NCSEnv", "NCSVectorEnv", "SafetyShield", "VectorSafetyShield", "SafetyFilter", "SafeLoop"}
-METHODS = {"from_statespace", "family", "resampled", "with_rate_limits"}
-FUNCTIONS = {"synthesize", "linear_model"}
-LIBRARY = {"truck_trailer", "cart_pole", "batch_reactor", "stirred_tank", "lane_keeping", "convoy"}
-OF_PLANTS = {*inspect.signature(LinearPlant).parameters} - {"dt"}
+METHODS = {"resampled"}
+FUNCTIONS = {"synthesize", "linear_model", "family"}
+OF_PLANTS = {*inspect.signature(LinearPlant).parameters}
 
 
 def past_the_door(source):
@@ -35,8 +34,7 @@ def makes(node):
         name in CLASSES
         or (owner and name in METHODS)
         or (owner in (["ncs_gym"], ["shields"], ["shields", "paper"]) and name in FUNCTIONS)
-        or (name in LIBRARY and given & (OF_PLANTS | {None}))  # limits and bounds, not a mass
-        or (name == "replace" and given & (OF_PLANTS - {"A", "B", "between_samples"}))  # of other values, too
+        or (name == "replace" and given & OF_PLANTS)
         or (owner == ["gym"] and "plant" in given and "LinearNCS" in ast.unparse(node.args[0]))
     )
 
@@ -49,6 +47,6 @@ def test_nothing_but_refusals_goes_past_the_door():
 
 def test_every_way_past_the_door_is_found():
     ways = """LinearPlant(**given); ncs_gym.NCSEnv(plant); partial(SafetyShield, env); plant.resampled(0.1)
-        from shields.paper import synthesize as own; shields.synthesize(plant); truck_trailer(gamma=0.0)
-        replace(plant, u_max=1.0); gym.make("ncs_gym/LinearNCS-v0", plant=plant)"""
+        from shields.paper import synthesize as own; shields.synthesize(plant); ncs_gym.family(plants)
+        replace(plant, limits=limits); gym.make("ncs_gym/LinearNCS-v0", plant=plant)"""
     assert all(past_the_door(way.strip()) for line in ways.splitlines() for way in line.split(";"))

@@ -78,8 +78,8 @@ def family(
     if rest_matters and not at_rest:
         raise ValueError(
             "the members differ in what acts on an operating point that is not zero (the middle of a disturbance with "
-            "two ends moves it, too): say at_rest=True if each is at rest at its own one, as Model(offset=...) checks of "
-            "a model in absolute coordinates"
+            "two ends moves it, too): say at_rest=True if each is at rest at its own one, as Model(offset=...) checks "
+            "of a model in absolute coordinates"
         )
     first, n = _around_center(plants[0], _center_of(plants)), len(plants[0].model.A)
     own = np.array([np.hstack([each.model.A, each.model.B]) for each in plants])

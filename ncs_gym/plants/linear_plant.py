@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -75,6 +75,8 @@ class LinearPlant(LimitValues, HardBounds):
             not cancel: |offset|, and |E| |middle| of a disturbance with two ends.
         remainder: What the model leaves out of the process that really moves; None if nothing.
         region: Digest of the model and the limits, which a remainder belongs to.
+        delta: Probability that Gaussian noise is truncated at.
+        of_disturbance, of_sensor, of_first_error: What is declared of each.
         state_names, state_units, input_names, input_units: The labels, with defaults.
 
     Raises:
@@ -85,6 +87,32 @@ class LinearPlant(LimitValues, HardBounds):
     limits: Limits
     bounds: Bounds
     labels: Mapping[str, Any] | None = None
+    A: np.ndarray = field(init=False)
+    B: np.ndarray = field(init=False)
+    H: np.ndarray = field(init=False)
+    box: np.ndarray = field(init=False)
+    box_ends: np.ndarray = field(init=False)
+    is_past_row: np.ndarray = field(init=False)
+    input_ends: np.ndarray = field(init=False)
+    mixed_rows: np.ndarray = field(init=False)
+    mixed_ends: np.ndarray = field(init=False)
+    operating_state: np.ndarray = field(init=False)
+    operating_input: np.ndarray = field(init=False)
+    step_offset: np.ndarray = field(init=False)
+    dt: float = field(init=False)
+    delta: float = field(init=False)
+    past: int = field(init=False)
+    continuous_model: np.ndarray | None = field(init=False)
+    between_samples: int | None = field(init=False)
+    remainder: Any = field(init=False)
+    region: str = field(init=False)
+    of_disturbance: Source = field(init=False)
+    of_sensor: Source = field(init=False)
+    of_first_error: Source = field(init=False)
+    state_names: tuple[str, ...] = field(init=False)
+    state_units: tuple[str, ...] = field(init=False)
+    input_names: tuple[str, ...] = field(init=False)
+    input_units: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         for name, kind in (("model", Model), ("limits", Limits), ("bounds", Bounds)):
@@ -167,14 +195,12 @@ class LinearPlant(LimitValues, HardBounds):
             names, units = [*given], [*given.values()]
             names = as_names(names, default, f"names of {name}s")
             self._set(**{f"{name}_names": names, f"{name}_units": as_units(units, size, f"units of {name}s")})
-        steps = self.past // self.m
+        ages = [counted(age, "step") for age in range(self.past // self.m, 0, -1)]
+        past = tuple(f"{name} of {age} ago" for age in ages for name in self.input_names)
         self._set(
             labels={name: dict(labels[name]) for name in labels} or None,
-            state_names=self.state_names
-            + tuple(
-                f"{name} of {counted(age, 'step')} ago" for age in range(steps, 0, -1) for name in self.input_names
-            ),
-            state_units=self.state_units + self.input_units * steps,
+            state_names=self.state_names + past,
+            state_units=self.state_units + self.input_units * len(ages),
         )
 
     def _check_between_samples(self) -> None:
@@ -331,8 +357,8 @@ class LinearPlant(LimitValues, HardBounds):
     def _require_symmetric(self, instead: str) -> None:
         if not self.is_symmetric:
             raise ValueError(
-                "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and what was asked for takes "
-                f"only these (a plant has {instead}, mixed_rows and mixed_ends)"
+                "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
+                f"what was asked for (a plant has {instead}, mixed_rows and mixed_ends)"
             )
 
     @cached_property

@@ -106,7 +106,8 @@ def _resting(
     terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(middle) + np.abs(x)
     if not (np.abs(missing_at(x, u)) <= EQUILIBRIUM_PRECISION * terms).all():
         raise ValueError(
-            f"no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} per step, whatever the input: give symmetric ends around zero"
+            f"no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} per "
+            "step, whatever the input: give symmetric ends around zero"
         )
     x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
     return x, u, missing_at(x, u)

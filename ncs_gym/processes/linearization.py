@@ -187,9 +187,10 @@ class NoEquilibriumWarning(UserWarning):
 
 def _size_of(limits: Any, point: Any) -> int:
     """Returns how many entries limits and a point have, some of which may be numbers."""
-    given = [limits] if as_setting(limits) is not None else limits if isinstance(limits, tuple) else []
-    numbers = [as_setting(each) for each in (point, *([] if point is not None else given))]
-    return max((each.size for each in numbers if each is not None), default=1)
+    numbers = as_setting(limits if point is None else point)
+    if numbers is None:  # a number and a vector
+        return max((np.size(end) for end in limits), default=1) if isinstance(limits, tuple) else 1
+    return numbers.shape[-1] if numbers.ndim else 1
 
 
 def _steps_of(

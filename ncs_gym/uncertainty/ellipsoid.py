@@ -77,9 +77,8 @@ class UncertainSet(ReadOnlyArrays, ABC):
         return {type(self).__name__: {each.name: document_of(getattr(self, each.name)) for each in fields(self)}}  # type: ignore[arg-type]
 
     def __add__(self, other: Any) -> Any:
-        from ncs_gym.bounds import Sum
-
-        return Sum((self, other))
+        make: Any = UncertainSet.kinds["Sum"]
+        return make((self, other))
 
     __radd__ = __add__
 

@@ -72,8 +72,9 @@ class Remainder(UncertainSet):
             return Remainder(self.family.bound_for(plant), True, self.family.basis, self.family)
         if self.belongs_to not in (None, plant.region):
             raise ValueError(
-                "the remainder belongs to a plant with another model or other limits: find the model anew by "
-                "ncs_gym.linear_model, or give Remainder(bound, proved, basis) anew if it holds for this plant, too"
+                "the remainder belongs to a plant with another model, other limits or another operating point (which "
+                "the middle of a disturbance moves): find the model anew by ncs_gym.linear_model, or give "
+                "Remainder(bound, proved, basis) anew if it holds for this plant, too"
             )
         return self if self.belongs_to else replace(self, proved=self.is_proved, belongs_to=plant.region)
 

@@ -138,9 +138,9 @@ def with_noise(
     """
     own = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
     given = zip((Q, R, P0), own, strict=True)
-    Q, R, P0 = (Gaussian(kept if new is None else new, plant.delta) for new, kept in given)
+    process, sensor, first = (Gaussian(kept if new is None else new, plant.delta) for new, kept in given)
     ball = Ball(np.sqrt(plant.gamma if gamma is None else gamma))
-    return replace(plant, bounds=Bounds(disturbance=ball + Q, sensor=R, first_error=P0))
+    return replace(plant, bounds=Bounds(disturbance=ball + process, sensor=sensor, first_error=first))
 
 
 def unknown_bounds(plant: LinearPlant) -> list[str]:

@@ -221,9 +221,9 @@ def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
 @pytest.mark.parametrize("text", ["x" * 1001, "\x1b[2J", "two\nlines"], ids=["long", "escape", "lines"])
 def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
     document = json.loads(json.dumps(truck_trailer().document))
-    for name in ("state_names", "state_units"):
-        changed = document | {"plant": document["plant"] | {name: ["x", text]}}
-        with pytest.raises(ValueError, match=f"{name} must be printable text of at most 1000 letters"):
+    for labels, name in (({"x": "m", text: "m"}, "names"), ({"x": "m", "y": text}, "units")):
+        changed = document | {"labels": {"states": labels}}
+        with pytest.raises(ValueError, match=f"{name} of states must be printable text of at most 1000 letters"):
             LinearPlant.read(changed)
     with pytest.raises(ValueError, match="the basis of a remainder must be printable text"):
         Remainder(Ellipsoid(np.eye(2)), proved=False, basis=text)

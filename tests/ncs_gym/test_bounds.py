@@ -8,7 +8,6 @@ import pytest
 
 from ncs_gym import Ellipsoid
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through, as_set
-from ncs_gym.uncertainty.declared_bound import as_bound
 from tests.plants import small
 
 E = np.array([[1.0, 0.5], [0.0, 2.0], [0.3, 0.0]])
@@ -90,7 +89,6 @@ def test_arrays_of_sets_cannot_be_written_to():
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
         (lambda: Bounds(0.1, 0.1, Box([0.0, -1.0], [0.2, 1.0])), r"first_error=...\) must have its middle at zero"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
-        (lambda: as_bound(Box(0.0, 0.2), 1, "the remainder"), "the remainder must have its middle at zero"),
         (lambda: small(np.eye(2), sensor_bound=Box(0.0, 0.2)), "must have its middle at zero"),
         (
             lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sized(3, 1),

@@ -18,6 +18,7 @@ from gymnasium.spaces import Box, Discrete
 from ncs_gym import (
     Actuator,
     AdversarialDisturbance,
+    Bounds,
     BoxDisturbance,
     Channel,
     ChannelContract,
@@ -27,14 +28,17 @@ from ncs_gym import (
     Estimator,
     FunctionProcess,
     GymProcess,
+    Limits,
     LinearPlant,
     LinearProcess,
+    Model,
     NCSEnv,
     NCSVectorEnv,
     RandomChannel,
     Remainder,
     RequestActions,
     SetpointTracking,
+    Through,
     TraceChannel,
     UnstablePlantError,
     VectorRandomChannel,
@@ -48,24 +52,26 @@ from ncs_gym import (
     register_plant,
     truck_trailer,
 )
+from ncs_gym.bounds import as_set
 from ncs_gym.envs.env import RenderModeError, ncs_env
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
-from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from shields import SafetyShield
 from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS
+from tests.product import altered, linear_plant
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"
 PLANT, HEAVY, UNSTABLE = truck_trailer(), truck_trailer(mass=4000.0), cart_pole()
-GRID = replace(HEAVY, between_samples=8)
+GRID = replace(HEAVY, limits=replace(HEAVY.limits, between_samples=8))
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
 GOOD = {"A": np.eye(2) * 0.5, "B": np.ones((2, 1)), "box": np.eye(2), "u_max": 1.0, "dt": 0.1} | QUIET
-ROOM = {"A": [[0.9]], "B": [[0.2]], "operating_state": [20.0], "operating_input": [10.0], "dt": 60.0} | QUIET
-ROOM |= {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
+ROOM_MODEL = Model([[0.9]], [[0.2]], None, 60.0, ([20.0], [10.0]))
+ROOM_LIMITS = Limits(state=(18.0, 25.0), input=(0.0, 12.0))
+SETS = "disturbance", "sensor", "first_error"
+BOUNDS, PLAIN = Bounds(0.01, 0.01, 0.01), Model(0.5 * np.eye(2), np.ones((2, 1)), None, 0.1)
 A, B, C, D = np.array([[0.0, 1.0], [-2.0, -3.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
-MODEL = (A, B, C, D)
-LIMITS = {"box": [1.0, 2.0], "u_max": 3.0} | QUIET
+MODEL, SAMPLED = (A, B, C, D), Model.sampled(A, B, C, 0.1)
 ON_REQUEST = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
 ASKED = {"channel": ON_REQUEST, "contract": ChannelContract(9, 1e-4), "terminate_on_violation": False}
 STEP, TORQUE = 0.05, 2.0
@@ -112,9 +118,9 @@ def kinked_late():
     return step
 
 
-def modeled(process=swing, **changes):
-    settings = {"box": [0.25, 1.5], "samples": 2_000, "u_max": TORQUE, "dt": STEP} | dict.fromkeys(QUIET, 0.0)
-    return linear_model(process, **(settings | changes))
+def modeled(process=swing, state=(0.25, 1.5), **settings):
+    limits, nothing = Limits(list(state), TORQUE), Bounds(0.0, 0.0, 0.0)
+    return linear_model(process, limits, nothing, STEP, **{"samples": 2_000} | settings)
 
 
 class Inner(gym.Env):
@@ -142,6 +148,10 @@ def write(env, state):
     env.state = state
 
 
+def nonlinear_pole():
+    return gym.make("ncs_gym/CartPoleNonlinear-v0").unwrapped.plant
+
+
 def inner(read=lambda env: env.state, kind=Inner, **settings):
     return GymProcess(kind, read_state=read, write_state=write, **settings)
 
@@ -152,7 +162,7 @@ def reset(env, **settings):
 
 
 def moved(process):
-    return reset(NCSEnv(LinearPlant(**GOOD), process=process)).step(np.zeros(1))
+    return reset(NCSEnv(linear_plant(**GOOD), process=process)).step(np.zeros(1))
 
 
 def plant_in(text):
@@ -173,7 +183,7 @@ def plant_with(change):
     def load(folder):
         PLANT.save(folder / "plant.json")
         document = json.loads((folder / "plant.json").read_text())
-        change(document["plant"])
+        change(document)
         plant_in(json.dumps(document))(folder)
 
     return load
@@ -185,21 +195,15 @@ def folder_for_a_file(folder):
 
 
 def weakened_remainder():
-    return replace(modeled(), remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"))
+    return altered(modeled(), remainder=Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example"))
 
 
-BOXES = [  # Lower and upper limits where half-widths or rows are expected.
-    *(([-1, -2], [1, 2]), [[-1, -2], [1, 2]], [[-1, 1], [-2, 2]], [(0.5, 1.0), (-2.0, 2.0)], [[1, 2], [3, 4]]),
-    *(([0, 0], [10, 5]), [(0, 1), (-2, 2)], [[-1, -np.inf], [1, np.inf]], [[-1, 1], [0, 2]]),
-    *(np.array([[-1, -2], [1, 2]]), np.array([[-1, 1], [-2, 2]]), ((0, 3), (0, np.inf)), [[0.05, -0.05], [1, -1]]),
-]
-OF_THREE = [[[-1, 1]] * 3, ([-1, -2, -3], [1, 2, 3]), ([1, 2, 3], [-1, -2, -3]), np.array([[-1, -2, -3], [1, 2, 3]])]
 BOTH = {"channel": Channel(on_request=True), "downlink": Channel(on_request=True)}
 ENVIRONMENTS = [
     *wrong(
         partial(gym.make, TRUCK),
         {
-            "plant": ["nowhere.json", LinearPlant(**GOOD | {"A": 1.1 * np.eye(2)})],
+            "plant": ["nowhere.json", linear_plant(**GOOD | {"A": 1.1 * np.eye(2)})],
             "task": [{}, {"fastest": 1.0, "reach": 1.0}],
             "initial_set": [np.eye(2), {"radius": 1.0}],
             "disturbance": ["storm", {"M": 1.0}],
@@ -242,8 +246,8 @@ ENVIRONMENTS = [
     ),
     partial(NCSEnv, UNSTABLE, Channel(), contract=4),
     partial(NCSEnv, UNSTABLE, Channel(quantization_step=0.1), contract=ChannelContract(4, 0.01)),
-    partial(NCSEnv, LinearPlant(**GOOD), noise="gaussian"),
-    partial(NCSVectorEnv, 2, plant=LinearPlant(**GOOD), noise="gaussian"),
+    partial(NCSEnv, linear_plant(**GOOD), noise="gaussian"),
+    partial(NCSVectorEnv, 2, plant=linear_plant(**GOOD), noise="gaussian"),
     lambda: ncs_env(gym.make("CartPole-v1")),
     lambda: gym.make_vec(TRUCK, num_envs=3).reset(seed=[1, 2]),
     *wrong(partial(register_plant, "Plants/T-v0", PLANT), {"channel": [{"loss": 2.0}], "max_episode_steps": [0]}),
@@ -278,128 +282,105 @@ CHANNELS = [
     lambda: Actuator(input_delay=2, inputs=1).start(episode=0.5),
     *called(Actuator(input_delay=2, inputs=1).apply, 600.5, -1, None, True),
 ]
+EXAMPLE = Remainder(Ellipsoid(np.eye(3)), True, "an example")
+
+
+def plant_of(model=ROOM_MODEL, limits=ROOM_LIMITS, bounds=BOUNDS, labels=None):
+    return LinearPlant(model, limits, bounds, labels)
+
+
+def with_limits(model, bounds=BOUNDS):
+    """Makes plants of limits given by their names."""
+    return lambda **limits: LinearPlant(model, Limits(**limits), bounds)
+
+
 PLANTS = [
     *wrong(
-        LinearPlant,
+        Model,
         {
             "A": [np.ones((2, 3)), [1.0, 0.0]],
             "B": [np.ones((3, 1)), [0.5], [0, 0.5]],
-            "H": [[1.0, 0.0], [[1.0, 0.0], [0.0, 0.0]]],
-            "box": [[[1e150, 0.0], [0.0, 1.0]], [[0.0, 0.0], [1.0, 0.0]], [1.0, 2.0, 3.0], [np.inf] * 2, *BOXES],
-            "u_max": [(-1.0, 2.0)],
-            "disturbance_bound": [1e-6 * np.eye(2)],
-            "sensor_bound": [([[1e-200], [1e-200]], 1.0)],
-            **{name: [[0.1, 0.2, 0.3]] for name in QUIET},
-            "remainder": [0.1, Remainder(Ellipsoid(np.eye(3)), True, "an example")],
-            "input_ends": [[[-0.5], [0.5]]],
-        },
-        **GOOD,
-    ),
-    partial(LinearPlant, **GOOD | {"A": [[0.5]], "B": [[1.0]], "box": [(0.5, 1.0)]}),
-    *wrong(LinearPlant, {"box": OF_THREE}, **GOOD | {"A": np.eye(3) / 2, "B": np.ones((3, 1))}),
-    *wrong(
-        truck_trailer,
-        {"mass": [0.0], "stiffness": [-1.0], "damping": [-1.0], "H": [3]}
-        | {"between_samples": [0, -3, 65, 2.5, True, "8", [8]]},
-    ),
-    partial(truck_trailer, box=[2.0, np.inf], between_samples=8),
-    partial(cart_pole, delta=None),
-    partial(LinearPlant, **ROOM, box_ends=[[-1.0], [1.0]]),
-    *wrong(
-        partial(linear_model, np.add, [0.7], 1.0, 1.0),
-        {name: [[[-1.0], [3.0]]] for name in ("input_ends", "state_limits", "input_limits")},
-    ),
-    partial(linear_model, np.add, u_max=1.0, dt=1.0, state_limits=(-1.0, np.inf)),
-    partial(linear_model, np.add, [0.7], 1.0),
-    partial(LinearPlant, **GOOD, C=np.eye(2)),
-    partial(truck_trailer, C=np.eye(2)),
-    partial(cart_pole, C=np.eye(4)),
-    partial(replace, PLANT, C=np.eye(2)),
-    partial(LinearPlant.from_statespace, MODEL, dt=0.1, **LIMITS, C=C),
-    *wrong(
-        LinearPlant,
-        {
+            "H": [[1.0, 0.0], [[1.0, 0.0], [0.0, 0.0]], 3],
+            "dt": [0.0, -1.0, None],
+            "at": [3.0, ([1.0], 0.0), ([1.0, 2.0], "10")],
             "offset": [[1.0], [1.0, 2.0]],
-            "state_limits": [(20.0, 25.0), 25.0, ([1.0, 2.0], 30.0), (np.nan, 30.0), (np.inf, -np.inf), (25.0, 18.0)],
-            "input_limits": [(0.0, 9.0), (-np.inf, np.inf)],
-            "operating_state": [[20.0, 1.0]],
-            "operating_input": ["10"],
-            "box": [[1.0]],
-            "u_max": [1.0],
+            "continuous": [[[-2.0, 1.0]]],
+            "delays": [-1, 1.5, 101],
         },
-        **ROOM,
+        A=0.5 * np.eye(2),
+        B=np.ones((2, 1)),
+        H=None,
+        dt=0.1,
     ),
-    *changed(LinearPlant, {"operating_state": [19.0], "offset": [0.0]}, {"A": [[1.0]], "offset": [0.0]}, **ROOM),
-    *changed(
-        partial(LinearPlant, A=[[0.9]], B=[[0.2]], dt=60.0, box=1.0, **QUIET),
-        {"u_max": 1.0, "box_ends": ([0.1], [1.0])},
-        {"u_max": 1.0, "box_ends": ([1.0], [-1.0])},
-        {"u_max": 1.0, "output_limits": [([1.0], 0.0)]},
-        {"u_max": 1.0, "output_limits": [([0.0], -1.0, 1.0)]},
-        {"input_ends": ([-1.0], [np.inf])},
+    *wrong(plant_of, {"model": [3, None], "limits": [3], "bounds": [0.1], "labels": [3, {"angle": "rad"}]}),
+    *wrong(
+        with_limits(PLAIN),
+        {
+            "state": [[1.0, 2.0, 3.0], [np.inf] * 2, [-1.0, 2.0], "wide", ([-1.0, -2.0], [-0.5, 2.0])],
+            "input": [None, (-1.0, np.inf), [1.0, 2.0], 0.0, (0.0, 1.0)],
+            "rows": [
+                3,
+                [([1.0, 0.0], -1.0, 1.0)],
+                [([0.0, 0.0], None, -1.0, 1.0)],
+                [([1.0], None, -1.0, 1.0)],
+                [([1.0, 0.0], [0.0], -1.0, 1.0)],
+                [([1.0, 0.0], None, 0.5, 1.0)],
+            ],
+            "rate": [0.0, -1.0, [1.0, 2.0], 2.0],
+            "between_samples": [0, -3, 65, 2.5, True, "8", [8], 8],
+        },
+        state=[1.0, 2.0],
+        input=1.0,
     ),
+    *wrong(
+        with_limits(ROOM_MODEL),
+        {
+            "state": [(20.0, 25.0), 25.0, ([1.0, 2.0], 30.0), (np.nan, 30.0), (np.inf, -np.inf), (25.0, 18.0)],
+            "input": [(0.0, 9.0), (-np.inf, np.inf), 1.0],
+        },
+        state=(18.0, 25.0),
+        input=(0.0, 12.0),
+    ),
+    *wrong(Bounds, {name: [1e-6 * np.eye(2), "small", -1.0, np.nan] for name in SETS}, **dict.fromkeys(SETS, 0.01)),
+    *(partial(plant_of, bounds=Bounds(**dict.fromkeys(SETS, 0.01) | {name: [0.1, 0.2]})) for name in SETS),
+    lambda: plant_of(bounds=Bounds(EXAMPLE, 0.1, 0.1)),
+    lambda: plant_of(bounds=Bounds(0.1, 0.1, Remainder(Ellipsoid(np.eye(1)), True, "an example"))),
+    *wrong(truck_trailer, {"mass": [0.0], "stiffness": [-1.0], "damping": [-1.0], "dt": [0.0]}),
+    lambda: replace(PLANT, limits=Limits([2.0, np.inf], 4.0, between_samples=8)),
+    lambda: Model(0.9, 0.2, None, 60.0),
+    lambda: plant_of(Model([[0.9]], [[0.2]], None, 60.0, ([19.0], [10.0]), [0.0])),
+    lambda: plant_of(Model([[1.0]], [[0.2]], None, 60.0, ([20.0], [10.0]), [0.0])),
+    *(partial(linear_model, np.add, limits, BOUNDS, 1.0) for limits in (3, Limits((-1.0, np.inf), 1.0))),
     *called(PLANT.to_deviation, [1.0]),
     *called(PLANT.from_deviation, [1.0]),
     partial(PLANT.to_deviation, [1.0, 1.0], "speed"),
     partial(PLANT.from_deviation, [1.0, 1.0], "speed"),
-    *changed(
-        partial(LinearPlant.from_statespace, **LIMITS),
-        {"sys": MODEL},
-        {"sys": SimpleNamespace(A=A, B=B, C=C, D=D, dt=True)},
-        {"sys": (*MODEL, 0.1), "dt": 0.2},
-        {"sys": (*MODEL, -0.1)},
-        {"sys": (*MODEL, 0.1), "between_samples": 8},
+    *called(
+        Model.of,
+        *(MODEL, SimpleNamespace(A=A, B=B, C=C, D=D, dt=True), (*MODEL, -0.1), SimpleNamespace(num=[1.0])),
+        *((A, B, C, np.ones((1, 1)), 0.1), (A, B, np.eye(3), D, 0.1), (A[:1], B, C, D, 0.1), (A, B), "plant"),
     ),
-    *wrong(
-        partial(LinearPlant.from_statespace, dt=0.1, **LIMITS),
-        {"sys": [(A, B, C, np.ones((1, 1))), (A, B, np.eye(3), D), (A[:1], B, C, D), (A, B), "plant"]},
-    ),
-    partial(LinearPlant.from_statespace, SimpleNamespace(num=[1.0]), dt=0.1, **LIMITS),
-    *changed(
-        partial(LinearPlant.from_statespace, MODEL),
-        {"H": C},
-        {"input_delay": -1},
-        {"du_max": 8.0},
-        {"state_names": ("a", "a")},
-        {"input_delay": 1, "initial_cov": np.eye(2)},
-        {"input_delay": 1, "between_samples": 8},
-        {"continuous_model": [[-2.0, 1.0]]},
-        **LIMITS,
-        dt=0.1,
-    ),
-    partial(
-        LinearPlant.from_statespace,
-        MODEL,
-        dt=0.1,
-        state_limits=([0.0, -1.0], [3.0, 1.0]),
-        input_limits=(-2.0, 3.0),
-        **QUIET,
-    ),
-    *changed(
-        partial(LinearPlant, A=A, B=B, dt=0.1, operating_state=[1.0, 1.0], **QUIET),
-        {"state_limits": (0.0, 3.0), "input_limits": (-2.0, 3.0)},
-        {"box": 1.0, "u_max": 1.0, "mixed_limits": ([1.0, 0.0, 1.0], -1.0, 3.0)},
-    ),
-    *changed(partial(replace, PLANT, between_samples=8), {"continuous_model": None}, {"A": 1.001 * PLANT.A}),
-    lambda: replace(
-        gym.make("ncs_gym/CartPoleNonlinear-v0").unwrapped.plant,
-        continuous_model=UNSTABLE.continuous_model,
-        between_samples=8,
-    ),
+    partial(Model.of, (*MODEL, 0.1), 0.2),
+    lambda: plant_of(SAMPLED.with_delays(1), Limits([1.0, 2.0], 3.0, between_samples=8)),
+    lambda: plant_of(SAMPLED, Limits([1.0, 2.0], 3.0, rate=0.1, between_samples=8)),
+    lambda: plant_of(replace(SAMPLED, A=1.001 * SAMPLED.A), Limits([1.0, 2.0], 3.0)),
+    lambda: plant_of(replace(SAMPLED, continuous=None), Limits([1.0, 2.0], 3.0, between_samples=8)),
+    lambda: plant_of(Model(SAMPLED.A, 0.0 * SAMPLED.B, None, 0.1), Limits(input=1.0)),  # how large do the states get?
+    lambda: replace(nonlinear_pole(), limits=replace(nonlinear_pole().limits, between_samples=8)),
     *(partial(zero_order_hold, np.array([[size]]), np.array([[1.0]]), 1.0) for size in (1e3, 1e13, 1e20)),
     plant_in(None),
     folder_for_a_file,
-    *map(plant_in, ("{", b"\xff\xfe", "[" * 100_000, "[]", '{"format": "ncs-gym plant 1", "plant": 3}')),
+    *map(plant_in, ("{", b"\xff\xfe", "[" * 100_000, "[]", '{"format": "ncs-gym plant 2", "model": 3}')),
     *map(
         plant_with,
         (
-            lambda plant: plant.pop("A"),
-            lambda plant: plant.update(mass=3),
-            lambda plant: plant.update(C=plant.pop("box")),
-            lambda plant: plant.update(A=[["1", "2"], ["3", "4"]]),
-            lambda plant: plant.update(dt=None),
-            lambda plant: plant.update(sensor_bound={"radius": 1}),
-            lambda plant: plant.update(sensor_bound={"shape": [[-1]]}),
+            lambda plant: plant["model"].pop("A"),
+            lambda plant: plant["model"].update(mass=3),
+            lambda plant: plant.pop("limits"),
+            lambda plant: plant["model"].update(A=[["1", "2"], ["3", "4"]]),
+            lambda plant: plant["model"].update(dt=None),
+            lambda plant: plant["bounds"].update(sensor={"radius": 1}),
+            lambda plant: plant["bounds"].update(sensor={"Ellipsoid": {"shape_matrix": [[-1]]}}),
         ),
     ),
 ]
@@ -410,21 +391,21 @@ PROCESSES = [
     partial(InvertedPendulumProcess, mass_factor=0.0),
     *wrong(PendulumProcess, {"gravity": [0.0], "mass": [0.0], "length": [0.0]}),
     *wrong(
-        partial(NCSEnv, LinearPlant(**GOOD)),
+        partial(NCSEnv, linear_plant(**GOOD)),
         {"process": [inner(kind=Counted), inner(kind=Wide), inner(kind=lambda: 3)]},
     ),
     partial(
         NCSEnv,
-        LinearPlant(**GOOD),
+        linear_plant(**GOOD),
         process=GymProcess(Inner, lambda env: env.state),
         disturbance=lambda rng, plant, x: 0.0 * x,
     ),
-    lambda: NCSEnv(LinearPlant(**GOOD | {"u_max": 1.5}), process=inner()),
+    lambda: NCSEnv(linear_plant(**GOOD | {"u_max": 1.5}), process=inner()),
     lambda: reset(
-        NCSEnv(LinearPlant(**GOOD), process=GymProcess(Inner, read_state=lambda env: env.state)),
+        NCSEnv(linear_plant(**GOOD), process=GymProcess(Inner, read_state=lambda env: env.state)),
         options={"state": [0.0, 0.0]},
     ),
-    lambda: NCSVectorEnv(2, plant=LinearPlant(**GOOD), process=inner(kind=lambda: ONE)),
+    lambda: NCSVectorEnv(2, plant=linear_plant(**GOOD), process=inner(kind=lambda: ONE)),
     *called(
         lambda read: moved(inner(read)),
         lambda env: env.position,
@@ -445,20 +426,20 @@ PROCESSES = [
         {"process": 3},
         {"process": GymProcess(lambda: gym.make("Pendulum-v1"), lambda env: env.unwrapped.state)},
         {"process": GymProcess(lambda: gym.make("CartPole-v1"), lambda env: np.zeros(2))},
-        {"box": [1.0, 1.0, 1.0]},
+        {"state": [1.0, 1.0, 1.0]},
         {"samples": 5},
         {"safety_factor": 0.9},
-        {"A": np.eye(2)},
-        {"jacobian_bounds": SLOPES, "A": np.eye(2), "B": np.ones((2, 1))},
+        {"matrices": (np.eye(2), np.ones((3, 1)))},
+        {"jacobian_bounds": SLOPES, "matrices": (np.eye(2), np.ones((2, 1)))},
         {"jacobian_bounds": SLOPES[::-1]},
         {"jacobian_bounds": 3},
         {"jacobian_bounds": (SLOPES[1], SLOPES[1])},
         *({"jacobian_bounds": SLOPES, "process": FunctionProcess(noisy, each)} for each in (False, True)),
     ),
-    *changed(pendulum, {"box": [0.6, 3.0]}, {"u_max": 4.0, "dt": 0.1}, {"mass": 0.04}),
-    lambda: replace(pendulum(), box=[3.0, 3.0]),
+    partial(pendulum, mass=0.04),
+    lambda: replace(pendulum(), limits=Limits([3.0, 3.0], TORQUE)),
     *(
-        lambda change=change: replace(modeled(), **change)
+        lambda change=change: altered(modeled(), **change)
         for change in (
             {"box": [1.0, 1.0]},
             {"box": [0.2, 1.5]},
@@ -468,15 +449,21 @@ PROCESSES = [
             {"dt": 0.1, "u_max": 3.0},
         )
     ),
-    lambda: LinearPlant(**GOOD | {"box": [0.25, 1.5], "u_max": TORQUE, "dt": STEP, "remainder": modeled().remainder}),
-    lambda: replace(modeled(), remainder=replace(weakened_remainder(), box=[0.2, 1.5]).remainder),
+    lambda: linear_plant(**GOOD | {"box": [0.25, 1.5], "u_max": TORQUE, "dt": STEP, "remainder": modeled().remainder}),
+    lambda: altered(modeled(), remainder=altered(weakened_remainder(), box=[0.2, 1.5]).remainder),
 ]
 UNCERTAINTY = [
     *called(
-        lambda value: as_bound(value, 2, "d"),
+        lambda value: as_set(value).sized(2),
         *(-1.0, np.nan, np.inf, [0.1, -0.2], 1e-200, 1e60, [0.1, 0.2, 0.3], np.eye(2), "small", True),
-        *(Ellipsoid(np.eye(3)), (np.ones((3, 1)), 1.0), (np.ones((2, 1)), [1.0, 2.0]), (np.ones((2, 1)), -1.0)),
+        *(
+            Ellipsoid(np.eye(3)),
+            {"Through": {"E": np.ones((3, 1)), "set": 1.0}},
+            {"Ball": {}},
+            {"Ball": {"radius": -1}},
+        ),
     ),
+    partial(Through, np.ones((2, 1)), [1.0, 2.0]),
     *called(
         lambda value: as_disturbance(value, PLANT, False),
         *("gusts", 3, BoxDisturbance([0.1, 0.1]), BoxDisturbance([0.1, 0.1, 0.1])),
@@ -484,7 +471,7 @@ UNCERTAINTY = [
     ),
     *called(lambda d: checked(PLANT, d, allow_assumption_violation=True), *([np.nan, 0.0], [0.0], "gust", None)),
     lambda: as_disturbance(
-        BoxDisturbance([0.051, 0.00204]), replace(PLANT, gamma=0.0, disturbance_bound=[0.05, 0.002]), False
+        BoxDisturbance([0.051, 0.00204]), altered(PLANT, gamma=0.0, disturbance_bound=[0.05, 0.002]), False
     ),
     *called(partial(bound_violation_probability, PLANT, Channel()), -1, 1.5, "many"),
     partial(bound_violation_probability, Channel(), PLANT, 1),
@@ -507,13 +494,11 @@ OTHER_ERRORS = [
     (lambda: NCSEnv(PLANT, render_mode="rgb_array").render(), ResetNeeded),
     (lambda: gym.make_vec(TRUCK, num_envs=3, render_mode="rgb_array").render(), ResetNeeded),
     (partial(register_plant, "Plants/T-v0", PLANT, chanel=Channel()), TypeError),
-    (partial(LinearPlant, **GOOD, sensor_bonud=0.1), TypeError),
+    (partial(LinearPlant, PLAIN, ROOM_LIMITS, BOUNDS, sensor_bonud=0.1), TypeError),
+    (partial(Bounds, 0.1, 0.1), TypeError),
+    (partial(Limits, states=1.0, input=1.0), TypeError),
     (partial(truck_trailer, wheels=18), TypeError),
     (partial(linear_model, np.add, dt=1.0), TypeError),
-    (partial(LinearPlant, A=A, B=B, dt=0.1), TypeError),
-    (partial(LinearPlant, A=A, B=0.0 * B, dt=0.1, u_max=1.0), TypeError),  # nothing says how large the states get
-    (partial(LinearPlant, A=A, B=B, dt=0.1, u_max=1.0, boxs=1.0), TypeError),
-    (partial(LinearPlant, A=A, B=B, dt=0.1, box=[1.0, 1.0], umax=1.0), TypeError),
     (partial(exact.inverse, np.ones((2, 2))), ZeroDivisionError),
     (partial(certified_error_set, batch_reactor(), ChannelContract(200)), ErrorSetError),
     (partial(certified_error_set, batch_reactor(), ChannelContract(1000)), ErrorSetError),

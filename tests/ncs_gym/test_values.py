@@ -1,6 +1,8 @@
-"""A plant of three values, a model, limits and bounds, is the one of the arguments that say the same."""
+"""A plant of a model, limits and bounds: what follows from them, their documents, and what they refuse."""
 
+import json
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -11,13 +13,15 @@ from ncs_gym import (
     Bounds,
     Box,
     Channel,
+    Ellipsoid,
     Gaussian,
     Limits,
     LinearPlant,
     Model,
     MovedOperatingPointWarning,
+    Remainder,
+    Sum,
     Through,
-    truck_trailer,
 )
 from shields import SafetyShield
 
@@ -26,12 +30,6 @@ STATES = {"angle": "rad", "rate": "rad/s"}
 A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.5]])
 MODEL, ABOUT = Model(A, B, None, dt=0.1), Model(A, B, None, dt=0.1, at=([1.0, 2.0], 0.5))
 LIMITS, BOUNDS = Limits(state=[1.0, 2.0], input=1.0), Bounds([0.01, 0.02], 0.01, 0.02)
-QUIET = {"disturbance_bound": [0.01, 0.02], "sensor_bound": [0.01, 0.01], "initial_bound": [0.02, 0.02]}
-
-
-def same(plant, other):
-    assert plant.fingerprint == other.fingerprint
-    assert plant.document == other.document
 
 
 def servo():
@@ -42,61 +40,60 @@ def servo():
     )
 
 
-def test_servo_of_values_is_that_of_arguments_and_is_shielded():
-    bounds = {"disturbance_bound": [0, 0.25], "sensor_bound": 5e-4, "initial_bound": [1e-3, 0.05]}
-    same(servo(), LinearPlant.from_statespace((*MOTOR, 0), 0.005, box=[0.2, 4.0], u_max=12.0, **bounds))
+def test_servo_is_shielded():
     channel = Channel(loss=0.3, max_consecutive_losses=2)
     env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=servo(), channel=channel))
     env.reset(seed=0)
     assert env.step(np.zeros(1, np.float32))[4]["shield_guaranteed"]
 
 
-def test_truck_of_values_keeps_its_fingerprint():
-    motion, push = [[0.0, 1.0], [-4.5, -4.6]], [[0.0], [1.0]]
-    noise = {"process_noise_cov": 1e-4 * np.eye(2), "measurement_noise_cov": 1e-4 * np.eye(2)}
-    labels = {"states": {"coupling stretch": "m", "stretch rate": "m/s"}, "inputs": {"truck acceleration": "m/s^2"}}
-    gaussian = Gaussian(1e-4 * np.eye(2), 0.05)
-    plant = LinearPlant(
-        Model.sampled(motion, push, None, dt=0.5), Limits([2.0, 2.0], 4.0), Bounds(gaussian, gaussian, gaussian), labels
-    )
-    same(plant, truck_trailer(gamma=0.0, **noise))
+def around_a_point():
+    rows = [([1.0, 1.0], None, 0.0, 4.0), ([1.0, 0.0], [1.0], 0.0, 3.0)]
+    return LinearPlant(ABOUT, Limits(([0.0, 1.0], [2.5, np.inf]), (0.0, 2.0), rows), BOUNDS)
 
 
 def test_limits_around_a_point_are_absolute_and_keep_both_ends():
-    plant = LinearPlant(
-        ABOUT,
-        Limits(([0.0, 1.0], [2.5, np.inf]), (0.0, 2.0), [([1.0, 1.0], None, 0.0, 4.0), ([1.0, 0.0], [1.0], 0.0, 3.0)]),
-        BOUNDS,
+    plant = around_a_point()
+    np.testing.assert_allclose(plant.own_limits, [[-1.0, -1.0], [1.5, np.inf]])
+    np.testing.assert_array_equal(plant.input_ends, [[-0.5], [1.5]])
+    np.testing.assert_allclose(plant.box[2] @ np.ones(2) / plant.box_ends[:, 2], 2.0 / np.array([-3.0, 1.0]))
+    np.testing.assert_allclose(
+        plant.mixed_rows[0] @ [1.0, 0.0, 1.0] / plant.mixed_ends[:, 0], 2.0 / np.array([-1.5, 1.5])
     )
-    settings = {
-        "operating_state": [1.0, 2.0],
-        "operating_input": 0.5,
-        "state_limits": ([0.0, 1.0], [2.5, np.inf]),
-        "input_limits": (0.0, 2.0),
-        "output_limits": [([1.0, 1.0], 0.0, 4.0)],
-        "mixed_limits": [([1.0, 0.0], [1.0], 0.0, 3.0)],
-    }
-    same(plant, LinearPlant(A=A, B=B, dt=0.1, **settings, **QUIET))
 
 
 def test_constants_of_a_model_are_at_rest_at_its_point():
     x, u = np.array([1.0, 2.0]), np.array([0.5])
     c = x - A @ x - B @ u
     absolute = LinearPlant(Model(A, B, None, 0.1, (x, u), c), Limits((x - 1.0, x + 1.0), (u - 1.0, u + 2.0)), BOUNDS)
-    settings = {"operating_state": x, "operating_input": u, "offset": c}
-    limits = {"state_limits": (x - 1.0, x + 1.0), "input_limits": (u - 1.0, u + 2.0)}
-    same(absolute, LinearPlant(A=A, B=B, dt=0.1, **settings, **limits, **QUIET))
+    np.testing.assert_array_equal(absolute.step_offset, np.abs(c))
+    np.testing.assert_array_equal(absolute.operating_state, x)
     with pytest.raises(ValueError, match="no equilibrium"):
         Model(A, B, None, 0.1, (x, u), 2.0 * c)
 
 
-def test_delays_rates_and_times_between_samples_are_those_of_arguments():
+def test_past_inputs_are_known_since_delays_and_rates_made_them():
     late = LinearPlant(MODEL.with_delays(2), Limits([1.0, 2.0], 1.0, rate=0.3), BOUNDS)
-    settings = {"A": A, "B": B, "dt": 0.1, "box": [1.0, 2.0], "u_max": 1.0} | QUIET
-    same(late, LinearPlant(**settings, input_delay=2, du_max=0.3))
-    between = Limits(state=[0.2, 4.0], input=12.0, between_samples=4)
-    bounds = Bounds([0.0, 0.25], 5e-4, [1e-3, 0.05])
-    assert LinearPlant(Model.sampled(*MOTOR, dt=0.005), between, bounds).grid_rows is not None
+    assert (late.n, late.past, late.is_past_row.tolist()) == (4, 2, [False, False, True, True])
+    x, u = np.array([0.1, 0.2, 0.3, 0.4]), np.array([0.5])
+    np.testing.assert_allclose(late.A @ x + late.B @ u, [*(A @ x[:2] + B[:, 0] * 0.3), 0.4, 0.5])
+    np.testing.assert_allclose(late.mixed_rows @ [*x, *u], [0.1 / 0.3])
+    assert not late.disturbance_bound.shape_matrix[2:].any()
+    slow = LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, rate=0.3), BOUNDS)
+    assert (slow.n, slow.past) == (3, 1)
+    assert LinearPlant(MODEL, Limits([1.0, 2.0], 1.0), BOUNDS).past == 0
+
+
+def test_gaussian_noise_counts_own_states_alone():
+    noise = Gaussian(1e-4 * np.eye(2), 0.05)
+    plain, late = (LinearPlant(model, LIMITS, Bounds(noise, noise, noise)) for model in (MODEL, MODEL.with_delays(3)))
+    for name in ("process_noise", "initial_noise"):
+        one, other = getattr(plain, name), getattr(late, name)
+        assert one.energy == other.energy
+        np.testing.assert_array_equal(other.bound.shape_matrix[:2, :2], one.bound.shape_matrix)
+        samples = other.sample(np.random.default_rng(0), 2000)
+        np.testing.assert_array_equal(samples[:, :2], one.sample(np.random.default_rng(0), 2000))
+        assert not samples[:, 2:].any()
 
 
 def test_disturbance_with_two_ends_moves_the_point():
@@ -104,10 +101,37 @@ def test_disturbance_with_two_ends_moves_the_point():
     E = model.held([[0.0], [1.0]])
     with pytest.warns(MovedOperatingPointWarning):
         plant = LinearPlant(model, LIMITS, Bounds(Through(E, Box(*ends)), 0.01, 0.02))
-    settings = {"sensor_bound": 0.01, "initial_bound": [0.02, 0.02], "disturbance_bound": (E, *ends)}
-    with pytest.warns(MovedOperatingPointWarning):
-        other = LinearPlant.from_statespace((*MOTOR, 0), 0.005, box=[1.0, 2.0], u_max=1.0, **settings)
-    same(plant, other)
+    x, u = plant.operating_state, plant.operating_input
+    np.testing.assert_allclose(plant.A @ x + plant.B @ u + E @ [0.1], x, atol=1e-12)
+    np.testing.assert_allclose(plant.disturbance_bound.shape_matrix, 0.04 * E @ E.T, rtol=1e-6, atol=1e-20)
+
+
+PLANTS = {
+    "servo": servo,
+    "around a point": around_a_point,
+    "late": lambda: LinearPlant(MODEL.with_delays(2), Limits([1.0, 2.0], 1.0, rate=0.3), BOUNDS),
+    "at all times": lambda: LinearPlant(
+        Model.sampled(*MOTOR, dt=0.005), Limits([0.2, 4.0], 12.0, between_samples=4), Bounds([0.0, 0.25], 5e-4, 1e-3)
+    ),
+    "sums": lambda: LinearPlant(
+        MODEL,
+        LIMITS,
+        Bounds(Ball(0.01) + Gaussian(1e-6 * np.eye(2), 0.1), Ellipsoid(np.eye(2)), Through([[1], [2]], 0.1)),
+    ),
+    "remainder": lambda: LinearPlant(
+        MODEL, LIMITS, Bounds(Sum((0.01, Remainder(Ellipsoid(1e-4 * np.eye(2)), True, "given"))), 0.0, 0.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_document_of_a_plant_makes_it_again(name):
+    plant = PLANTS[name]()
+    document = json.loads(json.dumps(plant.document, allow_nan=False))
+    again = LinearPlant.read(document)
+    assert again.fingerprint == plant.fingerprint
+    assert again.document == plant.document
+    assert replace(plant).fingerprint == plant.fingerprint
 
 
 def test_sets_of_a_plant_hold_the_sum_of_all_that_is_declared():
@@ -131,7 +155,6 @@ def test_zero_is_said_on_purpose_and_warns_of_nothing():
         (lambda: LinearPlant(MODEL, LIMITS, 0.1), "bounds must be a Bounds"),
         (lambda: LinearPlant(MODEL, Limits([1.0], 1.0), BOUNDS), "state limits must be a pair"),
         (lambda: LinearPlant(MODEL, LIMITS, Bounds([0.1] * 3, 0.1, 0.1)), r"Bounds\(disturbance=...\)"),
-        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, gamma=0.1), "gamma belongs to one of them"),
         (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"outputs": {}}), "labels must have names"),
         (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"states": ["x", "y"]}), "a dictionary of names"),
         (lambda: LinearPlant(ABOUT, LIMITS, BOUNDS), "state limits are absolute beside at="),
@@ -150,7 +173,7 @@ def test_zero_is_said_on_purpose_and_warns_of_nothing():
             lambda: LinearPlant(MODEL, LIMITS, Bounds(Gaussian(np.eye(2), 0.1), Gaussian(np.eye(2), 0.2), 0.0)),
             "the same delta",
         ),
-        (lambda: LinearPlant(MODEL, LIMITS, Bounds(Box(0.0, 0.1) + Ball(0.1), 0.0, 0.0)), "two different ends"),
+        (lambda: LinearPlant(MODEL, LIMITS, Bounds(Box(0.0, 0.1) + Box(-0.1, 0.1), 0.0, 0.0)), "two different ends"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_sentence(make, message):

@@ -144,9 +144,7 @@ def test_what_has_verified_is_not_verified_again_and_what_is_changed_is(monkeypa
     assert len(judged) == 4
     worn = altered(plant)
     assert worn.fingerprint == plant.fingerprint
-    object.__setattr__(
-        worn, "input_ends", 0.01 * worn.input_ends
-    )  # as nobody should, after the fingerprint was computed
+    object.__setattr__(worn, "box", 100.0 * worn.box)  # as nobody should, after the fingerprint was computed
     with pytest.raises(CertificateError):
         require_valid(certificate, worn)
 

@@ -112,5 +112,5 @@ def test_every_plant_that_can_be_made_is_read_again(box, u_max, bounds, tmp_path
 
 def test_half_width_whose_row_is_out_of_range_is_refused_at_once():
     """1 / 1e-75 is the largest number that rows may not have."""
-    with pytest.raises(ValueError, match="box"):
+    with pytest.raises(ValueError, match="half-widths"):
         linear_plant(A=[[0.5]], B=[[1.0]], box=1e-75, u_max=1.0, dt=1.0, disturbance_bound=0.0, sensor_bound=0.0)

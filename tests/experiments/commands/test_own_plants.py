@@ -29,13 +29,14 @@ register_plant("Plants/Truck-v0", truck_trailer(mass=2000.0), channel=Channel(lo
 
 
 TANK = """
-from ncs_gym import Channel, LinearPlant, contract_of, register_plant
+from ncs_gym import Ball, Bounds, Channel, Limits, LinearPlant, Model, contract_of, register_plant
 
 # Limits with two ends, far from symmetric about the operating point.
+A, B = [[0.9, 0.0], [0.095, 0.92]], [[0.114], [0.006]]
 plant = LinearPlant(
-    A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, disturbance_bound=0.01, sensor_bound=0.01,
-    initial_bound=0.05, operating_state=[3.0, 3.5], operating_input=[2.6],
-    state_limits=([0.5, 0.5], [4.0, 6.0]), input_limits=(0.0, 8.0),
+    Model(A, B, None, dt=2.0, at=([3.0, 3.5], [2.6])),
+    Limits(state=([0.5, 0.5], [4.0, 6.0]), input=(0.0, 8.0)),
+    Bounds(Ball(0.01), Ball(0.01), Ball(0.05)),
 )
 channel = Channel(loss=0.3, max_consecutive_losses=2)
 register_plant("Plants/Tank-v0", plant, channel=channel, contract=contract_of(channel), max_episode_steps=20)

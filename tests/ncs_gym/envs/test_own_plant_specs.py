@@ -242,7 +242,7 @@ def test_past_inputs_cost_nothing_but_what_inputs_do():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"input_delay": 2}, "input_delay act later than the task's speed moves: give it as a downlink"),
+        ({"input_delay": 2}, "delays act later than the task's speed moves: give it as a downlink"),
         ({"operating_input": [1.0]}, "the operating point must count from zero, got 1"),
     ],
 )

@@ -185,7 +185,7 @@ def test_constant_disturbance_is_refused_beside_between_samples_at_every_entranc
     plant = make()
     np.testing.assert_allclose(plant.step_offset, [0.0, 0.3])
     document = plant.document
-    (edited := document | {"plant": dict(document["plant"])})["plant"]["between_samples"] = 8
+    edited = document | {"limits": document["limits"] | {"between_samples": 8}}
     env_id = "Pushed/Oscillator-v0"
     register_plant(env_id, plant, channel=Channel())
     entrances = [

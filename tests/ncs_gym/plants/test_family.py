@@ -11,7 +11,6 @@ import pytest
 from scipy.linalg import expm
 
 from ncs_gym import Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
-from ncs_gym.plants.past_inputs import inputs_under_way
 from ncs_gym.uncertainty.family import Family
 from tests.plants import varying_cart_pole, varying_truck
 from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, resampled, sampled_plant
@@ -121,40 +120,20 @@ def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end(few
     np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.0, 0.3], rtol=1e-8)
     np.testing.assert_allclose(plant.reach, [1.0, 2.0, 3.0])
     delayed = family_of([of(0.3, input_delay=2), of(0.5, input_delay=2)])
-    np.testing.assert_allclose(np.sqrt(np.diag(delayed.remainder.bound.shape_matrix)), [0, 0.3, 0, 0], rtol=1e-8)
+    np.testing.assert_allclose(np.sqrt(np.diag(delayed.remainder_bound.shape_matrix)), [0, 0.3, 0, 0], rtol=1e-8)
     np.testing.assert_allclose(delayed.reach, [1.0, 2.0, 3.0, 3.0, 3.0])
     limited = family_of([of(0.3, du_max=0.5), of(0.5, du_max=0.5)])
-    np.testing.assert_allclose(np.sqrt(np.diag(limited.remainder.bound.shape_matrix)), [0, 0.3, 0], rtol=1e-8)
+    np.testing.assert_allclose(np.sqrt(np.diag(limited.remainder_bound.shape_matrix)), [0, 0.3, 0], rtol=1e-8)
     for more in ({"input_delay": 2}, {"du_max": 0.5}):
         given = family_of(partial(of, **more), {"gain": (0.3, 0.5)}, monotone=True)
         wanted = delayed if "input_delay" in more else limited
-        assert inputs_under_way(given) == len(given.A) - 2
+        assert given.past == len(given.A) - 2
         np.testing.assert_allclose(given.A, wanted.A, rtol=0, atol=1e-15)
         found, right = (np.sqrt(np.diag(each.remainder.bound.shape_matrix)) for each in (given, wanted))
         np.testing.assert_allclose(found, right, atol=1e-7)
 
 
-def test_input_that_is_disturbed_on_its_way_counts_by_the_limits_of_its_state():
-    def of(gain, disturbance):
-        model = {"A": [[0.9, gain], [0.0, 0.0]], "B": [[0.0], [1.0]], "box": [1.0, 2.0], "u_max": 1.0, "dt": 0.1}
-        return linear_plant(**model | QUIET | {"disturbance_bound": disturbance})
-
-    for disturbance, reached in (([0.01, 0.0], 1.0), ([0.01, 0.5], 2.0)):
-        plant = family_of([of(0.1, disturbance), of(0.3, disturbance)])
-        assert inputs_under_way(plant) == (reached == 1.0)
-        np.testing.assert_allclose(plant.reach, [1.0, reached, 1.0])
-        np.testing.assert_allclose(
-            np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.1 * reached, 0.0], rtol=1e-8
-        )
-        # Only what is known without an error is the last input of limits of rates.
-        assert rate_limited(of(0.1, disturbance), 0.5).n == (2 if reached == 1.0 else 3)
-    quiet = family_of([of(0.1, 0.0), of(0.3, 0.0)])
-    assert altered(quiet, disturbance_bound=[0.02, 0.0]).reach[1] == 1.0
-    disturbed = altered(quiet, disturbance_bound=[0.01, 0.5])  # on its way, and so is its bound
-    np.testing.assert_allclose(np.sqrt(np.diag(disturbed.remainder.bound.shape_matrix)), [0.2, 0.0], rtol=1e-8)
-
-
-def test_a_state_counts_as_a_past_input_only_if_it_is_that_for_every_member():
+def test_a_state_that_holds_the_last_input_counts_by_its_own_limits():
     def of(leak):
         model = {"A": [[0.5, 0.1 + 0.2 * leak], [0.0, leak]], "B": [[0.0], [1.0]], "box": [2.0, 12.0], "u_max": 1.0}
         return linear_plant(**model | {"dt": 1.0} | QUIET | {"disturbance_bound": [0.01, 0.0]})
@@ -169,7 +148,7 @@ def test_a_state_counts_as_a_past_input_only_if_it_is_that_for_every_member():
     for plant, (first, second) in zip(found, wanted, strict=True):
         shape = plant.remainder.bound.shape_matrix
         assert first**2 / shape[0, 0] + second**2 / shape[1, 1] <= 1.0
-        assert inputs_under_way(plant) == 0
+        assert plant.past == 0
         assert plant.reach[1] == 12.0
     np.testing.assert_allclose(found[0].remainder.bound.shape_matrix, found[1].remainder.bound.shape_matrix)
 
@@ -309,7 +288,7 @@ def test_members_may_rest_with_other_inputs(more, few_points):
     plant = family_of(cart, {"mass": (0.95, 1.05)}, monotone=True, at_rest=True)
     np.testing.assert_allclose(plant.operating_input, 0.3)
     np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [-2.0, 2.0])
-    past = inputs_under_way(plant)
+    past = plant.past
     np.testing.assert_allclose(plant.reach[2 : 2 + past], 2.3)
     moves = np.abs(plant.remainder.family.members[:, :2, -1]).max(axis=0)
     np.testing.assert_allclose(moves, [0.05 * 0.3 * 0.00495, 0.05 * 0.3 * 0.0976], rtol=0.1)
@@ -326,19 +305,23 @@ def test_rounding_of_operating_points_is_no_step(few_points):
     assert np.sqrt(plant.remainder.bound.shape_matrix[1, 1]) < 1e-5  # of a limit of 1
 
 
+def family_in(document):
+    """What a document of a plant says of its family."""
+    return document["bounds"]["disturbance"]["Sum"]["parts"][-1]["Remainder"]["family"]
+
+
 def test_other_members_are_another_plant(tmp_path):
     TRUCK.save(tmp_path / "plant.json")
     content = json.loads((tmp_path / "plant.json").read_text())
-    content["plant"]["remainder"]["interval"][1][0][-1] += 5.0
-    content["plant"]["remainder"]["members"][0][0][-1] += 5.0
+    family_in(content)["interval"][1][0][-1] += 5.0
+    family_in(content)["members"][0][0][-1] += 5.0
     (tmp_path / "other.json").write_text(json.dumps(content))
     assert LinearPlant.load(tmp_path / "other.json").fingerprint != TRUCK.fingerprint
 
 
 def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_from():
     document = json.loads(json.dumps(HULL.document))
-    assert not {"bound", "proved"} & document["plant"]["remainder"].keys()
-    document["plant"]["remainder"]["members"][2][1][2] *= 3.0  # a stronger input
+    family_in(document)["members"][2][1][2] *= 3.0  # a stronger input
     read = LinearPlant.read(document)
     assert largest_gauge(read, read.members.members, (2.0, 2.0, 4.0)) <= 1
     assert read.remainder.bound.shape_matrix[1, 1] > 4.0 * HULL.remainder.bound.shape_matrix[1, 1]
@@ -350,11 +333,11 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
         with pytest.raises(ValueError, match="needs"):
             replace(TRUCK.members, **changes)
     document = json.loads(json.dumps(TRUCK.document))
-    document["plant"]["remainder"]["interval"] = None
+    family_in(document)["interval"] = None
     with pytest.raises(ValueError, match="needs the interval of its entries"):
         LinearPlant.read(document)
     document = json.loads(json.dumps(TRUCK.document))
-    document["plant"]["remainder"]["members"][0][1][2] *= 3.0
+    family_in(document)["members"][0][1][2] *= 3.0
     with pytest.raises(ValueError, match="must lie in its interval"):
         LinearPlant.read(document)
 
@@ -441,7 +424,7 @@ REFUSED = {
     "ranges of plants": (lambda: family_of(TRUCKS, MASSES), "about a function"),
     "one plant": (lambda: family_of(TRUCKS[:1]), "two plants or more"),
     "no truth value": (lambda: family_of(TRUCKS, at_rest="no"), "at_rest must be"),
-    "no plant": (lambda: family_of([*TRUCKS, 3]), "must be of type LinearPlant"),
+    "no plant": (lambda: family_of([*TRUCKS, 3]), "must be plants"),
     "another box": (lambda: family_of(two(box=[1.0, 1.0])), "member 1 has another box"),
     "another noise": (lambda: family_of(two(disturbance_bound=0.1)), "another disturbance_bound"),
     "a step": (lambda: family_of(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "another dt"),
@@ -450,10 +433,10 @@ REFUSED = {
     "between samples later": (lambda: altered(HULL, between_samples=4), "between_samples"),
     "rates later": (
         lambda: rate_limited(family_of(two(B=[[0.0], [0.4]])), 0.5),
-        "give du_max to its members",
+        r"must be \[A, B, s\] of shape \(3, 5\)",
     ),
     "another step later": (lambda: resampled(HULL, 0.25), "without a remainder"),
-    "not a plant": (lambda: family_of(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "type LinearPlant"),
+    "not a plant": (lambda: family_of(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "must be plants"),
     "sizes": (
         lambda: altered(
             HULL,

@@ -77,10 +77,12 @@ def test_file_gives_back_the_same_plant(name, tmp_path):
 
 
 def test_file_written_by_hand_takes_plain_terms(tmp_path):
-    content = {"A": [[0.5]], "B": [[1]], "box": [2], "u_max": 1, "dt": 0.1}
-    content |= {"disturbance_bound": 0.01, "sensor_bound": [0.02], "initial_bound": [[[1.0]], 0.03]}
-    (tmp_path / "plant.json").write_text(json.dumps({"format": "ncs-gym plant 1", "plant": content}))
+    model = {"A": [[0.5]], "B": [[1]], "H": None, "dt": 0.1}
+    limits, bounds = {"state": ["-inf", 2], "input": 1}, {"disturbance": 0.01, "sensor": [0.02], "first_error": 0.03}
+    content = {"format": "ncs-gym plant 2", "model": model, "limits": limits, "bounds": bounds, "labels": None}
+    (tmp_path / "plant.json").write_text(json.dumps(content))
     plant = LinearPlant.load(tmp_path / "plant.json")
+    np.testing.assert_array_equal(plant.own_limits, [[-np.inf], [2.0]])
     bounds = plant.disturbance_bound, plant.sensor_bound, plant.initial_bound
     assert [bound.shape_matrix[0, 0] ** 0.5 for bound in bounds] == pytest.approx([0.01, 0.02, 0.03])
 

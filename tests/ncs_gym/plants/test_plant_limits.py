@@ -1,12 +1,10 @@
 """The safe box, and limits around an operating point."""
 
-import warnings
-
 import numpy as np
 import pytest
 
 from ncs_gym import ChosenLimitsWarning
-from tests.product import altered, family_of, linear_plant
+from tests.product import altered, linear_plant
 
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
 MODEL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.5]], "u_max": 1.0, "dt": 0.1} | QUIET
@@ -50,27 +48,8 @@ def test_limits_around_an_operating_point_keep_both_ends():
     np.testing.assert_allclose(plant.to_deviation([0.0], "input"), [-10.0])
     assert not plant.is_symmetric
     for name in ("box_rows", "u_max"):
-        with pytest.raises(ValueError, match="not symmetric about its operating point"):
+        with pytest.raises(ValueError, match="the limits of this plant are not"):
             getattr(plant, name)
-
-
-def test_largest_symmetric_limits_are_those_of_the_nearer_ends():
-    plant = linear_plant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0)).symmetric
-    np.testing.assert_allclose(1.0 / plant.box_rows, [[2.0]])
-    np.testing.assert_allclose(plant.u_max, [2.0])
-    assert plant.symmetric is plant
-    assert plant.fingerprint == linear_plant(**ROOM, box=2.0, u_max=2.0).fingerprint
-
-
-def test_symmetric_limits_inside_those_of_a_remainder_have_it_too():
-    limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plants = [linear_plant(**ROOM | limits | {"A": [[pole]]}) for pole in (0.8, 0.82)]
-    family = family_of(plants, at_rest=True)
-    assert not family.is_symmetric
-    assert family.symmetric.is_symmetric
-    half = np.sqrt(family.symmetric.remainder.bound.shape_matrix.item())
-    np.testing.assert_allclose(half, 0.01 * family.symmetric.reach[0], rtol=1e-8)
-    assert family.symmetric.members is family.members
 
 
 def test_limits_that_are_symmetric_but_for_rounding_are_the_short_form():
@@ -175,9 +154,6 @@ def test_half_widths_are_chosen_where_inputs_alone_are_limited():
     with pytest.warns(ChosenLimitsWarning):
         same = linear_plant(**model, u_max=2.0, state_limits=(-np.inf, [np.inf, np.inf]))
     assert same.fingerprint == plant.fingerprint
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert altered(plant, dt=0.2).fingerprint != plant.fingerprint
 
 
 def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_it():
@@ -194,7 +170,7 @@ def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_i
     ("limits", "message"),
     [
         ({"input_limits": (0.0, 5.0), "operating_input": [0.0]}, "entry 1 rests at its end"),
-        ({"input_limits": (0.0, 5.0)}, "give operating_input="),
+        ({"input_limits": (0.0, 5.0)}, "give at="),
         ({"input_limits": (-1.0, 5.0), "operating_state": [0.0], "state_limits": (0.0, 1.0)}, "entry 1 rests at its"),
     ],
 )
@@ -202,7 +178,7 @@ def test_input_that_rests_at_its_end_is_told_from_one_that_nobody_gave(limits, m
     model = {"A": [[0.9]], "B": [[0.1]], "dt": 1.0, "sensor_bound": 0.0, "initial_bound": 0.0, "disturbance_bound": 0.0}
     with pytest.raises(ValueError, match=message) as refused:
         linear_plant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
-    assert ("give operating" in str(refused.value)) == ("give operating" in message)
+    assert ("give at" in str(refused.value)) == ("give at" in message)
 
 
 def test_disturbance_may_act_in_some_directions_alone():

@@ -10,13 +10,13 @@ from ncs_gym import Channel, FamilyProcess, LinearProcess, RandomChannel
 from ncs_gym import truck_trailer as truck
 from ncs_gym.processes.process import own_process
 from tests.plants import varying_truck
-from tests.product import family_of, gym_env, loop_env, vector_env
+from tests.product import family_of, gym_env, library_plant, loop_env, vector_env
 
 QUIET = {"gamma": 0.0, "process_noise_cov": np.zeros((2, 2))}
 
 
 def quiet_truck(mass=4000.0, stiffness=4500.0):
-    return truck(mass, stiffness, **QUIET)
+    return library_plant(truck, mass, stiffness, **QUIET)
 
 
 RANGES = {"mass": (3800.0, 4200.0), "stiffness": (4300.0, 4700.0)}

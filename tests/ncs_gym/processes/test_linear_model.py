@@ -214,11 +214,11 @@ def test_another_environment_moves_the_states_that_are_no_past_inputs():
 def test_disturbance_that_moves_the_operating_point_is_refused():
     """The remainder was bounded around another point, and the function counts from it."""
     disturbed = TANK | {"disturbance_bound": ([[1.0]], [0.0], [0.004])}
-    with pytest.warns(MovedOperatingPointWarning), pytest.raises(ValueError, match="give symmetric ends"):
+    with pytest.warns(MovedOperatingPointWarning), pytest.raises(ValueError, match="moves"):
         linear_model(tank, **disturbed)
     # Of a tank without an outflow of its own the input alone moves.
     integrating = {"A": [[1.0]], "B": [[0.2]], "operating_input": 0.5} | disturbed | {"operating_input": 0.5}
-    with pytest.warns(MovedOperatingPointWarning) as told, pytest.raises(ValueError, match="give symmetric ends"):
+    with pytest.warns(MovedOperatingPointWarning) as told, pytest.raises(ValueError, match="moves"):
         linear_model(lambda x, u: x + 0.2 * u - 0.01 * x * u, **integrating)
     assert f"the state {[LEVEL]} and the input [0.49]" in str(told[0].message)
 
@@ -317,6 +317,5 @@ def test_remainder_is_not_sampled_where_limits_of_several_entries_forbid(limits)
     assert plant.remainder.bound.support(np.eye(2)).max() < 1e-6
     if "mixed_limits" in limits:
         fewer = {"mixed_rows": None, "mixed_ends": None}
-        with pytest.raises(ValueError, match="another mixed_limits"):
+        with pytest.raises(ValueError, match="other limits"):
             altered(plant, **fewer)
-        assert altered(plant, mixed_limits=[([0.0, 0.0], [1.0, -1.0], -0.5, 0.5)]).remainder is plant.remainder

@@ -1,4 +1,4 @@
-"""Bounds in plain terms: what a number, half-widths, an ellipsoid or (E, w) stand for."""
+"""Ellipsoids around sets in plain terms, and points of boxes inside them."""
 
 import itertools
 
@@ -6,46 +6,38 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
-from ncs_gym.uncertainty.declared_bound import as_bound, diagonal_inside, sample_box
-
-
-def test_number_is_the_radius_of_a_ball():
-    np.testing.assert_array_equal(as_bound(0.5, 3, "d").shape_matrix, 0.25 * np.eye(3))
+from ncs_gym.bounds import Box, Through, as_set
+from ncs_gym.uncertainty.declared_bound import diagonal_inside, sample_box
 
 
 def test_half_widths_give_the_smallest_ellipsoid_around_their_box():
     widths = np.array([0.1, 2.0, 30.0])
-    bound = as_bound(widths, 3, "d")
+    bound = as_set(widths).ellipsoid()
     corners = [widths * signs for signs in itertools.product([-1.0, 1.0], repeat=3)]
     np.testing.assert_allclose(bound.gauge(corners), 1.0, rtol=1e-12)
 
 
 def test_state_without_disturbance_costs_the_others_nothing():
-    np.testing.assert_allclose(as_bound([0.1, 0.0, 0.3], 3, "d").shape_matrix, 2.0 * np.diag([0.01, 0.0, 0.09]))
+    np.testing.assert_allclose(as_set([0.1, 0.0, 0.3]).ellipsoid().shape_matrix, 2.0 * np.diag([0.01, 0.0, 0.09]))
 
 
 @pytest.mark.parametrize(("w", "widths"), [(0.2, [0.2, 0.2]), ([0.2, 0.5], [0.2, 0.5])])
 def test_directions_and_sizes_give_an_ellipsoid_around_every_combination(w, widths):
     E = np.array([[1.0, 2.0], [0.0, 1.0], [3.0, 0.0]])
-    bound = as_bound((E, w), 3, "d")
+    bound = Through(E, w).ellipsoid()
     combinations = [E @ (np.array(widths) * signs) for signs in itertools.product([-1.0, 1.0], repeat=2)]
     np.testing.assert_allclose(bound.gauge(combinations), 1.0, rtol=1e-9)
     assert bound.gauge([0.0, 1.0, 0.0]) == np.inf  # off the plane that E spans
 
 
-def test_ellipsoid_is_taken_as_it_is():
-    own = Ellipsoid([[2.0, 0.3], [0.3, 1.0]])
-    assert as_bound(own, 2, "d") is own
-
-
-@pytest.mark.parametrize("zero", [0.0, [0.0, 0.0], ([[1.0], [1.0]], 0.0), Ellipsoid(np.zeros((2, 2)))])
+@pytest.mark.parametrize("zero", [Box([0.0, 0.0], [0.0, 0.0]), Through([[1.0], [1.0]], 0.0)])
 def test_zero_is_a_bound(zero):
-    np.testing.assert_array_equal(as_bound(zero, 2, "d").shape_matrix, np.zeros((2, 2)))
+    np.testing.assert_array_equal(zero.ellipsoid().shape_matrix, np.zeros((2, 2)))
 
 
 def test_box_of_half_widths_is_drawn_from_to_its_edges_and_no_further():
     widths = np.array([0.1, 0.0, 30.0])
-    samples = np.abs(sample_box(as_bound(widths, 3, "d"), np.random.default_rng(0), 2000))
+    samples = np.abs(sample_box(as_set(widths).ellipsoid(), np.random.default_rng(0), 2000))
     largest = samples.max(axis=1)
     assert (largest <= widths * (1 + 1e-12)).all()
     assert (largest >= 0.99 * widths).all()

@@ -28,7 +28,7 @@ def test_other_arguments_change_beside_the_remainder(tmp_path):
     twins = LinearPlant.load(tmp_path / "plant.json"), copy.deepcopy(PLANT), pickle.loads(pickle.dumps(PLANT))
     for twin in twins:
         assert twin.fingerprint == PLANT.fingerprint
-        with pytest.raises(ValueError, match="another box"):
+        with pytest.raises(ValueError, match="other limits"):
             altered(twin, box=[1.0, 1.0])
 
 

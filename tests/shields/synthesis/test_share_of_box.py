@@ -7,7 +7,6 @@ import pytest
 
 from experiments.report.text_tables import certificate_line
 from ncs_gym import cart_pole, truck_trailer
-from ncs_gym.plants.past_inputs import inputs_under_way
 from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
@@ -107,7 +106,7 @@ def test_share_of_a_polytope_is_of_what_further_limits_leave_of_the_box(limit):
 @pytest.mark.parametrize("steps", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way(steps):
     plant = delayed(steps)
-    assert inputs_under_way(plant) == steps
+    assert plant.past == steps
     certificate = certificate_of(plant)
     states = np.random.default_rng(1).uniform(-1.0, 1.0, (100_000, 2)) * [1.0, 1.5]
     at_rest = np.concatenate([states, np.zeros((len(states), steps))], axis=1)
@@ -118,8 +117,8 @@ def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way
 
 
 def test_plants_without_delay_have_no_input_under_way():
-    assert [inputs_under_way(plant) for plant in (truck_trailer(), cart_pole(), random_plant(0, 3, 2))] == [0, 0, 0]
-    assert inputs_under_way(random_plant(0, 1, 2)) == 0
+    assert [plant.past for plant in (truck_trailer(), cart_pole(), random_plant(0, 3, 2))] == [0, 0, 0]
+    assert random_plant(0, 1, 2).past == 0
 
 
 def test_operating_point_shifts_nothing(certificate, loaded):

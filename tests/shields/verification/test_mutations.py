@@ -166,12 +166,20 @@ def with_multipliers(certificate, **change):
     return replace(changed, rounding=moved.rounding)
 
 
+SOURCES = {"disturbance": "disturbance", "sensor": "sensor", "initial": "first_error"}
+
+
 def replaced(plant, **values):
     """The plant with numbers or derived bounds replaced and nothing derived anew, as a faulty derivation leaves it."""
     assert plant.fingerprint
     assert plant.disturbance.dim == plant.initial_error.dim >= plant.sensor_error.dim
+    sources = {f"{kind}_bound": f"of_{source}" for kind, source in SOURCES.items()}
+    for name in sources.keys() & values.keys():
+        values[sources[name]] = getattr(plant, sources[name])._replace(bound=values.pop(name))
     faulty = object.__new__(type(plant))
     faulty.__dict__.update(plant.__dict__ | values)
+    if "remainder" in values:
+        faulty.__dict__["remainder_bound"] = values["remainder"].bound
     return faulty
 
 
