@@ -116,8 +116,8 @@ class OpenedEnv(Process):
             if (plant.input_high > high + room).any() or (plant.input_low < low - room).any():
                 raise ValueError(
                     f"the input limits, {shown(plant.input_low.tolist())} to {shown(plant.input_high.tolist())}, go "
-                    f"beyond the actions, {shown(low.tolist())} to {shown(high.tolist())}: choose closer ones (u_max), "
-                    "or give GymProcess write_action"
+                    f"beyond the actions, {shown(low.tolist())} to {shown(high.tolist())}: choose closer ones, or give "
+                    "GymProcess write_action"
                 )
         return space.dtype, space.shape
 

@@ -226,8 +226,8 @@ def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
         return moving.step(frame, moving.write(np.zeros(n)), np.zeros(m))
     except (IndexError, TypeError, ValueError) as error:
         raise ValueError(
-            f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} (as box has) with "
-            f"{counted(m, 'input')} (as u_max has): {error}"
+            f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} with "
+            f"{counted(m, 'input')}, the sizes of limits and at: {error}"
         ) from error
 
 

@@ -340,9 +340,8 @@ def as_noise(value: Any, plant: LinearPlant) -> str:
     """Returns "truncated", "gaussian" or "extreme", checked.
 
     "gaussian" draws what a covariance describes, which is process noise, sensor noise and first error, from the
-    Gaussian itself. What is bounded by declaration (`gamma`, `disturbance_bound`, `sensor_bound`, `initial_bound`) has
-    no distribution beyond its bound and stays inside. "extreme" draws sensor noise and first errors in random
-    directions on the boundary of what is assumed of them.
+    Gaussian itself. What other sets bound has no distribution beyond them and stays inside. "extreme" draws sensor
+    noise and first errors in random directions on the boundary of what is assumed of them.
 
     Raises:
         ValueError: If it is another value, or "gaussian" for a plant without any covariance.
