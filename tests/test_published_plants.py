@@ -52,7 +52,9 @@ def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
     assert script.largest_share(altered(plant, box=np.array([[0.1, 0.0]]))) is None
 
 
-@pytest.mark.parametrize("name", ["spacecraft", "tvc_rocket", "propofol", "heli_tondel"])
+@pytest.mark.parametrize(
+    "name", ["spacecraft", "tvc_rocket", "heli_tondel", pytest.param("propofol", marks=pytest.mark.slow)]
+)
 def test_error_sets_are_found_where_steps_are_short_or_inputs_weak(name):
     """A regulator that had to decay by a quarter in every step weighed errors by 1e8 to 1e11 here."""
     plant, contract = script.plant_of(name), script.contract_of_plant(name)

@@ -32,7 +32,7 @@ def stored(folder):
     return sorted(path.stem for path in (folder / "runs").glob("*.json"))
 
 
-@pytest.mark.cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [2, 1])
 def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, certificate, tmp_path):
     runs = [training_run(certificate, arm="random", policy_kind="random", index=index) for index in range(3)]
@@ -43,6 +43,7 @@ def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, cer
     assert results[0].episodes != results[1].episodes
 
 
+@pytest.mark.slow
 def test_finished_runs_are_kept_and_not_executed_again(tmp_path, capsys):
     runs = [Small(name, "work", tmp_path) for name in "abc"]
     with pytest.warns(UserWarning, match=r"[ab] warns"):
@@ -99,7 +100,9 @@ def command(folder):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sessions are POSIX's")
-@pytest.mark.parametrize(("send", "number"), [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("send", "number"), [(os.killpg, signal.SIGINT), pytest.param(os.kill, signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_stop_keeps_what_is_finished_and_is_one_line(send, number, tmp_path):
     process = command(tmp_path)
     send(process.pid, number)  # Ctrl-C reaches the whole group

@@ -168,13 +168,12 @@ def test_synthesis_ends_after_a_minute_unless_another_limit_is_given(tmp_path):
     assert SynthesizeSettings().time_limit == 60.0
 
 
-def test_plant_of_a_file_under_a_contract(tmp_path):
-    random_plant(3, 3, 2).save(tmp_path / "plant.json")
-    asked = ("--plant", "plant.json", "--max-age", 2, "--quantization-step", 0.001)
+def test_plant_of_a_file_under_a_contract(plant_file, tmp_path):
+    asked = ("--plant", plant_file.name, "--max-age", 2, "--quantization-step", 0.001)
     assert ncs("synthesize", *asked, cwd=tmp_path).returncode == 0
     contract = Certificate.load(tmp_path / "certificate.json").contract
     assert (contract.max_age, contract.quantization_step) == (2, 0.001)
-    alone = ncs("synthesize", "--plant", "plant.json", "--quantization-step", 0.001, cwd=tmp_path)
+    alone = ncs("synthesize", "--plant", plant_file.name, "--quantization-step", 0.001, cwd=tmp_path)
     assert_one_sentence(alone, "give --max-age, too")
 
 
