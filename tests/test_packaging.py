@@ -313,7 +313,7 @@ def run_in(folder, *arguments):
     )
 
 
-@pytest.mark.cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GENERIC_NAMES)
 def test_package_that_was_overwritten_is_told_of(installed_copy, name, tmp_path):
     init = installed_copy / name / "__init__.py"

@@ -94,6 +94,7 @@ def test_no_state_between_samples_is_outside_and_without_it_some_are(name, kind,
     assert worst[None] > 1.0
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("kind", [1, 2])
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_single_decisions_are_those_of_many(mode, kind):

@@ -70,6 +70,7 @@ def test_first_failure_stops_the_others_is_named_and_keeps_what_is_finished(tmp_
     assert stored(tmp_path) == ["a"]
 
 
+@pytest.mark.slow
 def test_dead_worker_costs_its_own_run_only(tmp_path):
     runs = [Small("a", "die", tmp_path), Small("b", "work", tmp_path, awaits="a began"), Small("c", "work", tmp_path)]
     with (
@@ -114,6 +115,7 @@ def test_stop_keeps_what_is_finished_and_is_one_line(send, number, tmp_path):
     assert stored(tmp_path) == ["a"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc"), reason="processes are looked up in /proc")
 def test_workers_end_when_their_parent_is_killed(tmp_path):
     process = command(tmp_path)

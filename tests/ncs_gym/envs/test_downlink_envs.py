@@ -26,6 +26,7 @@ def test_vector_equals_scalar_environment(name):
     compare(vector_env(3, channel=UPLINK, downlink=DOWNLINKS[name], **CRUISE), 100)
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_vector_episodes_that_begin_anew_equal_scalar_ones(mode):
     channel = Channel(loss=0.2, quantization_step=0.02, delay=1, jitter=4)

@@ -412,7 +412,7 @@ class Echo(gym.Env):
         return np.array(action, np.float32), 0.0, False, False, {}
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("late", ["apply", "queue"])
 @pytest.mark.parametrize(
     "downlink",

@@ -512,6 +512,7 @@ def test_human_mode_shows_every_step_and_closes(monkeypatch):
     env.close()
 
 
+@pytest.mark.slow
 def test_images_need_no_display_and_leave_the_driver_alone(monkeypatch):
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     code = """if True:

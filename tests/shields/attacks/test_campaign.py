@@ -136,7 +136,7 @@ def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract
     assert min(outcome.counts["lost"], outcome.counts["certified again"]) > 0
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [

@@ -39,6 +39,7 @@ def test_no_search_over_state_error_disturbance_and_proposal_leaves_the_safe_set
     assert -found.fun > (0.5 if mode == "boundary" else 0.9)  # the search does come close
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("name", PLANTS)
 def test_no_ascent_over_state_error_and_disturbance_leaves_the_safe_set_under_the_gain(name):
     # (I) by another route: coordinate ascent from many starts, the input rounded as it is applied.

@@ -288,7 +288,7 @@ def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case
     assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
 
 
-@pytest.mark.cases(6)
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
 @pytest.mark.parametrize(
     ("where", "steps", "margin"),
@@ -334,6 +334,7 @@ def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thi
     assert 1.0 - 1e-4 < min(levels) <= max(levels) <= 1.0
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("margin", [0.0, 0.1])
 @pytest.mark.parametrize("far", [0.0, 1.0, 1e6])
 def test_a_state_is_known_to_be_in_the_box_in_rational_arithmetic(far, margin):

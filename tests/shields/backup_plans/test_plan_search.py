@@ -253,6 +253,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
     assert {"planned", "stored"} <= set(many.reason)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, monkeypatch):
     shield, rng = shield_of(name), np.random.default_rng(7)

@@ -156,6 +156,7 @@ def test_episode_begins_with_the_operating_input_as_the_one_before():
         assert info["state"][:2].all()
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     plant = PLANTS["rates"]

@@ -212,6 +212,7 @@ def episodes(env, seed):
     return said
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", MODES)
 def test_environments_in_threads_go_as_alone(mode):
     with warnings.catch_warnings():

@@ -149,6 +149,7 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
         assert p * p + (q - Fraction(tilt) * p) ** 2 <= 1
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("count", [16, pytest.param(160, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("tilt", [2.0**8, 2.0**10, 2.0**12])
 def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_margin(tilt, count):
