@@ -32,6 +32,7 @@ def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
     assert counts_of("monitor")["outside box"] > 1_000
 
 
+@pytest.mark.slow
 def test_a_plant_has_a_row_of_its_share_and_one_of_its_attack(capsys, monkeypatch):
     certificate = script.certified("ctms_cruise", script.plant_of("ctms_cruise"))
     monkeypatch.setattr(script, "certified", lambda *_: certificate)
