@@ -108,7 +108,10 @@ def test_arms_with_and_without_training_are_compared_where_limits_have_two_ends(
     small = ("--hyperparams", "n_steps=16", "n_envs=2", "batch_size=32", "n_epochs=1")
     arms = ("unshielded", "shielded")
     baselines = ("zero input", "K x_hat", "random", "lqr+shielded", "lqr+psf:20", "mpc")
-    run = ncs("compare", *tank, *short, *small, "--arms", *arms, "--baselines", *baselines, "--out", "c", cwd=folder)
+    with without_pictures():
+        run = ncs(
+            "compare", *tank, *short, *small, "--arms", *arms, "--baselines", *baselines, "--out", "c", cwd=folder
+        )
     assert run.returncode == 0, run.stderr
     arms = json.loads((folder / "c" / "summary.json").read_text())
     assert set(arms["references"]) == set(baselines)
