@@ -72,11 +72,16 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the study and a record as the
-# pages have them, hints, and the same bits in every process.
+# pages have them, hints, the same bits in every process, and what worker processes do.
 SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/test_study.py \
 	tests/experiments/commands/test_requirements.py \
+	tests/test_published_plants.py tests/hardening/test_bounded_inputs.py::test_what_is_said_of_a_document_with_long_texts_is_short \
 	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \
-	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process
+	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process \
+	tests/hardening/test_portability.py::test_operating_points_that_are_found_are_the_same_under_other_kernels \
+	tests/experiments/backends/test_execution.py \
+	tests/test_packaging.py tests/ncs_gym/rendering/test_rendering.py::test_images_need_no_display_and_leave_the_driver_alone \
+	tests/experiments/commands/test_attack.py::test_lookahead_may_leave_the_safe_set_and_keeps_the_box
 test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)
 

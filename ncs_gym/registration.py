@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
@@ -123,7 +124,7 @@ class Factory:
                 raise ValueError(
                     "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
                 )
-            read, own["contract"] = self.plant(), self.contract or contract_of(self.channel)
+            read, own["contract"] = _made(self.plant), self.contract or contract_of(self.channel)
         if between_samples is not None:
             read = replace(read, limits=replace(read.limits, between_samples=between_samples))
         own |= {"plant": read, "disturbance": self._disturbance(read)}
@@ -158,6 +159,12 @@ class Factory:
         if not isinstance(plant, LinearPlant) or own.check(plant) or own.excess(plant):
             return "ball"
         return own
+
+
+@cache
+def _made(plant: Callable[[], LinearPlant]) -> LinearPlant:
+    """Returns a default plant, which environments share: nothing can change it, and what follows from it is kept."""
+    return plant()
 
 
 # The four impairments of Liu et al. Section 5, all at once.

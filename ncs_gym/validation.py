@@ -260,7 +260,8 @@ def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
             eigenvalue beyond rounding.
     """
     matrix = as_matrix(value, (size, size), name)
-    matrix = as_matrix(matrix, (len(matrix), len(matrix)), name)
+    if size is None:
+        matrix = as_matrix(matrix, (len(matrix), len(matrix)), name)
     variances = np.diag(matrix)
     deviations = np.sqrt(np.maximum(variances, 0.0))
     units = np.outer(deviations, deviations)
@@ -268,7 +269,7 @@ def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
         raise ValueError(f"{name} must be symmetric, got {shown(matrix.tolist())}")
     matrix = 0.5 * (matrix + matrix.T)
     kept = variances > 0.0
-    correlations = matrix[np.ix_(kept, kept)] / units[np.ix_(kept, kept)]
+    correlations = matrix[kept][:, kept] / units[kept][:, kept]
     smallest = float(np.linalg.eigvalsh(correlations)[0]) if kept.any() else 0.0
     if smallest < -COVARIANCE_ROUNDING or matrix[~kept].any():
         least = float(np.linalg.eigvalsh(matrix)[0])

@@ -104,6 +104,7 @@ def _checked_in(plant: LinearPlant, contract: ChannelContract | None) -> Certifi
 
 def main() -> None:
     """Checks in what the tests had to synthesize: `python -m tests.certificates`, after a run on this source."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `conftest.py`; the name of the folder depends on it
     for folder in (ROOT / ".pytest_cache" / "d" / f"certificates-{source_digest()}").glob("certificate-*/"):
         shutil.copy(folder / "certificate.json", CHECKED_IN / "others" / f"{folder.name.partition('-')[2]}.json")
 

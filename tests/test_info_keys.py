@@ -25,13 +25,13 @@ from ncs_gym import (
     VectorNetworked,
     VectorRandomChannel,
     VectorRequestActions,
-    truck_trailer,
 )
 from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.ncs_gym.networked.environments import Counter
-from tests.product import family_of, linear_plant, loop_env, safety_shield, vector_shield
+from tests.plants import varying_truck
+from tests.product import linear_plant, loop_env, safety_shield, vector_env, vector_shield
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "ncs_gym.md").read_text()
 ENVIRONMENTS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0")
@@ -88,6 +88,7 @@ def test_page_names_every_key_once():
     assert sorted(named) == sorted([*kinds("lookahead"), "parameters"])
 
 
+@pytest.mark.cases(8)
 @pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
 def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env_id, certificate = loop
@@ -219,6 +220,7 @@ VECTORS = ["NextStep", "SameStep"]
 FEW = {"num_envs": 3, "max_episode_steps": 5}
 
 
+@pytest.mark.cases(7)
 @pytest.mark.parametrize("env_id", registered_ids())
 def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
     assert_tells_what_is_the_listeners_own(lambda: gym.make(env_id))
@@ -226,7 +228,7 @@ def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
         assert_tells_what_is_the_listeners_own(lambda mode=mode: gym.make_vec(env_id, autoreset_mode=mode, **FEW))
 
 
-@pytest.mark.parametrize("mode", ["project", "monitor", "lookahead"])
+@pytest.mark.parametrize("mode", ["project", pytest.param("monitor", marks=pytest.mark.slow), "lookahead"])
 def test_nobody_changes_a_shield_by_writing_into_what_it_told(loop, mode):
     env_id, certificate = loop
     assert_tells_what_is_the_listeners_own(lambda: safety_shield(gym.make(env_id), certificate, mode))
@@ -264,12 +266,11 @@ def test_nobody_changes_a_network_by_writing_into_what_it_told(kind, network):
         )
 
 
-FAMILY = {"plant": family_of(truck_trailer, {"mass": (3800.0, 4200.0)}, monotone=True)}
 CONVOY = "ncs_gym/ConvoyOnRequest-v0"
 TRUCK = EstimateFilterSettings("trusting", certificate_of(gym.make(ENVIRONMENTS[0]).unwrapped.plant))
 OTHERS = {
-    "a plant that varies": lambda: loop_env(**FAMILY),
-    "plants that vary": lambda: gym.make_vec("ncs_gym/LinearNCS-v0", **FEW, **FAMILY),
+    "a plant that varies": lambda: loop_env(varying_truck()),
+    "plants that vary": lambda: vector_env(plant=varying_truck(), **FEW),
     "requests": lambda: RequestActions(gym.make(CONVOY), 0.1),
     "requests of many": lambda: VectorRequestActions(gym.make_vec(CONVOY, **FEW), 0.1),
     "requests of a network": lambda: RequestActions(Networked(Counter(), Channel(on_request=True)), 0.1),

@@ -158,31 +158,11 @@ def test_environment_and_shields_do_not_import_the_learners():
             assert not imports_of(path, LEARNERS), path
 
 
-def test_nothing_is_compiled_at_first_use():
-    """Neither imported by us, nor by what we import, nor pinned; nor is what draws, before anything is drawn.
-
-    The published method is there without a further import.
-    """
+def test_nothing_that_compiles_at_first_use_is_imported_or_pinned():
     for path in MODULES:
         assert not imports_of(path, COMPILERS), path
     pinned = {line.partition("==")[0].lower() for line in (ROOT / "constraints.txt").read_text().splitlines()}
     assert not pinned & COMPILERS
-    code = f"""
-import sys, gymnasium, numpy, ncs_gym, shields
-shields.paper.synthesize
-import experiments.commands.attack
-model, limits = ncs_gym.Model([[0.9]], [[1.0]], None, dt=0.1), ncs_gym.Limits(state=[1.0], input=1.0)
-plant = ncs_gym.LinearPlant(model, limits, ncs_gym.Bounds(disturbance=1e-3, sensor=0.0, first_error=0.0))
-certificate = shields.synthesize(plant)
-env = shields.SafetyShield(gymnasium.make("ncs_gym/LinearNCS-v0", plant=plant), certificate)
-many = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, plant=plant), certificate)
-for each, shape in ((env, (1,)), (many, (2, 1))):
-    each.reset(seed=0)
-    each.step(numpy.ones(shape, numpy.float32))
-print(sorted(({COMPILERS} | {{"matplotlib", "filterpy", "pygame"}}) & set(sys.modules)))
-"""
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "[]"
 
 
 def test_every_folder_says_what_it_is_for():
@@ -203,22 +183,39 @@ def test_few_names_are_public_and_each_is_documented():
 
 
 def test_what_takes_long_is_imported_when_it_is_needed():
-    """One process imports one module after the other, those that need least first; after each it looks for the rest."""
+    """One process imports one module after the other, those that need least first; after each it looks for the rest.
+
+    Then it makes shields and steps: nothing is compiled, and nothing that draws is imported before anything is drawn.
+    The published method is there without a further import.
+    """
     later = {
         "experiments.__main__": {"numpy", "tyro"},
         "ncs_gym": {"scipy.linalg", "scipy.optimize", "scipy.stats", "filterpy", "pygame", "matplotlib"},
         "shields": {"cvxpy", "clarabel", "torch", "matplotlib", "scipy.stats", "filterpy"},
         "experiments.settings": {"scipy.stats", "filterpy", "cvxpy", "matplotlib", "torch"},
-        "experiments.commands.compare": {"torch", "stable_baselines3"},
     }
     code = f"""
 import importlib, sys
 for module, later in {later!r}.items():
     importlib.import_module(module)
     print(module, sorted(later & set(sys.modules)))
+import gymnasium, numpy, ncs_gym, shields
+shields.paper.synthesize
+import experiments.commands.attack
+model, limits = ncs_gym.Model([[0.9]], [[1.0]], None, dt=0.1), ncs_gym.Limits(state=[1.0], input=1.0)
+plant = ncs_gym.LinearPlant(model, limits, ncs_gym.Bounds(disturbance=1e-3, sensor=0.0, first_error=0.0))
+certificate = shields.synthesize(plant)
+env = shields.SafetyShield(gymnasium.make("ncs_gym/LinearNCS-v0", plant=plant), certificate)
+many = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, plant=plant), certificate)
+for each, shape in ((env, (1,)), (many, (2, 1))):
+    each.reset(seed=0)
+    each.step(numpy.ones(shape, numpy.float32))
+print("steps", sorted(({COMPILERS} | {{"matplotlib", "filterpy", "pygame"}}) & set(sys.modules)))
+import experiments.commands.compare
+print("compare", sorted({LEARNERS} & set(sys.modules)))
 """
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.splitlines() == [f"{module} []" for module in later]
+    assert run.stdout.splitlines() == [f"{module} []" for module in (*later, "steps", "compare")]
 
 
 @pytest.mark.parametrize("package", ORDER)
@@ -313,7 +310,7 @@ def run_in(folder, *arguments):
     )
 
 
-@pytest.mark.cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GENERIC_NAMES)
 def test_package_that_was_overwritten_is_told_of(installed_copy, name, tmp_path):
     init = installed_copy / name / "__init__.py"

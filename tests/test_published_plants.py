@@ -32,6 +32,7 @@ def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
     assert counts_of("monitor")["outside box"] > 1_000
 
 
+@pytest.mark.slow
 def test_a_plant_has_a_row_of_its_share_and_one_of_its_attack(capsys, monkeypatch):
     certificate = script.certified("ctms_cruise", script.plant_of("ctms_cruise"))
     monkeypatch.setattr(script, "certified", lambda *_: certificate)
@@ -52,7 +53,9 @@ def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
     assert script.largest_share(altered(plant, box=np.array([[0.1, 0.0]]))) is None
 
 
-@pytest.mark.parametrize("name", ["spacecraft", "tvc_rocket", "propofol", "heli_tondel"])
+@pytest.mark.parametrize(
+    "name", ["spacecraft", "tvc_rocket", "heli_tondel", pytest.param("propofol", marks=pytest.mark.slow)]
+)
 def test_error_sets_are_found_where_steps_are_short_or_inputs_weak(name):
     """A regulator that had to decay by a quarter in every step weighed errors by 1e8 to 1e11 here."""
     plant, contract = script.plant_of(name), script.contract_of_plant(name)

@@ -113,6 +113,7 @@ def test_folder_keeps_how_the_environment_was_made(tmp_path):
         replace(agent, kwargs={"disturbance": lambda *given: None}).save(tmp_path)
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("as_file", [False, True])
 def test_folder_keeps_a_plant_without_an_id(tmp_path, as_file):
     plant, folder = small([[0.9, 0.1], [0.0, 0.8]], disturbance_bound=0.01), tmp_path / "agent"

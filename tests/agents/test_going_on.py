@@ -125,7 +125,7 @@ def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):
             Looking.seen += (tmp_path / "agent.json").exists()
             return True
 
-    result = train(loop, 2560, 0, hyperparams=SMALL, callbacks=[Looking()], checkpoints=tmp_path)
+    result = train(loop, 1280, 0, hyperparams=SMALL, callbacks=[Looking()], checkpoints=tmp_path)
     assert Looking.seen > 100
     assert Agent.load(tmp_path).checksum == result.agent.checksum
     assert (tmp_path / HISTORY_FILE).read_text() == history_document(result.history)
@@ -144,11 +144,11 @@ def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
             return True
 
     keeping, limit = Keeping(), truck_trailer().u_max
-    agent = train(loop, 400, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
+    agent = train(loop, 240, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
     stored = agent.model.replay_buffer
     actions = stored.actions[: stored.pos].reshape(-1, 1)
     np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
-    proposed = train(loop, 400, 0, algorithm, REPLAY).agent.model.replay_buffer
+    proposed = train(loop, 240, 0, algorithm, REPLAY).agent.model.replay_buffer
     assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
 
 

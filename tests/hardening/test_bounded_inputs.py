@@ -203,7 +203,7 @@ def documents(folder):
     }
 
 
-@pytest.mark.parametrize("name", ["plant", "certificate", "agent"])
+@pytest.mark.parametrize("name", ["plant", "certificate", pytest.param("agent", marks=pytest.mark.slow)])
 def test_what_is_said_of_a_document_with_long_texts_is_short(name, tmp_path):
     pytest.importorskip("stable_baselines3")
     document, load = documents(tmp_path)[name]

@@ -160,7 +160,8 @@ def test_plants_are_the_same_numbers_under_other_kernels_and_their_certificates_
 
 
 @on_x86
-@pytest.mark.parametrize("wide", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 def test_operating_points_that_are_found_are_the_same_under_other_kernels(wide):
     expected = {name: plant.fingerprint for name, plant in plants_around_points().items()}

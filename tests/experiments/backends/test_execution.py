@@ -32,7 +32,7 @@ def stored(folder):
     return sorted(path.stem for path in (folder / "runs").glob("*.json"))
 
 
-@pytest.mark.cases(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [2, 1])
 def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, certificate, tmp_path):
     runs = [training_run(certificate, arm="random", policy_kind="random", index=index) for index in range(3)]
@@ -43,6 +43,7 @@ def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, cer
     assert results[0].episodes != results[1].episodes
 
 
+@pytest.mark.slow
 def test_finished_runs_are_kept_and_not_executed_again(tmp_path, capsys):
     runs = [Small(name, "work", tmp_path) for name in "abc"]
     with pytest.warns(UserWarning, match=r"[ab] warns"):
@@ -69,6 +70,7 @@ def test_first_failure_stops_the_others_is_named_and_keeps_what_is_finished(tmp_
     assert stored(tmp_path) == ["a"]
 
 
+@pytest.mark.slow
 def test_dead_worker_costs_its_own_run_only(tmp_path):
     runs = [Small("a", "die", tmp_path), Small("b", "work", tmp_path, awaits="a began"), Small("c", "work", tmp_path)]
     with (
@@ -99,7 +101,9 @@ def command(folder):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sessions are POSIX's")
-@pytest.mark.parametrize(("send", "number"), [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("send", "number"), [(os.killpg, signal.SIGINT), pytest.param(os.kill, signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_stop_keeps_what_is_finished_and_is_one_line(send, number, tmp_path):
     process = command(tmp_path)
     send(process.pid, number)  # Ctrl-C reaches the whole group
@@ -111,6 +115,7 @@ def test_stop_keeps_what_is_finished_and_is_one_line(send, number, tmp_path):
     assert stored(tmp_path) == ["a"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc"), reason="processes are looked up in /proc")
 def test_workers_end_when_their_parent_is_killed(tmp_path):
     process = command(tmp_path)

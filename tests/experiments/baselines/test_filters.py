@@ -183,7 +183,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(kind, cer
     assert found >= 5
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", ["angle", "rates", "coupled"])
 @pytest.mark.parametrize("margin", [0.0, 0.2])
 def test_predictive_filter_keeps_limits_with_two_ends_and_of_states_and_inputs_together(name, margin):

@@ -109,7 +109,10 @@ def test_arms_with_and_without_training_are_compared_where_limits_have_two_ends(
     small = ("--hyperparams", "n_steps=16", "n_envs=2", "batch_size=32", "n_epochs=1")
     arms = ("unshielded", "shielded")
     baselines = ("zero input", "K x_hat", "random", "lqr+shielded", "lqr+psf:20", "mpc")
-    run = ncs("compare", *tank, *short, *small, "--arms", *arms, "--baselines", *baselines, "--out", "c", cwd=folder)
+    with without_pictures():
+        run = ncs(
+            "compare", *tank, *short, *small, "--arms", *arms, "--baselines", *baselines, "--out", "c", cwd=folder
+        )
     assert run.returncode == 0, run.stderr
     arms = json.loads((folder / "c" / "summary.json").read_text())
     assert set(arms["references"]) == set(baselines)
@@ -169,13 +172,12 @@ def test_synthesis_ends_after_a_minute_unless_another_limit_is_given(tmp_path):
     assert SynthesizeSettings().time_limit == 60.0
 
 
-def test_plant_of_a_file_under_a_contract(tmp_path):
-    random_plant(3, 3, 2).save(tmp_path / "plant.json")
-    asked = ("--plant", "plant.json", "--max-age", 2, "--quantization-step", 0.001)
+def test_plant_of_a_file_under_a_contract(plant_file, tmp_path):
+    asked = ("--plant", plant_file.name, "--max-age", 2, "--quantization-step", 0.001)
     assert ncs("synthesize", *asked, cwd=tmp_path).returncode == 0
     contract = Certificate.load(tmp_path / "certificate.json").contract
     assert (contract.max_age, contract.quantization_step) == (2, 0.001)
-    alone = ncs("synthesize", "--plant", "plant.json", "--quantization-step", 0.001, cwd=tmp_path)
+    alone = ncs("synthesize", "--plant", plant_file.name, "--quantization-step", 0.001, cwd=tmp_path)
     assert_one_sentence(alone, "give --max-age, too")
 
 

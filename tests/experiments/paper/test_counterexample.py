@@ -39,7 +39,8 @@ def test_counterexample_is_one_in_exact_arithmetic_with_a_disturbance_of_the_pri
     assert step.confirmed
 
 
-def test_row_about_every_error_uses_the_printed_box():
+def test_row_about_every_error_uses_the_printed_box(monkeypatch):
+    monkeypatch.setitem(worst_step.__kwdefaults__, "starts", 20)
     text = invariance(CASE).computed
     d = [float(v) for v in text.split("d = [")[1].split("]")[0].split(",")]
     assert (np.abs(d) <= [0.02, 0.01]).all()

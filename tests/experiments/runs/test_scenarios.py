@@ -124,16 +124,20 @@ def test_random_policy_acts_alike_under_every_scenario(certificate):
         (-0.0123, None, "-0.012 [n/a]"),
     ],
 )
-def test_small_returns_are_printed_with_two_significant_digits(results, mean, half, text):
+def test_small_returns_are_printed_with_two_significant_digits(mean, half, text):
     interval = None if half is None else [mean - half, mean + half]
-    summary = arm_summary([results["lqr"]], None, fixed_policy=True)
+    summary = arm_summary([run("lqr")], None, fixed_policy=True)
     summary |= {"eval_return_mean": mean, "eval_return_ci95": interval}
     printed = summary_text({"lqr": summary}, {})
     assert printed.endswith(f" {text}")
     assert max(map(len, printed.splitlines())) <= 100
 
 
-def test_summary_and_table_have_a_block_per_scenario(results):
+def test_summary_and_table_have_a_block_per_scenario():
+    results = {name: run(name) for name in ("lqr", "lqr+trusting", "lqr+shielded")}
+    for name, result in results.items():
+        count = 5 if name == "lqr+trusting" else 0
+        result.scenarios["worst-case disturbance"] = run(name, violations=(count, count)).episodes
     modes = {"lqr": None, "lqr+trusting": "trusting", "lqr+shielded": "project"}
     arms = {name: arm_summary([results[name]], mode, fixed_policy=True) for name, mode in modes.items()}
     json.dumps(arms, allow_nan=False)

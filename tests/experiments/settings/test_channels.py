@@ -35,7 +35,7 @@ def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period
     own, rng = Channel(send_period=period), np.random.default_rng(0)
     channel = changed_channel(own, {"loss": loss, "burst_length": length})
     link, states = ChannelState(channel, rng), []
-    for step in range(1, 200_000):
+    for step in range(1, 80_000):
         if link.sends_at(step):
             states.append(not link.exchange(rng, step, np.zeros(1)))
         else:

@@ -38,6 +38,11 @@ def test_factories_carry_metadata():
     assert ncs_gym.registration.TRUCK_TRAILER.metadata == NCSEnv.metadata
 
 
+def test_environments_of_an_id_share_its_plant_which_is_made_once():
+    alone, many = gym.make("ncs_gym/CartPole-v0"), gym.make_vec("ncs_gym/CartPole-v0", num_envs=2)
+    assert alone.unwrapped.plant is many.unwrapped.plant is gym.make("ncs_gym/CartPoleTwoWay-v0").unwrapped.plant
+
+
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("noise", ["truncated", "gaussian"])
 def test_same_seed_gives_the_same_trajectory_info_included(env_id, noise):

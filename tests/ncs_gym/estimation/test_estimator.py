@@ -162,7 +162,7 @@ def test_partial_measurements_keep_being_used():
     assert np.mean(np.array(ages) == 0) > 0.99
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("current", [30.0, 300.0, np.inf])
 @pytest.mark.parametrize("channel", [Channel(), CHANNELS[1]])
 def test_samples_are_used_however_wide_the_box_of_another_state_is(current, channel):

@@ -127,23 +127,29 @@ def test_plants_of_any_size_are_drawn(n, m):
     assert count(env.render(), theme.SAFE_FILL, theme.PLANE) > 1000
 
 
-def test_numbers_around_an_operating_point_are_absolute(monkeypatch):
+@pytest.fixture
+def words_drawn(monkeypatch):
+    """Every text that is drawn."""
+    drawn, draw = [], Canvas.text
+
+    def text(canvas, words, *place, **style):
+        drawn.append(words)
+        return draw(canvas, words, *place, **style)
+
+    monkeypatch.setattr(Canvas, "text", text)
+    return drawn
+
+
+def test_numbers_around_an_operating_point_are_absolute(words_drawn):
     common = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "gamma": 1e-4}
     limits = {"state_limits": ([0.2, -3.0], [2.0, 1.0]), "operating_state": [1.1587, -0.5]}
     limits |= {"input_limits": (0.0, 1.0), "operating_input": [0.25]}
     names = {"state_names": ("level", "heat"), "state_units": ("m", ""), "input_names": ("pump",)}
     env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(**common, **limits, **names))
-    written, draw = [], Canvas.text
-
-    def text(canvas, words, *place, **style):
-        written.append(words)
-        return draw(canvas, words, *place, **style)
-
-    monkeypatch.setattr(Canvas, "text", text)
     env.reset(seed=0, options={"state": [0.1, 0.25]})
     env.render()
-    assert {"level", "+1.259 m", "heat", "\N{MINUS SIGN}0.25", "pump", "+0.250"} <= set(written)
-    assert {"level [m]", "0.2", "1.1", "2", "heat", "\N{MINUS SIGN}3", "\N{MINUS SIGN}1", "1"} <= set(written)
+    assert {"level", "+1.259 m", "heat", "\N{MINUS SIGN}0.25", "pump", "+0.250"} <= set(words_drawn)
+    assert {"level [m]", "0.2", "1.1", "2", "heat", "\N{MINUS SIGN}3", "\N{MINUS SIGN}1", "1"} <= set(words_drawn)
 
 
 @pytest.mark.parametrize(("factor", "named"), [(1.0, ("level", "m")), (100.0, ("output", "")), (-0.5, ("output", ""))])
@@ -167,25 +173,18 @@ def test_axis_of_a_state_without_a_limit_reaches_as_far_as_inputs_do():
 
 
 @pytest.mark.parametrize("states", [1, 2])
-def test_past_inputs_are_not_drawn(monkeypatch, states):
+def test_past_inputs_are_not_drawn(words_drawn, states):
     limits = {"state_limits": (0.2, 2.0), "operating_state": np.ones(states), "input_limits": (0.0, 1.0)}
     own = {"A": 0.8 * np.eye(states), "B": np.full((states, 1), 0.4), "dt": 20.0, "gamma": 1e-4, "operating_input": 0.5}
     plant = linear_plant(**own, **limits, input_delay=1, du_max=0.6, input_names=("valve",))
     env = safety_shield(make("ncs_gym/LinearNCS-v0", plant=plant), certificate_of(plant, None, "polytope"))
-    written, draw = [], Canvas.text
-
-    def text(canvas, words, *place, **style):
-        written.append(words)
-        return draw(canvas, words, *place, **style)
-
-    monkeypatch.setattr(Canvas, "text", text)
     env.reset(seed=0)
     env.step(np.ones(1, np.float32))
     env.render()
-    assert not [words for words in written if "ago" in words or "more state" in words]
-    assert {"x1", "step 1", "20 s"} <= set(written)
-    assert ("time [steps]" in written) == (states == 1)
-    assert written.count("x2") == 2 * (states == 2)  # a bar and an axis
+    assert not [words for words in words_drawn if "ago" in words or "more state" in words]
+    assert {"x1", "step 1", "20 s"} <= set(words_drawn)
+    assert ("time [steps]" in words_drawn) == (states == 1)
+    assert words_drawn.count("x2") == 2 * (states == 2)  # a bar and an axis
 
 
 @pytest.mark.parametrize(
@@ -512,6 +511,7 @@ def test_human_mode_shows_every_step_and_closes(monkeypatch):
     env.close()
 
 
+@pytest.mark.slow
 def test_images_need_no_display_and_leave_the_driver_alone(monkeypatch):
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     code = """if True:

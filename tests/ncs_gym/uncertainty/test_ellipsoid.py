@@ -218,6 +218,7 @@ def test_joined_ellipsoid_holds_both_and_touches_each(n):
     np.testing.assert_allclose(joined(first, flat), first)
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("size", [1, 2, 4])
 @pytest.mark.parametrize("seed", [0, 3])
 def test_points_outside_a_sum_are_found_as_by_minimization(seed, size):

@@ -228,7 +228,7 @@ def rewriting(kind):
 
 
 @pytest.mark.parametrize("rewrite", REWRITES)
-@pytest.mark.parametrize("autoreset", [None, "NextStep", "SameStep"])
+@pytest.mark.parametrize("autoreset", [None, pytest.param("NextStep", marks=pytest.mark.slow), "SameStep"])
 def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, autoreset, rewrite):
     if autoreset is None:
         make, shield, layer = gym.make, safety_shield, rewriting(gym.Wrapper)
