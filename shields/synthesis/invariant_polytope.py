@@ -28,8 +28,8 @@ from shields.verification import ACTION_ROUNDING
 # published plant that has a polytope. They are counted, not timed: the speed of a machine decides no certificate.
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
-# and for what others imply only up to some part of it. Where the first makes too many rows, a larger one makes fewer.
-MARGINS = (1e-6, 2e-5)
+# and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer.
+MARGINS = (1e-6, 2e-5, 2e-4)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 # In the details of an `Infeasible`: it is the limits of rows that end the search.
@@ -116,12 +116,16 @@ def _is_too_large(infeasible: Infeasible) -> bool:
 
 
 def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float) -> Polytope:
-    """Returns what `invariant_polytope` does, of rows that cut by more than `implied`."""
+    """Returns what `invariant_polytope` does, of rows that cut by more than `implied`.
+
+    A state along which it would have no end gets the limit within which its gain was sought.
+    """
     kept = len(step.plant.box)
     faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
     extents = _extents(faces) if step.has_free_states else np.ones(step.plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
-        step.widths = step.widths * extents
+        step.limited = np.isinf(extents)
+        step.widths = step.widths * np.where(step.limited, 1.0, extents)
         faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
     return _rounded(step, _faces_that_count(faces, kept, progress, implied))
 
@@ -327,10 +331,11 @@ class _ClosedLoop:
         self._K, self._errors, self._D, self.rest = feedback
         self.widths = units_of_states(plant, self.rest)
         self.has_free_states = self.widths is not plant.half_widths
+        self.limited = np.zeros(plant.n, bool)
         self.next = plant.A + plant.B @ self._K
 
     def first_faces(self) -> Faces:
-        """Returns the faces of the box, of the input limits and of limits within a step.
+        """Returns the faces of the box, of input limits, of limits within a step, and of those of `limited` states.
 
         Raises:
             Infeasible: If errors of the estimate alone take an input beyond its limit, or the rest is not inside.
@@ -353,7 +358,8 @@ class _ClosedLoop:
                 "that answers less, leave room"
             )
         faces = box.followed_by(inputs).followed_by(in_half_ranges(within.images, low, high))
-        return faces._replace(rows=faces.rows * self.widths)
+        own, ones = np.eye(plant.n)[self.limited], np.ones(np.count_nonzero(self.limited))
+        return faces._replace(rows=faces.rows * self.widths).followed_by(Faces(own, -ones, ones))
 
     def predecessor(self, faces: Faces) -> Faces:
         """Returns what states have to fulfil so that the next ones fulfil rows.
@@ -419,10 +425,9 @@ def _too_many() -> Infeasible:
 
 
 def _extents(faces: Faces) -> np.ndarray:
-    """Returns how far every coordinate reaches in a polytope, shape (n,); 1 where it has no end."""
+    """Returns how far every coordinate reaches in a polytope, shape (n,); infinite where it has no end."""
     within = Extremes(faces)
-    extents = np.abs([within.of(row) for row in np.eye(faces.rows.shape[1])]).max(axis=1)
-    return np.where(np.isfinite(extents), extents, 1.0)
+    return np.abs([within.of(row) for row in np.eye(faces.rows.shape[1])]).max(axis=1)
 
 
 def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:
