@@ -29,15 +29,15 @@ from shields.verification import ACTION_ROUNDING
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
 # and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer.
-MARGINS = (1e-6, 2e-5, 2e-4)
+MARGINS = (1e-6, 2e-5, 6e-5, 2e-4)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 # In the details of an `Infeasible`: it is the limits of rows that end the search.
 _TOO_LARGE = "too_large"
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
-# Where fewer rows than this share of the most are left of a search that has too many, it goes on.
-_LEAST_PRUNED = 0.9
+# A search that had too many rows has too many again once it has grown by this factor.
+_GROWN = 1.1
 # Significant digits of rows and multipliers; what a row lacks by that is far below the margin.
 _DIGITS = 10
 # Points at which the share of the box is counted: the third digit is right.
@@ -172,16 +172,16 @@ def _faces_that_cut(
         )
     faces, _ = _without_implied(faces, kept, implied)
     within = Extremes(faces)
-    following = followed = 0
+    following, followed, most = 0, 0, MOST_ROWS
     while following < len(within.faces.rows):
         if following < kept and not any(_cuts_others(within, following, implied)):
             following += 1
             continue
-        if len(within.faces.rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
+        if len(within.faces.rows) > most:  # what later ones imply leads nowhere else, either
             faces, following = _without_implied(within.faces, kept, implied, following)
-            if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
+            if len(faces.rows) > MOST_ROWS:
                 raise _too_many()
-            within = Extremes(faces)
+            within, most = Extremes(faces), max(MOST_ROWS, int(_GROWN * len(faces.rows)))
         if followed >= MOST_FOLLOWED:
             raise _too_large(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
         if following % 50 == 0:

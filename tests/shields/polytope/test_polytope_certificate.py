@@ -183,7 +183,7 @@ def slow_plant():
     )
 
 
-@pytest.mark.parametrize(("rows", "coarser", "share"), [(40, 1, 0.959), (25, 2, 0.956)])
+@pytest.mark.parametrize(("rows", "coarser", "share"), [(40, 1, 0.959), (20, 2, 0.959), (12, 3, 0.956)])
 def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(
     monkeypatch, rows, coarser, share
 ):
