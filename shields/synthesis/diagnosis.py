@@ -20,6 +20,7 @@ from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.invariant_polytope import Feedback
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.polytope_gain import (
+    HOPELESS,
     ellipsoid_margin,
     most_tolerant_gain,
     needs_of,
@@ -36,9 +37,6 @@ from shields.synthesis.search import Progress
 
 # Digits of the share of the radii that is named.
 _SHOWN_DIGITS = 3
-# Where the ellipsoid's gain bears less of the radii than this with a polytope no better gain is sought: searches have
-# gained an eighth.
-_HOPELESS = 0.8
 # Of contracts, where there is none, none for older samples is named [steps].
 _OLDEST_NAMED = 32
 # For so many ages that a quick search found feasible a certificate is sought.
@@ -266,7 +264,7 @@ def _tolerance_around(plant: LinearPlant, contract: ChannelContract | None, enou
         best = max(best, tolerance(K, at_least), key=lambda each: each.margin)
         if best.margin >= enough:
             return best
-    if start is None or best.margin < _HOPELESS:
+    if start is None or best.margin < HOPELESS:
         return best
     K = problem.to_physical(start.L, most_tolerant_gain(problem, start, SUFFICIENT_MARGIN).K)[1]
     return max(best, tolerance(K), key=lambda each: each.margin)
@@ -288,6 +286,6 @@ def _margin(problem: DesignProblem, *, polytope: bool, input_limits: bool = True
     if not polytope or of_ellipsoid >= enough:
         return of_ellipsoid
     at_hand = max(of_ellipsoid, polytope_margin(problem, gain.K, input_limits=input_limits))
-    if not input_limits or at_hand < _HOPELESS:
+    if not input_limits or at_hand < HOPELESS:
         return at_hand
     return max(at_hand, most_tolerant_gain(problem, gain, enough).margin)

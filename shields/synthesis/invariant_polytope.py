@@ -27,16 +27,16 @@ from shields.verification import ACTION_ROUNDING
 # published plant that has a polytope. They are counted, not timed: the speed of a machine decides no certificate.
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
-# and for what others imply only up to some part of it. Where the first makes too many rows, a larger one makes fewer.
-MARGINS = (1e-6, 2e-5)
+# and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer.
+MARGINS = (1e-6, 2e-5, 6e-5, 2e-4)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 # In the details of an `Infeasible`: it is the limits of rows that end the search.
 _TOO_LARGE = "too_large"
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
-# Where fewer rows than this share of the most are left of a search that has too many, it goes on.
-_LEAST_PRUNED = 0.9
+# A search that had too many rows has too many again once it has grown by this factor.
+_GROWN = 1.1
 # Significant digits of rows and multipliers; what a row lacks by that is far below the margin.
 _DIGITS = 10
 # Points at which the share of the box is counted: the third digit is right.
@@ -115,12 +115,16 @@ def _is_too_large(infeasible: Infeasible) -> bool:
 
 
 def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float) -> Polytope:
-    """Returns what `invariant_polytope` does, of rows that cut by more than `implied`."""
+    """Returns what `invariant_polytope` does, of rows that cut by more than `implied`.
+
+    A state along which it would have no end gets the limit within which its gain was sought.
+    """
     kept = len(step.plant.box)
     faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
     extents = _extents(faces) if step.has_free_states else np.ones(step.plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
-        step.widths = step.widths * extents
+        step.limited = np.isinf(extents)
+        step.widths = step.widths * np.where(step.limited, 1.0, extents)
         faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
     return _rounded(step, _faces_that_count(faces, kept, progress, implied))
 
@@ -167,16 +171,16 @@ def _faces_that_cut(
         )
     faces, _ = _without_implied(faces, kept, implied)
     within = Extremes(faces)
-    following = followed = 0
+    following, followed, most = 0, 0, MOST_ROWS
     while following < len(within.faces.rows):
         if following < kept and not any(_cuts_others(within, following, implied)):
             following += 1
             continue
-        if len(within.faces.rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
+        if len(within.faces.rows) > most:  # what later ones imply leads nowhere else, either
             faces, following = _without_implied(within.faces, kept, implied, following)
-            if len(faces.rows) > _LEAST_PRUNED * MOST_ROWS:
+            if len(faces.rows) > MOST_ROWS:
                 raise _too_many()
-            within = Extremes(faces)
+            within, most = Extremes(faces), max(MOST_ROWS, int(_GROWN * len(faces.rows)))
         if followed >= MOST_FOLLOWED:
             raise _too_large(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
         if following % 50 == 0:
@@ -326,10 +330,11 @@ class _ClosedLoop:
         self._K, self._errors, self._D, self.rest = feedback
         self.widths = units_of_states(plant, self.rest)
         self.has_free_states = self.widths is not plant.half_widths
+        self.limited = np.zeros(plant.n, bool)
         self.next = plant.A + plant.B @ self._K
 
     def first_faces(self) -> Faces:
-        """Returns the faces of the box, of the input limits and of limits within a step.
+        """Returns the faces of the box, of input limits, of limits within a step, and of those of `limited` states.
 
         Raises:
             Infeasible: If errors of the estimate alone take an input beyond its limit, or the rest is not inside.
@@ -352,7 +357,8 @@ class _ClosedLoop:
                 "that answers less, leave room"
             )
         faces = box.followed_by(inputs).followed_by(in_half_ranges(within.images, low, high))
-        return faces._replace(rows=faces.rows * self.widths)
+        own, ones = np.eye(plant.n)[self.limited], np.ones(np.count_nonzero(self.limited))
+        return faces._replace(rows=faces.rows * self.widths).followed_by(Faces(own, -ones, ones))
 
     def predecessor(self, faces: Faces) -> Faces:
         """Returns what states have to fulfil so that the next ones fulfil rows.
@@ -418,10 +424,9 @@ def _too_many() -> Infeasible:
 
 
 def _extents(faces: Faces) -> np.ndarray:
-    """Returns how far every coordinate reaches in a polytope, shape (n,); 1 where it has no end."""
+    """Returns how far every coordinate reaches in a polytope, shape (n,); infinite where it has no end."""
     within = Extremes(faces)
-    extents = np.abs([within.of(row) for row in np.eye(faces.rows.shape[1])]).max(axis=1)
-    return np.where(np.isfinite(extents), extents, 1.0)
+    return np.abs([within.of(row) for row in np.eye(faces.rows.shape[1])]).max(axis=1)
 
 
 def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:

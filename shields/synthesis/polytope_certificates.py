@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -35,10 +36,17 @@ from shields.synthesis.invariant_polytope import (
     share_of_points,
 )
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.polytope_gain import most_tolerant_gain, needs_of, regulators
+from shields.synthesis.polytope_gain import (
+    HOPELESS,
+    more_tolerant_gain,
+    most_tolerant_gain,
+    needs_of,
+    regulators,
+)
 from shields.synthesis.resting_point import (
     Farthest,
     at_operating_point,
+    distances,
     farthest_equilibrium,
     farthest_from_limits,
     improved,
@@ -160,7 +168,7 @@ def around_resting_point(
 
     The gain is sought within symmetric limits around the equilibrium that is farthest from all limits, or around a
     fixed one; where the share of the box is known, a better resting point then. One polytope is sought for each of the
-    `_MOST_SOUGHT` first gains.
+    `_MOST_SOUGHT` first gains, then for one that tolerates more than they do.
 
     Args:
         plant: The plant.
@@ -174,12 +182,37 @@ def around_resting_point(
     """
     progress("resting point")
     reasons: list[str] = []
-    for each in _different(fallbacks_around(plant, contract, progress, fixed, known), plant)[:_MOST_SOUGHT]:
+    fallbacks = _different(fallbacks_around(plant, contract, progress, fixed, known), plant)
+    for each in chain(fallbacks[:_MOST_SOUGHT], more_tolerant(fallbacks, plant, progress, fixed)):
         try:
             return _certified_polytope(plant, each.K, contract, progress, each.rest)
         except _NOT_CERTIFIED as failure:
             reasons.append(_reason_of(failure))
     raise Infeasible(reasons[0] if reasons else "no gain was found", "P", 0.0)
+
+
+def more_tolerant(
+    fallbacks: Sequence[Feedback], plant: LinearPlant, progress: Progress, fixed: Rest | None
+) -> Iterator[Feedback]:
+    """Yields a fallback that bears larger radii than given ones, around a fixed point or the one that suits it.
+
+    None where these bear so little that a search has never made up for it.
+    """
+
+    def margin_of(scaled: np.ndarray) -> float:
+        needs = needs_of(first._replace(K=scaled * units), plant)
+        if needs is None:
+            return 0.0
+        return (distances(plant, fixed) / needs).min() if fixed else farthest_equilibrium(plant, needs).distance
+
+    if not fallbacks:
+        return
+    first, units = fallbacks[0], plant.input_half[:, None] / plant.half_widths
+    best = max((each.K / units for each in fallbacks), key=margin_of)
+    if margin_of(best) >= HOPELESS:
+        progress("gain that tolerates more")
+        K = more_tolerant_gain(best, margin_of).K * units
+        yield first._replace(K=K, rest=fixed or farthest_equilibrium(plant, needs_of(first._replace(K=K), plant)).rest)
 
 
 def fallbacks_around(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +20,9 @@ from shields.synthesis.max_margin_gain import MaxMarginGain
 _INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 # The search for the most tolerant gain tries at most so many gains per entry, fewer where it is asked often, and so
 # many in all.
-_TRIES_PER_ENTRY, _FEW_TRIES_PER_ENTRY, _MOST_TRIES = 25, 8, 200
+_TRIES_PER_ENTRY, _FEW_TRIES_PER_ENTRY, MOST_TRIES = 25, 8, 200
+# From a gain that bears less of the radii than this no better one is sought: searches have gained an eighth.
+HOPELESS = 0.8
 # Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones;
 # over no more steps than the second number.
 _LEFT_OVER, _MOST_STEPS = 1e-7, 4000
@@ -66,18 +70,31 @@ def most_tolerant_gain(problem: DesignProblem, start: MaxMarginGain, enough: flo
         start: The gain that keeps an ellipsoid for the largest radii.
         enough: The search ends once the radii may grow by this factor; one that has such an end is a short one.
     """
+    tries = (_TRIES_PER_ENTRY if enough == np.inf else _FEW_TRIES_PER_ENTRY) * start.K.size
+    return more_tolerant_gain(start.K, partial(polytope_margin, problem), enough, min(tries, MOST_TRIES))
+
+
+def more_tolerant_gain(
+    K: np.ndarray, margin_of: Callable[[np.ndarray], float], enough: float = np.inf, tries: int = MOST_TRIES
+) -> TolerantGain:
+    """Returns a gain of larger margin, by Nelder and Mead's search from a given one, shape (m, n).
+
+    Args:
+        K: The given one.
+        margin_of: The margin of a gain.
+        enough: The search ends once the margin is as large.
+        tries: The margins of so many gains are computed at most.
+    """
 
     def loss(entries: np.ndarray) -> float:
-        return -polytope_margin(problem, entries.reshape(start.K.shape))
+        return -float(exact.rounded(margin_of(entries.reshape(K.shape)), _DIGITS))
 
     def stop(intermediate_result: OptimizeResult) -> None:
         if -intermediate_result.fun >= enough:
             raise StopIteration
 
-    tries = (_TRIES_PER_ENTRY if enough == np.inf else _FEW_TRIES_PER_ENTRY) * start.K.size
-    options = {"maxfev": min(tries, _MOST_TRIES)}
-    found = minimize(loss, start.K.ravel(), method="Nelder-Mead", callback=stop, options=options)
-    return TolerantGain(found.x.reshape(start.K.shape), float(-found.fun))
+    found = minimize(loss, K.ravel(), method="Nelder-Mead", callback=stop, options={"maxfev": tries})
+    return TolerantGain(found.x.reshape(K.shape), float(-found.fun))
 
 
 def ellipsoid_margin(problem: DesignProblem, gain: MaxMarginGain, *, input_limits: bool = True) -> float:
