@@ -582,7 +582,7 @@ def gains_taken(env_id: str, episodes: int, seed: int = 0) -> Counter[str]:
     env = ncs_env(gym.make(env_id, terminate_on_violation=False))
     histories = histories_of(env.plant, env.channel, env.error_set)
     counts = count_gains(env, histories)
-    env._estimator = Estimator(env.plant, env.channel, histories=histories)
+    env._now.estimator = Estimator(env.plant, env.channel, histories=histories)
     env.action_space.seed(seed)
     for episode in range(episodes):
         env.reset(seed=seed + episode)

@@ -357,8 +357,8 @@ def _attacked(env: NCSEnv, process: Any, certificate: Any, episodes: int, seed: 
         now = {
             "set": ~(certificate.safe_set.gauge(info["state"]) <= 1.0),
             "box": info["cost"] > 0.0,
-            "alarm": many._estimator.alarm,
-            "simulation": many._process.alarm,
+            "alarm": many._now.estimator.alarm,
+            "simulation": many._now.process.alarm,
         }
         for name, seen in now.items():
             first[name] = np.where(seen, np.minimum(first[name], step), first[name])

@@ -64,7 +64,7 @@ class Asking:
     @property
     def age(self) -> np.ndarray:
         """Steps since the newest sample used was taken, shape (N,)."""
-        return self._inner.known.age
+        return self._inner.belief.age
 
     @property
     def waiting(self) -> np.ndarray:
@@ -74,7 +74,7 @@ class Asking:
     @cached_property
     def margin(self) -> np.ndarray:
         """How far inside S the proposed inputs keep the next state, shape (N,): `Decision.margin`."""
-        known, given = self._inner.known, self._shield.filter
+        known, given = self._inner.belief, self._shield.filter
         sets = given.test.reachable(np.array(known.estimate, order="C"), given.errors_of_many(known.error_shape))
         plant = self._inner.plant
         return sets.margins(plant.input_half[:, None] * self.proposed.T + plant.input_middle[:, None])[1]

@@ -9,39 +9,26 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
-from ncs_gym.envs.info import Constraints, Known, loop_info
+from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop_settings import (
-    CHANNELS,
-    expect,
-    loop_contracts,
-    require_suitable,
-    start_option,
-    starting_set,
-)
+from ncs_gym.envs.loop import Belief, Loop, OneLoop
+from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
-from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract, largest_age
-from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
-from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.network.packet_reception import UnusedPacketsWarning
-from ncs_gym.network.requests import Requested, Requests, require_on_request
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.downlink import DownlinkProtocol, Inputs, no_inputs
+from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.plant_step import PlantSimulation
-from ncs_gym.processes.process import LinearProcess, Process, as_process, own_process
+from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
+from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, as_flag, setting, shown, warn_caller
+from ncs_gym.validation import as_count, as_flag, setting, shown
 
-# Keeps the rounding of a sampled start inside the initial set.
-SAMPLE_ROUNDING = 1e-9
 # The steps the observation space is sized for are gone through one by one.
 DEFAULT_HORIZON, LONGEST_HORIZON = 200, 100_000
 RENDER_MODES = ["human", "rgb_array"]
@@ -163,24 +150,28 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
     observation_space: Box
     action_space: Box
-    plant: LinearPlant = setting("plant")
-    channel: Channel = setting("channel")
+    loop: Loop = setting("loop", "_now.loop")
+    plant: LinearPlant = setting("plant", "_now.loop.plant")
+    channel: Channel = setting("channel", "_now.loop.channel")
     task: Task = setting("task")
-    disturbance: Disturbance = setting("disturbance")
-    initial_set: Ellipsoid = setting("initial_set")
+    disturbance: Disturbance = setting("disturbance", "_now.loop.disturbance")
+    initial_set: Ellipsoid = setting("initial_set", "_now.loop.initial_set")
     terminate_on_violation: bool = setting("terminate_on_violation")
-    allow_assumption_violation: bool = setting("allow_assumption_violation")
-    contract: ChannelContract | None = setting("contract")
-    certificate_contract: ChannelContract | None = setting("certificate_contract")
-    error_set: ErrorSet = setting("error_set")
-    estimator: Estimator = setting("estimator")
+    allow_assumption_violation: bool = setting("allow_assumption_violation", "_now.loop.allow_assumption_violation")
+    contract: ChannelContract | None = setting("contract", "_now.loop.contract")
+    certificate_contract: ChannelContract | None = setting("certificate_contract", "_now.loop.certificate_contract")
+    error_set: ErrorSet = setting("error_set", "_now.loop.error_set")
+    estimator: Estimator = setting("estimator", "_now.estimator")
     horizon: int = setting("horizon")
-    noise: str = setting("noise")
+    noise: str = setting("noise", "_now.loop.noise")
     observe: tuple[str, ...] = setting("observe")
-    process: Process = setting("process", "_process_given")
-    downlink: Channel | None = setting("downlink")
-    downlink_contract: ChannelContract | None = setting("downlink_contract")
-    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_protocol")
+    process: Process = setting("process", "_now.loop.process")
+    downlink: Channel | None = setting("downlink", "_now.loop.downlink")
+    downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
+    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
+    steps: int = setting("steps", "_now.steps")
+    episodes: int = setting("episodes", "_now.episodes")
+    start: Ellipsoid | np.ndarray = setting("start", "_now.start")
 
     def __init__(
         self,
@@ -200,62 +191,34 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         downlink_contract: ChannelContract | None = None,
         observe: Sequence[str] = (),
     ) -> None:
-        self._plant = expect(plant, LinearPlant, "plant")
-        self._channel = Channel() if channel is None else expect(channel, Channel, "channel")
+        loop = Loop(
+            plant=plant,
+            channel=channel,
+            disturbance=disturbance,
+            initial_set=initial_set,
+            allow_assumption_violation=allow_assumption_violation,
+            contract=contract,
+            noise=noise,
+            process=process,
+            downlink=downlink,
+            downlink_contract=downlink_contract,
+        )
         self._task = Regulation() if task is None else expect(task, Task, "task")
         self._terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
-        self._allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
-        self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
-        self._initial_set = starting_set(initial_set, plant)
         require_suitable(self._task, plant)
-        self._process_given = own_process(plant) if process is None else as_process(process)
-        if plant.between_samples is not None and not isinstance(self._process_given, LinearProcess):
-            raise ValueError(
-                "between_samples is about the plant's own equations: beside another process= give a plant with "
-                "between_samples=1"
-            )
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
         self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
-        contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
-        self._contract, self._protocol, self._certificate_contract = contracts
-        self._oldest = largest_age(self._contract)
-        self._downlink = downlink
-        self._downlink_contract = None if downlink is None else self._protocol.contract
-        histories = arrival_histories(plant, self._channel, self._certificate_contract)
-        self._error_set = histories.recursion.error_set
-        if not histories.uses_samples:
-            step = self._channel.quantization_step
-            rounded = f", rounded to {step:g}" if step else ""
-            warn_caller(
-                f"no packet is of use: with this sensor noise{rounded}, samples move the estimate by less than 1 % of "
-                "what they differ by, so that it is a prediction",
-                UnusedPacketsWarning,
-            )
-        self._estimator = Estimator(plant, self._channel, histories=histories)
-        self._downlink_state = DownlinkState(self._protocol, plant.m)
-        self._committed = self._downlink_state.committed  # the inputs until the next decision takes effect
-        self._uplinks = uplinks([self._channel], self._channel, plant.dt)
-        self._downlinks = downlinks([downlink], self._protocol, plant.dt)
-        on_request, input_delay = self._channel.on_request, len(self._committed.pending)
-        self._requests = Requests(self._channel, self._contract, input_delay) if on_request else None
-        self._noise = as_noise(noise, plant)
-        allowed = self._allow_assumption_violation
-        self._process = PlantSimulation(
-            plant, self._disturbance, allowed, noise=self._noise, process=self._process_given
-        )
+        self._now = OneLoop(loop)
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        steps = self._horizon + len(self._committed.pending)
+        input_delay = len(self._now.pending)
         self._observe = read_observed(observe)
-        sets = self._error_set, self._initial_set
+        sets, steps = (self.error_set, self.initial_set), self._horizon + input_delay
         self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
         self._observer = Observer(self._task, self.observation_space, self._observe, self._horizon)
-        self._worst_is_now = plant.between_samples is None and not len(plant.mixed_rows)
-        self.steps = self.episodes = 0
-        self.start: Ellipsoid | np.ndarray = self._initial_set
-        self._consistent = False
+        self._consistent = self._over = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -274,37 +237,17 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If an option is unknown or wrong, or the environment cannot have the channel.
         """
-        start = start_option(options, self._plant)
-        read = [links.read((options or {}).get(name), name) for name, links in self._links()]
-        fixed = self._process.read_parameters((options or {}).get("parameters"))
+        start, now = start_option(options, self.plant), self._now
+        sources, fixed = now.read(options)
         super().reset(seed=seed)
-        read = [links.drawn(each, self.np_random) for (_, links), each in zip(self._links(), read, strict=True)]
+        sources = now.drawn(sources, self.np_random)
         self._consistent = False
         if seed is not None:
-            self._process.forget()
-        rng = self.np_random
-        initial, first = (None, start) if start is not None else (self._initial_set, self._drawn_start(rng))
-        self._state, self.start = self._process.start(rng, first, initial, fixed)
-        self._task_state = self._task.begin(rng, self._plant)
-        self._disturbance_memory = self._process.begin(rng)
-        for (_, links), sources in zip(self._links(), read, strict=True):
-            links.give(sources)
-            links.begin(rng)
-        self._network = channel_infos(self._uplinks, self._downlinks)
-        channel = self.episode_channel
-        self._channel_state, self._packets = ChannelState(channel, rng), 0
-        if self._requests is not None:
-            self._requests.begin(channels=[channel])
-        if (channel.delay, channel.jitter) != (self._estimator.channel.delay, self._estimator.channel.jitter):
-            self._estimator = self._estimator_for(covering([channel], self._channel))
-        self._estimator.reset(self._state + self._process.first_error(rng))
-        self._downlink_state.begin(rng, self._estimator.episode, self.episode_downlink)
-        self.steps = 0
-        self.episodes += 1
-        self._violations = 0.0
+            now.process.forget()
+        now.give(sources)
+        now.begin(self.np_random, start, fixed, self._begin_task)
         self._consistent, self._over = True, False
-        values = self._plant.values_at_start(self._state)
-        info = self._info(no_inputs(self._plant.m), values, arrived=False)
+        info = self._info(no_inputs(self.plant.m), arrived=False)
         if self.renderer is not None:
             self.renderer.begin(info, self._task_state)
         return self._observation(), info
@@ -317,38 +260,28 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, an earlier step failed half-way, or ended the episode.
         """
-        read = read_action(self._plant, action)
+        read, now = read_action(self.plant, action), self._now
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         if self._over:
             raise gym.error.ResetNeeded("the episode is over, as the step before said: call reset")
         self._consistent = False
-        rng = self.np_random
-        inputs = self._downlink_state.exchange(rng, self.steps, read[1])
-        u, before = inputs.applied, self._state
-        if self._requests is not None:
-            self._requests.decide(self._estimator.age)
-            # A sensor that has not heard whether a sample is requested takes it.
-            self._channel_state.requested = bool(self._requests.decided[0] or inputs.missing)
-        self._state = self._process.advance(rng, before, u, self.steps, self._disturbance_memory)
-        self._task_state = self._task.advance(rng, self._plant, self._task_state, u)
-        self.steps += 1
-        sends = self._channel_state.sends_at(self.steps)
-        sample = self._process.measure(rng, self._state) if sends else None
-        packets = self._channel_state.exchange(rng, self.steps, sample, self._estimator.episode)
-        self._packets += sends
-        self._estimator.advance(u, packets)
-        reward = self._task.reward_one(self._plant, self._task_state, self._state, u)
-        worst = self._plant.worst_constraint_values(before, u, self._state)
-        info = self._info(inputs, worst, arrived=bool(packets), read=read)
-        process = self._process.process
+        inputs, arrived = now.move(self.np_random, read[1], self._move_task)
+        reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
+        info = self._info(inputs, arrived=arrived, read=read)
+        process = now.process.process
         terminated = process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         truncated = process.truncated
         self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
-            sent = sent_at(self.steps, self._channel_state, packets)
-            self.renderer.record(info, self._task_state, sent)
+            self.renderer.record(info, self._task_state, sent_at(now.steps, now.network, now.received))
         return self._observation(), reward, terminated, truncated, info
+
+    def _begin_task(self) -> None:
+        self._task_state = self._task.begin(self.np_random, self.plant)
+
+    def _move_task(self, u: np.ndarray) -> None:
+        self._task_state = self._task.advance(self.np_random, self.plant, self._task_state, u)
 
     def request(self, asked: bool = True) -> None:
         """Asks for a sample in the next step, where the channel takes samples on request (docs/requests.md).
@@ -360,12 +293,12 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If the channel does not take samples on request, or what is given is no bool.
         """
-        require_on_request(self._requests).ask(asked)
+        require_on_request(self._now.requests).ask(asked)
 
     @property
     def state(self) -> np.ndarray:
         """The true state, shape (n,), a copy; only `reset(options={"state": x})` sets it."""
-        return self._state.copy()
+        return self._now.state.copy()
 
     @property
     def outstanding(self) -> int:
@@ -376,21 +309,21 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If the channel does not take samples on request.
         """
-        return int(require_on_request(self._requests).outstanding(self._estimator.age))
+        return int(require_on_request(self._now.requests).outstanding(self.estimator.age))
 
     @property
     def request_state(self) -> tuple[int, int]:
         """The age of the newest sample used, and `outstanding` [steps, samples]."""
-        return self._estimator.age, self.outstanding
+        return self.estimator.age, self.outstanding
 
     @property
     def request_limits(self) -> np.ndarray:
         """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        input_delay = len(self._committed.pending)
-        if self._contract is None:
-            most = self._horizon, max(self._channel.longest_delay + input_delay, 1)
+        input_delay, contract = len(self._now.pending), self.contract
+        if contract is None:
+            most = self._horizon, max(self.channel.longest_delay + input_delay, 1)
         else:
-            most = self._contract.max_age, self._contract.max_age + input_delay
+            most = contract.max_age, contract.max_age + input_delay
         return np.array(most, dtype=np.float64).clip(min=1.0)
 
     def render(self) -> np.ndarray | None:
@@ -415,62 +348,38 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     @property
     def episode_channel(self) -> Channel:
         """The channel of this episode."""
-        return self._uplinks.now[0]
+        return self._now.channels.now[0]
 
     @property
     def episode_downlink(self) -> Channel | None:
         """The downlink of this episode; None for an ideal one."""
-        return self._downlinks.now[0]
+        return self._now.downlinks.now[0]
 
     @property
-    def known(self) -> Known:
+    def belief(self) -> Belief:
         """What a shield decides on, read-only: no wrapper stands between."""
-        return self._known
+        return self._belief
 
     def estimates_ahead(self) -> list[tuple[np.ndarray, int]]:
         """Returns estimate and number of the error shape of now and of every step until the next decision's effect."""
-        pending = self._committed.pending
-        return [self._estimator.numbered(pending[:ahead]) for ahead in range(len(pending) + 1)]
+        return self._now.ahead()
 
     def close(self) -> None:
         """Closes the window and the process."""
-        self._process.close()
+        self._now.process.close()
         if self.renderer is not None:
             self.renderer.close()
 
-    def _links(self) -> list[tuple[str, EpisodeChannels]]:
-        return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
-
-    def _estimator_for(self, channel: Channel) -> Estimator:
-        histories = arrival_histories(self._plant, channel, self._certificate_contract)
-        return Estimator(self._plant, channel, histories=histories, after=self._estimator)
-
-    def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
-        return (1.0 - SAMPLE_ROUNDING) * self._initial_set.sample(rng)
-
     def _observation(self) -> np.ndarray:
         task_state = self._task_state
-        for u in self._committed.pending:
-            task_state = self._task.predict_one(self._plant, task_state, u)
-        return self._observer.observation(self._known, self._task.observe(task_state))
+        for u in self._now.pending:
+            task_state = self._task.predict_one(self.plant, task_state, u)
+        return self._observer.observation(self._belief, self._task.observe(task_state))
 
-    def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool, read: Any = None) -> dict[str, Any]:
-        values = worst if self._worst_is_now else self._plant.constraint_values(self._state)
-        cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
-        self._violations += cost
-        constraints = Constraints(values, worst, cost, self._violations)
-        estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
-        estimate, number = estimator.numbered(self._committed.pending)
-        (applied, committed, missing), table = inputs, estimator.table
-        age, damaged = estimator.age, estimator.damaged
-        shape, outside = table.shape(number), self._process.alarm
-        self._known = Known(estimate, shape, age, alarm, damaged, applied, committed, table, number, outside)
-        sampled = Requested(False, False, self._packets)
-        if self._requests is not None:
-            sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
-        happened = estimator.mean, self._state, self.steps, missing, arrived
-        told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant, read)
-        return loop_info(self._known, *happened, self._oldest, *told)
+    def _info(self, inputs: Inputs, *, arrived: bool, read: Any = None) -> dict[str, Any]:
+        report = self._now.report(inputs, arrived)
+        self._belief = report.belief
+        return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant, read))
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

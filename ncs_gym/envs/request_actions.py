@@ -141,7 +141,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         return self._seen(observations), rewards - self.cost * sent, terminated, truncated, info
 
     def _seen(self, observations: np.ndarray) -> np.ndarray:
-        more = np.minimum(np.stack([self._inner.known.age, self._inner.outstanding], axis=1), self._most)
+        more = np.minimum(np.stack([self._inner.belief.age, self._inner.outstanding], axis=1), self._most)
         return np.concatenate([observations, more], axis=1).astype(self.observation_space.dtype)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.info import Known
+from ncs_gym.envs.loop import Belief
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.network.downlink import Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -150,7 +150,7 @@ class Observer:
         self._low, self._high = (low[:, None], high[:, None]) if many else (low, high)
         self._axis = ", shape (entries, N)" if many else ", shape (entries,)"
 
-    def observation(self, known: Known, own: Any) -> np.ndarray:
+    def observation(self, known: Belief, own: Any) -> np.ndarray:
         """Returns entries clipped to the space, shape (entries,) or (entries, N), float32.
 
         Args:
@@ -184,7 +184,7 @@ class Observer:
                 self._warn(len(known.estimate), int(beyond[0][0]))
         return within.astype(np.float32)
 
-    def _observed(self, known: Known, name: str) -> np.ndarray:
+    def _observed(self, known: Belief, name: str) -> np.ndarray:
         if name == "age":
             return np.asarray(known.age, dtype=np.float64)[None]
         return np.sqrt(np.diagonal(known.error_shape, axis1=-2, axis2=-1)).T

@@ -10,35 +10,24 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv
-from ncs_gym.envs.episode_channels import channel_infos, covering, downlinks, uplinks
-from ncs_gym.envs.info import Constraints, Known, loop_info
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv
+from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
+from ncs_gym.envs.loop import Belief, Loop, ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, actions_of, read_actions
-from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel, widest
-from ncs_gym.network.contract import ChannelContract, largest_age
-from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
-from ncs_gym.network.packet_loss_and_delay import VectorChannelState
-from ncs_gym.network.requests import Requested, Requests, require_on_request
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.downlink import DownlinkProtocol, Inputs, no_inputs
+from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, frozen, setting, shown
-
-
-def _with_columns(values: np.ndarray, mask: np.ndarray, new: Any) -> np.ndarray:
-    """Returns an array (..., N) with others where `mask` (N,) says so, of a type that holds both."""
-    found = values.astype(np.result_type(values, new))
-    found[..., mask] = new
-    return found
 
 
 class NCSVectorEnv(SpecOfJson, VectorEnv):
@@ -75,25 +64,29 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     """
 
     single: NCSEnv = setting("single")
-    plant: LinearPlant = setting("plant")
-    channel: Channel = setting("channel")
+    loop: Loop = setting("loop", "_now.loop")
+    plant: LinearPlant = setting("plant", "_now.loop.plant")
+    channel: Channel = setting("channel", "_now.loop.channel")
     task: Task = setting("task")
-    disturbance: Disturbance = setting("disturbance", "_single.disturbance")
-    initial_set: Ellipsoid = setting("initial_set", "_single.initial_set")
+    disturbance: Disturbance = setting("disturbance", "_now.loop.disturbance")
+    initial_set: Ellipsoid = setting("initial_set", "_now.loop.initial_set")
     terminate_on_violation: bool = setting("terminate_on_violation", "_single.terminate_on_violation")
-    allow_assumption_violation: bool = setting("allow_assumption_violation", "_single.allow_assumption_violation")
+    allow_assumption_violation: bool = setting("allow_assumption_violation", "_now.loop.allow_assumption_violation")
     horizon: int = setting("horizon", "_single.horizon")
-    noise: str = setting("noise", "_single.noise")
+    noise: str = setting("noise", "_now.loop.noise")
     observe: tuple[str, ...] = setting("observe", "_single.observe")
-    process: Process = setting("process", "_single.process")
-    contract: ChannelContract | None = setting("contract")
-    certificate_contract: ChannelContract | None = setting("certificate_contract")
-    error_set: ErrorSet = setting("error_set")
-    downlink: Channel | None = setting("downlink")
-    downlink_contract: ChannelContract | None = setting("downlink_contract", "_single.downlink_contract")
-    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_protocol")
+    process: Process = setting("process", "_now.loop.process")
+    contract: ChannelContract | None = setting("contract", "_now.loop.contract")
+    certificate_contract: ChannelContract | None = setting("certificate_contract", "_now.loop.certificate_contract")
+    error_set: ErrorSet = setting("error_set", "_now.loop.error_set")
+    downlink: Channel | None = setting("downlink", "_now.loop.downlink")
+    downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
+    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
+    steps: np.ndarray = setting("steps", "_now.steps")
+    episodes: np.ndarray = setting("episodes", "_now.episodes")
+    starts: np.ndarray = setting("starts", "_now.start")
 
     def __init__(
         self,
@@ -118,69 +111,46 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             settings["horizon"] = max(own_horizon, min(self._max_episode_steps, LONGEST_HORIZON))
         settings |= {name: each and widest(each) for name, each in zip(CHANNELS, own, strict=True)}
         self._single = single = NCSEnv(**settings)
-        self._plant, self._channel, self._task = single.plant, single.channel, single.task
-        self._contract, self._error_set, self.render_mode = single.contract, single.error_set, single.render_mode
-        self._oldest = largest_age(self._contract)
+        self._task, self.render_mode = single.task, single.render_mode
         self.single_observation_space = single.observation_space
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._observer = Observer(self._task, single.observation_space, single.observe, single.horizon, many=True)
-        allowed = single.allow_assumption_violation
-        self._process = PlantSimulation(
-            self._plant, single.disturbance, allowed, self.num_envs, noise=single.noise, process=single.process
-        )
-        self._downlink, self._protocol = single.downlink, single.downlink_protocol
-        self._certificate_contract = single.certificate_contract
-        count = self.num_envs
-        dt = self._plant.dt
-        self._uplinks = uplinks(own[0] or [self._channel] * count, self._channel, dt)
-        self._downlinks = downlinks(own[1] or [None] * count, self._protocol, dt)
-        histories = arrival_histories(self._plant, self._channel, self._certificate_contract)
-        self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
-        self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
-        self._requests = None
-        if self._channel.on_request:
-            self._requests = Requests(self._channel, self._contract, self._protocol.input_delay, self.num_envs)
-        self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
-        self._state = np.zeros((self._plant.n, self.num_envs))
-        self._worst = self._plant.values_at_start(self._state)
-        self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
-        self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
-        self.starts = np.full((self.num_envs, self._plant.n), np.nan)
+        self._now = ManyLoops(single.loop, self.num_envs, *own)
+        self._done = np.zeros(self.num_envs, np.bool_)
         self.ticks, self._consistent = 0, False
-        self._known: Known
-        self._ended: tuple[np.ndarray, Known] | None = None
+        self._belief: Belief
+        self._ended: tuple[np.ndarray, Belief] | None = None
 
     @property
     def state(self) -> np.ndarray:
         """The true states, shape (N, n), a copy; only `reset(options={"state": x})` sets them."""
-        return self._state.T.copy()
+        return self._now.state.T.copy()
 
     @property
     def episode_channels(self) -> tuple[Channel, ...]:
         """The channels of the present episodes."""
-        return tuple(self._uplinks.now)
+        return tuple(self._now.channels.now)
 
     @property
     def episode_downlinks(self) -> tuple[Channel | None, ...]:
         """The downlinks of the present episodes; None for ideal ones."""
-        return tuple(self._downlinks.now)
+        return tuple(self._now.downlinks.now)
 
     @property
-    def known(self) -> Known:
+    def belief(self) -> Belief:
         """What a shield decides on, read-only: no wrapper stands between."""
-        return self._known
+        return self._belief
 
     @property
-    def ended(self) -> tuple[np.ndarray, Known] | None:
+    def ended(self) -> tuple[np.ndarray, Belief] | None:
         """With SAME_STEP, where an episode ended in the last step, shape (N,), and what was known at its end."""
         return self._ended
 
     def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), numbers (k,)."""
-        pending = self._downlink_state.committed.pending
-        return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
+        return self._now.ahead(chosen)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -198,10 +168,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         Raises:
             ValueError: If an option is unknown or wrong, or the environments cannot have the channel.
         """
-        mask, starts = vector_reset_options(options, self.num_envs, self._plant)
-        links = list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
-        read = [each.read((options or {}).get(name), name) for name, each in links]
-        fixed = self._process.read_parameters((options or {}).get("parameters"))
+        mask, starts = vector_reset_options(options, self.num_envs, self.plant)
+        sources, fixed = self._now.read(options)
         if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
             if len(seeds) != self.num_envs:
@@ -209,17 +177,15 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
         super().reset(seed=seed)
         if seed is not None:
-            self._process.forget()
+            self._now.process.forget()
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
         chosen = np.flatnonzero(mask).tolist()
-        read = [each.drawn(sources, self.np_random, chosen) for (_, each), sources in zip(links, read, strict=True)]
+        sources = self._now.drawn(sources, self.np_random, chosen)
         self._consistent, self._ended = False, None
-        for (_, each), sources in zip(links, read, strict=True):
-            each.give(sources, chosen)
+        self._now.give(sources, chosen)
         self._begin(mask, starts, fixed)
-        self._worst = np.where(mask, self._plant.values_at_start(self._state), self._worst)
-        info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
+        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
         self._draw(info, begins=mask, moved=False)
         return self._observation(), info
@@ -232,24 +198,22 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        u = read_actions(self._plant, actions, self.num_envs)[1]
+        u, now = read_actions(self.plant, actions, self.num_envs)[1], self._now
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         some_done = np.count_nonzero(self._done) > 0
         if some_done and self._autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent, self._ended = False, None
-        inputs = self._downlink_state.exchange(self.np_random, self.steps, u)
-        applied, committed, missing = inputs
-        arrived = self._advance(applied, self._requested(missing))
-        reward = self._task.reward_many(self._plant, self._task_state, self._state, applied)
+        inputs, arrived = now.move(self.np_random, u, self._move_task)
+        self.ticks += 1
+        reward = self._task.reward_many(self.plant, self._task_state, now.state, inputs.applied)
         restarted = self._done.copy() if some_done else None
         if restarted is not None:  # NEXT_STEP: the last step ended these episodes
             self._begin(restarted, None)
-            applied, committed = (frozen(np.where(restarted, 0.0, each)) for each in (applied, committed))
+            applied, committed = (frozen(np.where(restarted, 0.0, each)) for each in inputs[:2])
             reward[restarted], arrived[restarted] = 0.0, False
-            self._worst[:, restarted] = self._plant.values_at_start(self._state[:, restarted])
-            inputs = Inputs(applied, committed, missing & ~restarted)
+            inputs = Inputs(applied, committed, inputs.missing & ~restarted)
         info = self._info(inputs, arrived, None)
         terminated, truncated = self._ends(info["cost"], restarted)
         self._done = terminated | truncated
@@ -261,13 +225,16 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self._draw(info, begins=restarted)
         return observation, reward, terminated, truncated, info
 
+    def _move_task(self, u: np.ndarray) -> None:
+        self._task_state = self._task.advance_many(self.np_random, self.plant, self._task_state, u)
+
     def request(self, asked: Any = True) -> None:
         """Asks for samples in the next step, in all environments or where a mask (N,) says so; see `NCSEnv.request`.
 
         Raises:
             ValueError: If the channel does not take samples on request, or what is given is no bool.
         """
-        require_on_request(self._requests).ask(asked)
+        require_on_request(self._now.requests).ask(asked)
 
     @property
     def outstanding(self) -> np.ndarray:
@@ -276,7 +243,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         Raises:
             ValueError: If the channel does not take samples on request.
         """
-        return require_on_request(self._requests).outstanding(self._estimator.age)
+        return require_on_request(self._now.requests).outstanding(self._now.estimator.age)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
@@ -304,12 +271,12 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             renderer.begin(own, task_state)
         elif moved:
             step = int(self.steps[e])
-            sends, arrival = self._channel_state.arrival_of(e, step)
+            sends, arrival = self._now.network.arrival_of(e, step)
             renderer.record(own, task_state, PacketRecord(step, arrival) if sends else None)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the process."""
-        self._process.close()
+        self._now.process.close()
         self._single.close()
 
     def inputs_of(self, actions: np.ndarray) -> np.ndarray:
@@ -318,52 +285,12 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         Raises:
             ValueError: If one is not finite or the shape is wrong.
         """
-        return read_actions(self._plant, actions, self.num_envs)[1]
-
-    def _requested(self, missing: Any) -> np.ndarray | None:
-        """Decides the requests; returns where a sample is requested now, (N,), or None if samples are not on request.
-
-        A sensor that has not heard whether a sample is requested, where commands are missing (N,), takes it.
-        """
-        if self._requests is None:
-            return None
-        self._requests.decide(self._estimator.age)
-        return self._requests.decided[0] | missing
-
-    def _advance(self, u: np.ndarray, requested: np.ndarray | None) -> np.ndarray:
-        """Moves everything one step on; returns where packets arrived, shape (N,).
-
-        Args:
-            u: Inputs, shape (m, N).
-            requested: Where samples are requested, (N,); None if samples are not on request.
-        """
-        rng, estimator, before = self.np_random, self._estimator, self._state
-        self._state = self._process.advance(rng, before, u, self.steps, self._disturbance_memory)
-        self._worst = self._plant.worst_constraint_values(before, u, self._state)
-        self._task_state = self._task.advance_many(rng, self._plant, self._task_state, u)
-        self.steps += 1
-        self.ticks += 1
-        sends, samples = self._channel_state.send(rng, self.steps, requested), None
-        self._packets = self._packets + sends
-        if np.count_nonzero(sends):
-            samples = self._channel_state.channel.quantize(self._process.measure(rng, self._state))
-            if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
-                damaged = np.asarray(~np.isfinite(samples).all(axis=0))
-                self._channel_state.discard(damaged)
-                estimator.damaged |= sends & damaged
-                estimator.alarm |= estimator.damaged
-                samples[:, damaged] = 0.0  # times a gain of zero it is to be nothing
-        arrivals = self._channel_state.arrivals()
-        estimator.advance(u, samples, arrivals)
-        arrived = np.zeros(self.num_envs, np.bool_)
-        for _, arrives in arrivals:
-            arrived |= arrives
-        return arrived
+        return read_actions(self.plant, actions, self.num_envs)[1]
 
     def _ends(self, cost: np.ndarray, restarted: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Returns which episodes are terminated and which truncated, shape (N,) each; those that just began are not."""
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
-        process = self._process.process
+        process = self._now.process.process
         if process.terminated is not False:  # other people's environments may end
             terminated, truncated = terminated | process.terminated, truncated | process.truncated
         if self._single.terminate_on_violation:
@@ -379,43 +306,12 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
 
         `fixed` is what the process read of the parameters of a family, (N, k).
         """
-        rng, rows = self.np_random, np.flatnonzero(mask)
-        count = len(rows)
-        first_states, first_errors = self._first(count)
-        initial, states = (self._single.initial_set, first_states) if starts is None else (None, starts[mask].T)
-        states, known = self._process.start_many(rng, states, initial, mask, fixed)
-        task_state, memory = self._task.begin_many(rng, self._plant, count), self._process.begin(rng, count)
-        channels, downlinks = self._uplinks.begin(rng, rows), self._downlinks.begin(rng, rows)
-        if count == self.num_envs or not (self._uplinks.is_plain and self._downlinks.is_plain):
-            self._network = channel_infos(self._uplinks, self._downlinks, many=True)
-        if count == self.num_envs:
-            self._task_state, self._disturbance_memory = np.array(task_state), np.array(memory)
-            self._channel_state = VectorChannelState(channels or self._channel, rng, count)
-        else:
-            self._task_state = _with_columns(self._task_state, mask, task_state)
-            self._disturbance_memory = _with_columns(self._disturbance_memory, mask, memory)
-            self._channel_state.begin(rng, rows, channels)
-        self._prepare_estimator(all_begin=count == self.num_envs)
-        self._state[:, mask] = states
-        self._estimator.begin(mask, states + first_errors)
-        self._downlink_state.begin(rng, mask, downlinks)
-        if self._requests is not None:
-            self._requests.begin(mask, channels)
-        self._packets = np.where(mask, 0, self._packets)
-        self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
-        self.episodes[mask] += 1
-        self.starts[mask] = known
+        self._now.begin(self.np_random, mask, starts, fixed, self._begin_task)
+        self._done = self._done & ~mask
 
-    def _prepare_estimator(self, *, all_begin: bool) -> None:
-        """Makes the estimator one for the delays of all present channels; it forgets nothing unless all begin."""
-        known = self._estimator.histories.channel
-        used = [self._channel] if self._uplinks.is_plain else [*self._uplinks.now, *([] if all_begin else [known])]
-        if (wanted := covering(used, self._channel)) != known:
-            histories = arrival_histories(self._plant, wanted, self._certificate_contract)
-            if all_begin:
-                self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
-            else:
-                self._estimator.follow(histories)
+    def _begin_task(self, mask: np.ndarray) -> None:
+        begun = self._task.begin_many(self.np_random, self.plant, int(np.count_nonzero(mask)))
+        self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
 
     def _one_each(self, value: Any, name: str) -> list[Channel] | None:
         """Returns a channel that is given for all environments, or for each, as a list of N; None for None."""
@@ -428,59 +324,30 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             )
         return each
 
-    def _predicted_estimates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns estimates, (n, N), and numbers of error statistics, (N,), of the times of the next effects."""
-        return self._estimator.predicted(self._downlink_state.committed.pending)
-
-    def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        rng = self.np_random
-        states = (1.0 - SAMPLE_ROUNDING) * self._single.initial_set.sample(rng, count)
-        return states.T, self._process.first_error(rng, count)
-
     def _observation(self) -> np.ndarray:
         task_state = self._task_state
-        for u in self._downlink_state.committed.pending:
-            task_state = self._task.predict_many(self._plant, task_state, u)
-        return self._observer.observation(self._known, self._task.observe_many(task_state)).T
+        for u in self._now.pending:
+            task_state = self._task.predict_many(self.plant, task_state, u)
+        return self._observer.observation(self._belief, self._task.observe_many(task_state)).T
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
-        plant = self._plant
-        is_now = plant.between_samples is None and not len(plant.mixed_rows)
-        values = self._worst.copy() if is_now else plant.constraint_values(self._state)
-        cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
-        self._violations = self._violations + (cost if counted is None else cost * counted)
-        estimates, numbers = self._predicted_estimates()
-        table = self._estimator.histories.table
-        constraints = Constraints(values, self._worst, cost, self._violations.copy())
-        alarm = self._estimator.alarm | self._process.alarm
-        age, damaged, outside = self._estimator.age.copy(), self._estimator.damaged.copy(), self._process.alarm.copy()
-        applied, committed, missing = inputs
-        shapes = table.shapes.take(numbers, axis=0)
-        for array in (estimates, shapes, age, alarm, damaged, numbers, outside):
-            array.setflags(write=False)
-        self._known = Known(estimates, shapes, age, alarm, damaged, applied, committed, table, numbers, outside)
-        asked, forced = self._nothing, self._nothing
-        if self._requests is not None:
-            asked, forced = self._requests.requested, self._requests.forced
-        happened = self._estimator.mean, self._state, self.steps, missing, arrived
-        sampled = Requested(asked, forced, self._packets)
-        told = constraints, sampled, self._network | self._process.infos, actions_of(inputs, self._plant)
-        return loop_info(self._known, *happened, self._oldest, *told)
+        report = self._now.report(inputs, arrived, counted)
+        self._belief = report.belief
+        return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant))
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
         done = self._done.copy()
-        ended = self._known
+        ended = self._belief
         self._ended = frozen(done), ended
         final = {key: _where(done, value, np.zeros_like(value)) for key, value in info.items()}
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
-        self._worst = self._plant.values_at_start(self._state)
-        fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
+        fresh = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
-        self._known = self._known._replace(applied=frozen(next(inputs)), committed=frozen(next(inputs)))
+        self._belief = self._belief._replace(applied=frozen(next(inputs)), committed=frozen(next(inputs)))
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

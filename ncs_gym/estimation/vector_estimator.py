@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.estimation.arrival_histories import NO_REPLAY, ArrivalHistories
-from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN
+from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN, ErrorTable
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum_in_axes
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import CopiedWhole, frozen
@@ -49,6 +49,11 @@ class VectorEstimator(CopiedWhole):
         """Numbers of the error statistics, whose shapes are `histories.table.shapes`, shape (N,)."""
         return self.histories.present.take(self.history)
 
+    @property
+    def table(self) -> ErrorTable:
+        """The error shapes by the numbers that `numbered` returns."""
+        return self.histories.table
+
     def follow(self, histories: ArrivalHistories) -> None:
         """Goes on with a graph for more delays, that of the same plant."""
         self.histories, self.history = histories, histories.taking_over(self.histories, self.history)
@@ -86,9 +91,7 @@ class VectorEstimator(CopiedWhole):
         if arrivals:
             self._replay()
 
-    def predicted(
-        self, inputs: Sequence[np.ndarray], chosen: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def numbered(self, inputs: Sequence[np.ndarray], chosen: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimates, (n, N), and numbers of error statistics, (N,), after the next steps.
 
         Args:

@@ -3,27 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.validation import shown
-
-
-class Requested(NamedTuple):
-    """What was requested in a step; of N environments, arrays of shape (N,).
-
-    Attributes:
-        requested: Whether a sample is requested, asked for or forced.
-        forced: Whether it is requested only because the contract needs it.
-        packets: Number of samples sent in the episode so far.
-    """
-
-    requested: Any
-    forced: Any
-    packets: Any
 
 
 def spare_samples(channel: Channel, contract: ChannelContract | None) -> int | None:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym import LinearPlant
-from ncs_gym.envs.info import Known
+from ncs_gym.envs.loop import Belief
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
@@ -120,7 +120,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
-        self._report = self._observed(self._inner.known)
+        self._report = self._observed(self._inner.belief)
         nothing, none = np.zeros((self._filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
         kept = idle._replace(proved=self._state.inside)  # environments left alone keep what is proved of them
@@ -163,7 +163,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         some_restarted = np.count_nonzero(restarted) > 0
         if some_restarted:
             self._look_at({*self._inner.episode_channels})
-        known = self._inner.known
+        known = self._inner.belief
         self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)
         same_input, on_time = _as_decided(known, decided.input, due)
@@ -194,7 +194,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         self._lost.tell()
         return observation, rewards, terminated, truncated, info
 
-    def _observed(self, known: Known) -> LoopObservation:
+    def _observed(self, known: Belief) -> LoopObservation:
         errors = self._errors.many(known.table, known.number)
         seen = np.ascontiguousarray(known.estimate), errors, known.alarm, known.age, known.damaged
         return LoopObservation(*seen, known.table.certified.take(known.number), known.outside)
@@ -224,7 +224,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
         """Takes in what is known of the steps before the first decisions take effect, where episodes began."""
         earlier, no_alarm = [], np.zeros(len(chosen), np.bool_)
         for ahead, (means, numbers) in enumerate(self._inner.estimates_ahead(chosen)[:-1]):
-            errors = self._errors.many(self._inner.known.table, numbers)
+            errors = self._errors.many(self._inner.belief.table, numbers)
             inside = [
                 known_inside(self._filter, known[e][ahead], means[:, k].copy(), errors.single(k))
                 for k, e in enumerate(chosen.tolist())
@@ -237,7 +237,7 @@ class VectorSafetyShield(BaseShield[NCSVectorEnv], AroundEnvironments, VectorWra
     def _final_info(
         self,
         info: dict[str, Any],
-        ended: tuple[np.ndarray, Known],
+        ended: tuple[np.ndarray, Belief],
         state: MonitorState,
         decided: Decision,
         proposed: np.ndarray,
@@ -313,7 +313,7 @@ def _moved(before: Clock, now: Clock) -> tuple[np.ndarray, np.ndarray]:
     return restarted, once & (now.ticks == before.ticks + 1)
 
 
-def _as_decided(known: Known, decided: np.ndarray, due: np.ndarray | None) -> tuple[np.ndarray, Any]:
+def _as_decided(known: Belief, decided: np.ndarray, due: np.ndarray | None) -> tuple[np.ndarray, Any]:
     """Returns where the input taken is the one decided and, behind a downlink, the one applied the one that was due.
 
     Args:

@@ -14,7 +14,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
-from ncs_gym.envs.info import Known
+from ncs_gym.envs.loop import Belief
 from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown, warn_caller
@@ -33,9 +33,6 @@ REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation,
 
 # What the clock reads while a step is under way: after an exception nothing is proved until the next reset.
 INTERRUPTED = (-1, -1)
-
-# What of an environment a shield's proof rests on.
-PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
 
 class BaseShield(RecordConstructorArgs, Generic[E]):
@@ -90,7 +87,7 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._input_delay = inner.downlink_protocol.input_delay
         self._channels: set[Channel] = set()
-        self._made_for = self._premises(inner)
+        self._made_for = inner.loop
         if (promised := self._certificate.contract) is not None and inner.certificate_contract is None:
             warn_caller(
                 "the certificate assumes a contract of the channel, and the environment was made without one, so that "
@@ -119,18 +116,10 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
             raise ValueError(f"the shield needs an {wanted} inside, got {type(layer).__name__}")
         return layer
 
-    @staticmethod
-    def _premises(inner: Any) -> dict[str, Any]:
-        """Returns what a proof rests on, by name: the environment and its settings, of a vector those of either."""
-        single = getattr(inner, "single", inner)
-        premises = {name: getattr(single, name) for name in PREMISES}
-        of_vector = {f"{name} of the vector": getattr(inner, name, premises[name]) for name in PREMISES}
-        return {"environment": inner} | premises | of_vector
-
     def _require_same(self) -> None:
-        now = self._premises(self._environment_in(self.env))
-        for name, value in self._made_for.items():
-            if now[name] is not value:
+        now = self._environment_in(self.env)
+        for name, is_same in (("environment", now is self._inner), ("loop", now.loop is self._made_for)):
+            if not is_same:
                 why = f"the {name} is not the one that the shield was made for"
                 raise ValueError(f"{why}: wrap the environment in a shield of its own")
 
@@ -251,7 +240,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         self._require_same()
         self._look_at({self._inner.episode_channel})
-        now, clock, known, start = self._episode, self._read_clock(), self._inner.known, self._inner.start
+        now, clock, known, start = self._episode, self._read_clock(), self._inner.belief, self._inner.start
         report, errors = self._observed(known), self._monitored.errors
         ahead = self._inner.estimates_ahead()[:-1]
         earlier = [LoopObservation(mean, errors.one(known.table, number), False) for mean, number in ahead]
@@ -288,7 +277,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
             count = now.interventions + decision.intervened
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        clock, known = self._read_clock(), self._inner.known
+        clock, known = self._read_clock(), self._inner.belief
         moved_once = clock == (episode, step + 1)
         self._monitored.advance(known.applied, moved_once, self._observed(known), known.committed)
         now.interventions += decision.intervened
@@ -297,7 +286,7 @@ class SafetyShield(BaseShield[NCSEnv], gym.Wrapper):
         self._lost.tell_of(info["shield_reason"])
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
-    def _observed(self, known: Known) -> LoopObservation:
+    def _observed(self, known: Belief) -> LoopObservation:
         errors = self._monitored.errors.one(known.table, known.number)
         stays = known.table.is_certified(known.number)
         seen = known.estimate, errors, known.alarm, known.age, known.damaged

@@ -68,7 +68,7 @@ def test_what_estimators_share_cannot_be_written_to():
     many = gym.make_vec("ncs_gym/CartPole-v0", num_envs=3).unwrapped
     many.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
-        many.known.table.shapes[...] = 1e-4
+        many.belief.table.shapes[...] = 1e-4
 
 
 def test_copies_of_estimators_and_actuators_share_nothing():

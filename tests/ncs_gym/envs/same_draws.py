@@ -87,42 +87,42 @@ class ScriptedEnv(NCSEnv):
         many, index = self.many, self.index
         self.np_random = np.random.default_rng(0)
         links = {"channel": many.episode_channels[index], "downlink": many.episode_downlinks[index]}
-        super().reset(options={"state": many._state[:, index], **links})
+        super().reset(options={"state": many._now.state[:, index], **links})
         if np.isnan(many.starts[index]).any():
-            self.start = self.initial_set
-        self._process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
-        if (parameters := many._process.process.parameters) is not None:
-            self._process.process.choose(np.random.default_rng(0), None, parameters[index])
-        self.estimator.reset(many._estimator.mean[:, index])
+            self._now.start = self.initial_set
+        self._now.process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
+        if (parameters := many._now.process.process.parameters) is not None:
+            self._now.process.process.choose(np.random.default_rng(0), None, parameters[index])
+        self.estimator.reset(many._now.estimator.mean[:, index])
         self._task_state = np.copy(many._task_state[..., index])[()]
-        self._disturbance_memory = np.copy(many._disturbance_memory[..., index])[()]
-        self._channel_state = ChannelState(self.episode_channel, np.random.default_rng(0))
-        self._channel_state._loss_state = LossState(*(kept[index] for kept in many._channel_state._loss_state))
-        self._downlink_state.begin(np.random.default_rng(0))
+        self._now.memory = np.copy(many._now.memory[..., index])[()]
+        self._now.network = ChannelState(self.episode_channel, np.random.default_rng(0))
+        self._now.network._loss_state = LossState(*(kept[index] for kept in many._now.network._loss_state))
+        self._now.downlink.begin(np.random.default_rng(0))
         if self.downlink is not None:
-            states = many._downlink_state._channel_state._loss_state
-            self._downlink_state.in_flight._loss_state = LossState(*(kept[index] for kept in states))
-        self.np_random, self._violations = ScriptedGenerator(), 0.0
-        info = self._info(no_inputs(self.plant.m), self.plant.values_at_start(self._state), arrived=False)
+            states = many._now.downlink._channel_state._loss_state
+            self._now.downlink.in_flight._loss_state = LossState(*(kept[index] for kept in states))
+        self.np_random, self._now.violations = ScriptedGenerator(), 0.0
+        info = self._info(no_inputs(self.plant.m), arrived=False)
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple:
         """Steps with what the vector drew at its last step."""
         self.hear()
         result = super().step(action)
-        sends = self._channel_state.sends_at(self.steps)
+        sends = self._now.network.sends_at(self.steps)
         assert not (sends and self.np_random.numbers)  # where nothing is sent, less is drawn
         return result
 
     def go_on_from(self, state: np.ndarray) -> None:
         """Takes over a state that is the same but for rounding, which unstable plants enlarge."""
-        self._state = state.copy()
+        self._now.state = state.copy()
 
     def hear(self) -> None:
         """Takes over what the vector drew at its last step."""
-        process, rng = self.many._process, self.many.np_random
-        self._process.disturbance_now = process.disturbance_now[:, self.index]
-        self._process.noise_now = process.noise_now[:, self.index]
+        process, rng = self.many._now.process, self.many.np_random
+        self._now.process.disturbance_now = process.disturbance_now[:, self.index]
+        self._now.process.noise_now = process.noise_now[:, self.index]
         self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
 
 
@@ -130,10 +130,10 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     """Scalar environments that follow each environment of a vector, which is made to record."""
     single = many.single
     allowed = single.allow_assumption_violation
-    moving = many._process.process
-    many._process = RecordedProcess(many.plant, single.disturbance, allowed, many.num_envs, noise=single.noise)
-    many._process.process = moving  # with the members of families that the reset has drawn
-    many._process.noise_now = np.zeros((many.plant.p, many.num_envs))
+    moving = many._now.process.process
+    many._now.process = RecordedProcess(many.plant, single.disturbance, allowed, many.num_envs, noise=single.noise)
+    many._now.process.process = moving  # with the members of families that the reset has drawn
+    many._now.process.noise_now = np.zeros((many.plant.p, many.num_envs))
     many.np_random = rng = RecordingGenerator(many.np_random)
     begin = many._begin
 

@@ -144,10 +144,10 @@ def test_a_graph_that_forgets_changes_nothing(name, monkeypatch):
     monkeypatch.setattr(arrival_histories, "_shared", {})
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 40)
     env = make(name, 3, channel=Channel(loss=0.3, max_consecutive_losses=2, jitter=2), max_episode_steps=-1).unwrapped
-    before = env._estimator.histories
+    before = env._now.estimator.histories
     compare(env, 200)
-    assert env._estimator.histories is not before
-    assert len(env._estimator.histories) <= 60
+    assert env._now.estimator.histories is not before
+    assert len(env._now.estimator.histories) <= 60
 
 
 def steps_of(env, count, seed=0):
@@ -261,10 +261,10 @@ def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
     env, graphs = vector_env(3, **OVERTAKING), weakref.WeakSet()
     env.reset(seed=0)
     for _ in steps_of(env, 500):
-        graphs.add(env._estimator.histories)
+        graphs.add(env._now.estimator.histories)
     gc.collect()
     assert len(graphs) <= 3
-    assert env.single.estimator._histories is not env._estimator.histories
+    assert env.single.estimator._histories is not env._now.estimator.histories
 
 
 def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):
@@ -287,14 +287,14 @@ def test_a_graph_has_room_for_many_environments(monkeypatch):
     graphs = []
     for _ in range(100):
         env.step(np.zeros((100, 1), np.float32))
-        graphs.append(env._estimator.histories)
+        graphs.append(env._now.estimator.histories)
     assert 2 < len(set(map(id, graphs))) < 60
 
 
 def test_a_damaged_measurement_is_not_used_and_harms_no_other():
     env = vector_env(3, plant=truck_trailer(), channel=Channel(jitter=3))
     env.reset(seed=0)
-    measure, count = env._process.measure, 0
+    measure, count = env._now.process.measure, 0
 
     def damaged(rng, state):
         nonlocal count
@@ -304,7 +304,7 @@ def test_a_damaged_measurement_is_not_used_and_harms_no_other():
             measured[:, 1] = np.nan
         return measured
 
-    env._process.measure = damaged
+    env._now.process.measure = damaged
     for _ in range(60):
         *_, info = env.step(np.zeros((3, 1), np.float32))
         assert np.isfinite(info["estimate"]).all()

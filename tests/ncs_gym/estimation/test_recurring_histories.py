@@ -22,4 +22,4 @@ def test_histories_of_a_vector_recur(env_id):
     idle = np.zeros(envs.action_space.shape, np.float32)
     for _ in range(30):
         envs.step(idle)
-    assert len(envs.unwrapped._estimator.histories) < MOST
+    assert len(envs.unwrapped._now.estimator.histories) < MOST

@@ -111,7 +111,7 @@ def forged(known):
         certified=known.table.certified,
         is_certified=known.table.is_certified,
     )
-    return known._replace(error_shape=FORGED * known.error_shape, table=table)
+    return known._replace(table=table)
 
 
 class Doubtful:
@@ -120,8 +120,8 @@ class Doubtful:
     active = False
 
     @property
-    def known(self):
-        return forged(super().known) if self.active else super().known
+    def belief(self):
+        return forged(super().belief) if self.active else super().belief
 
 
 class DoubtfulEnv(Doubtful, NCSEnv):

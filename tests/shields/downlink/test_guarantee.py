@@ -214,7 +214,7 @@ class Meddling(gym.Wrapper):
         *result, info = self.env.step(action)
         if self.active:
             inner, field = self.unwrapped, {"input": "applied", "input_committed": "committed"}[self.key]
-            inner._known = inner._known._replace(**{field: getattr(inner._known, field) + 1e-12})
+            inner._belief = inner._belief._replace(**{field: getattr(inner._belief, field) + 1e-12})
         return *result, info
 
 
@@ -260,7 +260,7 @@ class MeddlingWithMany(VectorWrapper):
     def step(self, actions):
         *result, info = self.env.step(actions)
         inner = self.unwrapped
-        inner._known = inner._known._replace(applied=inner._known.applied + 1e-12 * self.chosen)
+        inner._belief = inner._belief._replace(applied=inner._belief.applied + 1e-12 * self.chosen)
         return *result, info
 
 

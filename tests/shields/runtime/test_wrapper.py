@@ -248,7 +248,7 @@ def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, auto
         for key in KEYS.keys() & one.keys():
             np.testing.assert_array_equal(one[key], other[key])
         for env in (inside, outside):
-            np.testing.assert_array_equal(plain.unwrapped.known.applied, env.unwrapped.known.applied)
+            np.testing.assert_array_equal(plain.unwrapped.belief.applied, env.unwrapped.belief.applied)
         assert np.all(one["shield_guaranteed"])
         overridden += np.count_nonzero(one["shield_intervened"])
     assert overridden > 10

@@ -1,0 +1,489 @@
+"""One control loop, or N side by side: what it is made of, how it moves, and what is reported of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
+from ncs_gym.envs.loop_settings import CHANNELS, expect, loop_contracts, starting_set
+from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
+from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_table import ErrorTable
+from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.estimation.vector_estimator import VectorEstimator
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract, largest_age
+from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, VectorDownlinkState
+from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
+from ncs_gym.network.packet_reception import UnusedPacketsWarning
+from ncs_gym.network.requests import Requests
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.plant_step import PlantSimulation
+from ncs_gym.processes.process import LinearProcess, Process, as_process, own_process
+from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.validation import CopiedWhole, as_flag, frozen, warn_caller
+
+# Keeps the rounding of a sampled start inside the initial set.
+SAMPLE_ROUNDING = 1e-9
+
+
+class Belief(NamedTuple):
+    """What a controller can know of a loop now; of N loops, arrays whose last axis is the loop.
+
+    A shield takes what it decides on from here, never from an `info`, into which wrappers may have written. Nobody
+    writes into the arrays.
+
+    Attributes:
+        estimate: x_hat of the time at which the next decision takes effect, shape (n,) or (n, N).
+        number: Number of the ellipsoid Sigma_k that holds its error, an int or shape (N,).
+        table: What gives that number its meaning; another one after shapes were forgotten.
+        age: Steps since the newest sample used was taken, an int or shape (N,).
+        alarm: Whether an assumption was seen to be violated, a bool or shape (N,).
+        damaged: Whether one was because a sample was no finite numbers, a bool or shape (N,).
+        outside: Whether `alarm` is also about a step of the process outside E(D), a bool or shape (N,).
+        applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
+        committed: The input decided in the last step, of the same shape.
+    """
+
+    estimate: np.ndarray
+    number: Any
+    table: ErrorTable
+    age: Any
+    alarm: Any
+    damaged: Any
+    outside: Any
+    applied: np.ndarray
+    committed: np.ndarray
+
+    @property
+    def error_shape(self) -> np.ndarray:
+        """Sigma_k, shape (n, n) and read-only, or a fresh array of shape (N, n, n)."""
+        if self.estimate.ndim == 1:
+            return self.table.shape(self.number)
+        return self.table.shapes.take(self.number, axis=0)
+
+
+class Report(NamedTuple):
+    """What happened in a step of a loop; of N loops, arrays whose last axis is the loop.
+
+    Attributes:
+        belief: What a controller can know; the rest is true besides.
+        steps: Steps taken in the episode, an int or shape (N,).
+        state: x, shape (n,) or (n, N).
+        mean: x_hat now, also behind a downlink, of the same shape.
+        arrived: Whether a packet arrived at this step, a bool or shape (N,).
+        packets: Samples sent in the episode, an int or shape (N,).
+        values: How far c_j x is beyond a limit now, shape (k,) or (k, N).
+        worst: The largest since the last step, and those of limits of x and u, shape (k + q,) or (k + q, N).
+        cost: 1.0 if one of these is positive, else 0.0, a float or shape (N,).
+        violations: The sum of costs in the episode, a float or shape (N,).
+        missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
+        requested: Whether a sample was requested, a bool or shape (N,).
+        forced: Whether that was so only because the contract needs it, likewise.
+        others: Infos about the episode: its channels, the parameters of the member of a family.
+    """
+
+    belief: Belief
+    steps: Any
+    state: np.ndarray
+    mean: np.ndarray
+    arrived: Any
+    packets: Any
+    values: np.ndarray
+    worst: np.ndarray
+    cost: Any
+    violations: Any
+    missing: Any
+    requested: Any
+    forced: Any
+    others: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Loop:
+    """What a control loop is made of: a plant, what acts on it and moves, and the networks of both directions.
+
+    Attributes:
+        plant, channel, disturbance, initial_set, allow_assumption_violation, contract, noise, process, downlink,
+            downlink_contract: As of `NCSEnv`, which checks nothing of them by itself.
+        protocol: How commands are sent over the downlink, with its `input_delay`: 0 for an ideal one.
+        certificate_contract: Contract that a certificate for this loop rests on: `contract` with c steps added.
+        error_set: Certified error set, or sets by age.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
+        ErrorSetError: If it is too ill-conditioned.
+        ValueError: If a setting is of the wrong kind or does not fit the plant.
+    """
+
+    plant: LinearPlant
+    channel: Any = None
+    disturbance: Any = "ball"
+    initial_set: Any = None
+    allow_assumption_violation: bool = False
+    contract: ChannelContract | None = None
+    noise: str = "truncated"
+    process: Any = None
+    downlink: Channel | None = None
+    downlink_contract: ChannelContract | None = None
+    protocol: DownlinkProtocol = field(init=False)
+    certificate_contract: ChannelContract | None = field(init=False)
+    error_set: ErrorSet = field(init=False)
+
+    def __post_init__(self) -> None:
+        plant = expect(self.plant, LinearPlant, "plant")
+        channel = Channel() if self.channel is None else expect(self.channel, Channel, "channel")
+        allowed = as_flag(self.allow_assumption_violation, "allow_assumption_violation")
+        disturbance: Disturbance = as_disturbance(self.disturbance, plant, allowed)
+        initial_set: Ellipsoid = starting_set(self.initial_set, plant)
+        process: Process = own_process(plant) if self.process is None else as_process(self.process)
+        if plant.between_samples is not None and not isinstance(process, LinearProcess):
+            raise ValueError(
+                "between_samples is about the plant's own equations: beside another process= give a plant with "
+                "between_samples=1"
+            )
+        made = loop_contracts(plant, channel, self.contract, self.downlink, self.downlink_contract)
+        contract, protocol, certificate_contract = made
+        values = {
+            "channel": channel,
+            "disturbance": disturbance,
+            "initial_set": initial_set,
+            "process": process,
+            "contract": contract,
+            "protocol": protocol,
+            "certificate_contract": certificate_contract,
+            "noise": as_noise(self.noise, plant),
+            "downlink_contract": None if self.downlink is None else protocol.contract,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        histories = self.histories(channel)
+        object.__setattr__(self, "error_set", histories.recursion.error_set)
+        if not histories.uses_samples:
+            step = channel.quantization_step
+            rounded = f", rounded to {step:g}" if step else ""
+            warn_caller(
+                f"no packet is of use: with this sensor noise{rounded}, samples move the estimate by less than 1 % of "
+                "what they differ by, so that it is a prediction",
+                UnusedPacketsWarning,
+            )
+
+    def histories(self, channel: Channel) -> ArrivalHistories:
+        """Returns the graph of arrival histories that loops over a channel with these delays share."""
+        return arrival_histories(self.plant, channel, self.certificate_contract)
+
+    @property
+    def oldest(self) -> float:
+        """The largest age of the newest sample that the contract allows [steps]; infinite without one."""
+        return largest_age(self.contract)
+
+
+class LoopState(CopiedWhole):
+    """Where a loop is, or where N are; the last axis of every array is then the loop.
+
+    A loop begins and moves with random numbers of the caller's. What a task draws comes between those of the plant and
+    of the network, which is why tasks are called from here.
+
+    Args:
+        loop: What it is made of.
+        channels: Those that episodes have unless they are given others, one for each loop; None for those of `loop`.
+        downlinks: The downlinks, likewise.
+        size: N; None for one loop, whose values are numbers in place of arrays.
+
+    Attributes:
+        state: x, shape (n,) or (n, N).
+        worst: `worst_constraint_values` of the last step, shape (k + q,) or (k + q, N).
+        steps, episodes: Steps taken in the episode, and episodes begun, ints or shape (N,).
+        start: What the start of the episode is known to lie in, for one loop; for N, states that episodes were started
+            at by an option or outside the initial set, NaN elsewhere, shape (N, n).
+        channels, downlinks: Those of the present episodes.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        channels: Sequence[Channel] | None = None,
+        downlinks_own: Sequence[Channel | None] | None = None,
+        size: int | None = None,
+    ) -> None:
+        plant, count = loop.plant, size or 1
+        self.loop, self._size = loop, size
+        allowed = loop.allow_assumption_violation
+        self.process = PlantSimulation(plant, loop.disturbance, allowed, size, noise=loop.noise, process=loop.process)
+        self.channels = uplinks(channels or [loop.channel] * count, loop.channel, plant.dt)
+        self.downlinks = downlinks(downlinks_own or [loop.downlink] * count, loop.protocol, plant.dt)
+        self.requests = None
+        if loop.channel.on_request:
+            self.requests = Requests(loop.channel, loop.contract, loop.protocol.input_delay, size)
+        self._worst_is_now = plant.between_samples is None and not len(plant.mixed_rows)
+        self._others: dict[str, Any] = {}
+
+    @property
+    def links(self) -> dict[str, EpisodeChannels]:
+        """The channels of both directions, by the name of their option of `reset`."""
+        return dict(zip(CHANNELS, (self.channels, self.downlinks), strict=True))
+
+    def read(self, options: dict[str, Any] | None) -> tuple[list[Any], np.ndarray | None]:
+        """Returns what options of `reset` say of channels and of parameters; raises ValueError if one is wrong."""
+        given = options or {}
+        sources = [links.read(given.get(name), name) for name, links in self.links.items()]
+        return sources, self.process.read_parameters(given.get("parameters"))
+
+    def drawn(self, sources: list[Any], rng: np.random.Generator, chosen: Sequence[int] | None = None) -> list[Any]:
+        """Returns sources in which those that draw have drawn; nothing has changed where that fails."""
+        return [links.drawn(each, rng, chosen) for links, each in zip(self.links.values(), sources, strict=True)]
+
+    def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
+        """Gives the next episodes of some loops, all by default, the channels of sources."""
+        for links, each in zip(self.links.values(), sources, strict=True):
+            links.give(each, chosen)
+
+    def move(self, rng: np.random.Generator, u: np.ndarray, task: Callable[[np.ndarray], None]) -> tuple[Inputs, Any]:
+        """Moves one step on; returns the inputs of the step, and whether a packet arrived, a bool or shape (N,).
+
+        Args:
+            rng: Source of randomness.
+            u: What is decided now, shape (m,) or (m, N) [physical units].
+            task: Moves the task, given the input applied.
+        """
+        inputs = self.downlink.exchange(rng, self.steps, u)
+        before, requested = self.state, None
+        if self.requests is not None:
+            self.requests.decide(self.estimator.age)
+            # A sensor that has not heard whether a sample is requested takes it.
+            requested = self.requests.decided[0] | inputs.missing
+        self.state = self.process.advance(rng, before, inputs.applied, self.steps, self.memory)
+        self.worst = self.loop.plant.worst_constraint_values(before, inputs.applied, self.state)
+        task(inputs.applied)
+        self.steps = self.steps + 1
+        return inputs, self._receive(rng, inputs.applied, requested)
+
+    def report(self, inputs: Inputs, arrived: Any, counted: np.ndarray | None = None) -> Report:
+        """Returns what happened; the costs of loops that are not `counted`, shape (N,), do not count once more."""
+        plant, estimator, worst = self.loop.plant, self.estimator, self.worst
+        values = worst if self._worst_is_now else plant.constraint_values(self.state)
+        estimate, number = estimator.numbered(self.pending)
+        age, damaged, outside = estimator.age, estimator.damaged, self.process.alarm
+        alarm, asked, forced = estimator.alarm | outside, False, False
+        if self.requests is not None:
+            asked, forced = self.requests.requested, self.requests.forced
+        if self._size is None:
+            cost, alarm = 1.0 if max(worst.tolist()) > 0.0 else 0.0, bool(alarm)
+        else:
+            cost = (np.maximum.reduce(worst) > 0.0).astype(np.float64)
+            values = values.copy() if values is worst else values
+            age, damaged, outside = (frozen(each.copy()) for each in (age, damaged, outside))
+            for array in (estimate, number, alarm):
+                frozen(array)
+            if self.requests is None:
+                asked = forced = self.nothing
+        self.violations = self.violations + (cost if counted is None else cost * counted)
+        (applied, committed, missing), table = inputs, estimator.table
+        belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed)
+        happened = belief, self.steps, self.state, estimator.mean, arrived, self.packets
+        kept = values, worst, cost, self.violations
+        return Report(*happened, *kept, missing, asked, forced, self._others | self.process.infos)
+
+    @property
+    def pending(self) -> tuple[np.ndarray, ...]:
+        """The inputs until the next decision takes effect, shape (m,) or (m, N) each."""
+        return self.downlink.committed.pending
+
+    def ahead(self, *chosen: np.ndarray) -> list[tuple[np.ndarray, Any]]:
+        """Returns estimate and number of the error set of now and of every step until the next decision's effect.
+
+        Args:
+            chosen: Indices of the loops that count, of N; all by default.
+        """
+        return [self.estimator.numbered(self.pending[:steps], *chosen) for steps in range(len(self.pending) + 1)]
+
+    # Of one loop or of many: those of the classes below.
+    nothing: Any = False
+    state: np.ndarray
+    worst: np.ndarray
+    memory: Any
+    steps: Any
+    episodes: Any
+    packets: Any
+    violations: Any
+    start: Any
+    estimator: Any
+    downlink: Any
+    network: Any
+
+    def _receive(self, rng: np.random.Generator, u: np.ndarray, requested: Any) -> Any:
+        """Samples, sends and estimates, given the inputs applied; returns whether a packet arrived."""
+        raise NotImplementedError
+
+
+class OneLoop(LoopState):
+    """Where one loop is.
+
+    Attributes:
+        received: The packets that arrived at the last step.
+    """
+
+    def __init__(self, loop: Loop) -> None:
+        super().__init__(loop)
+        self.estimator = Estimator(loop.plant, loop.channel, histories=loop.histories(loop.channel))
+        self.downlink = DownlinkState(loop.protocol, loop.plant.m)
+        self.steps = self.episodes = 0
+        self.start = loop.initial_set
+        self.received: list[Any] = []
+
+    def begin(
+        self,
+        rng: np.random.Generator,
+        start: np.ndarray | None,
+        fixed: np.ndarray | None,
+        task: Callable[[], None],
+    ) -> None:
+        """Begins an episode.
+
+        Args:
+            rng: Source of randomness.
+            start: Where, shape (n,); None draws it from the initial set.
+            fixed: What `read` returned of parameters.
+            task: Begins the task's episode.
+        """
+        loop = self.loop
+        initial, first = (None, start) if start is not None else (loop.initial_set, self._drawn_start(rng))
+        self.state, self.start = self.process.start(rng, first, initial, fixed)
+        task()
+        self.memory = self.process.begin(rng)
+        for links in self.links.values():
+            links.begin(rng)
+        self._others = channel_infos(self.channels, self.downlinks)
+        channel = self.channels.now[0]
+        self.network, self.packets = ChannelState(channel, rng), 0
+        if self.requests is not None:
+            self.requests.begin(channels=[channel])
+        if (channel.delay, channel.jitter) != (self.estimator.channel.delay, self.estimator.channel.jitter):
+            known = covering([channel], loop.channel)
+            self.estimator = Estimator(loop.plant, known, histories=loop.histories(known), after=self.estimator)
+        self.estimator.reset(self.state + self.process.first_error(rng))
+        self.downlink.begin(rng, self.estimator.episode, self.downlinks.now[0])
+        self.steps, self.violations, self.received = 0, 0.0, []
+        self.episodes += 1
+        self.worst = loop.plant.values_at_start(self.state)
+
+    def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
+        return (1.0 - SAMPLE_ROUNDING) * self.loop.initial_set.sample(rng)
+
+    def _receive(self, rng: np.random.Generator, u: np.ndarray, requested: Any) -> bool:
+        if requested is not None:
+            self.network.requested = bool(requested)
+        sends = self.network.sends_at(self.steps)
+        sample = self.process.measure(rng, self.state) if sends else None
+        self.received = self.network.exchange(rng, self.steps, sample, self.estimator.episode)
+        self.packets += sends
+        self.estimator.advance(u, self.received)
+        return bool(self.received)
+
+
+class ManyLoops(LoopState):
+    """Where N loops are, each in an episode of its own."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        size: int,
+        channels: Sequence[Channel] | None = None,
+        downlinks_own: Sequence[Channel | None] | None = None,
+    ) -> None:
+        super().__init__(loop, channels, downlinks_own, size)
+        plant, self.size = loop.plant, size
+        self.estimator = VectorEstimator(plant, loop.histories(loop.channel), size)
+        self.downlink = VectorDownlinkState(loop.protocol, plant.m, size)
+        self.nothing = np.zeros(size, np.bool_)
+        self.packets, self.violations = np.zeros(size, np.int64), np.zeros(size)
+        self.steps, self.episodes = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self.state, self.start = np.zeros((plant.n, size)), np.full((size, plant.n), np.nan)
+        self.worst = plant.values_at_start(self.state)
+
+    def begin(
+        self,
+        rng: np.random.Generator,
+        mask: np.ndarray,
+        starts: np.ndarray | None,
+        fixed: np.ndarray | None,
+        task: Callable[[np.ndarray], None],
+    ) -> None:
+        """Begins episodes where `mask`, shape (N,), says so.
+
+        Args:
+            rng: Source of randomness.
+            mask: Where.
+            starts: The states, shape (N, n); None draws them from the initial set.
+            fixed: What `read` returned of parameters.
+            task: Begins the task's episodes, given their mask.
+        """
+        loop, rows = self.loop, np.flatnonzero(mask)
+        count = len(rows)
+        first_states = ((1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng, count)).T
+        first_errors = self.process.first_error(rng, count)
+        initial, states = (loop.initial_set, first_states) if starts is None else (None, starts[mask].T)
+        states, known = self.process.start_many(rng, states, initial, mask, fixed)
+        task(mask)
+        memory = self.process.begin(rng, count)
+        channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
+        if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):
+            self._others = channel_infos(self.channels, self.downlinks, many=True)
+        if count == self.size:
+            self.memory = np.array(memory)
+            self.network = VectorChannelState(channels or loop.channel, rng, count)
+        else:
+            self.memory = with_columns(self.memory, mask, memory)
+            self.network.begin(rng, rows, channels)
+        self._prepare_estimator(all_begin=count == self.size)
+        self.state = with_columns(self.state, mask, states)
+        self.estimator.begin(mask, states + first_errors)
+        self.downlink.begin(rng, mask, commands)
+        if self.requests is not None:
+            self.requests.begin(mask, channels)
+        self.packets, self.steps = np.where(mask, 0, self.packets), np.where(mask, 0, self.steps)
+        self.violations, self.episodes = np.where(mask, 0.0, self.violations), self.episodes + mask
+        self.worst = np.where(mask, loop.plant.values_at_start(self.state), self.worst)
+        self.start[mask] = known
+
+    def _prepare_estimator(self, *, all_begin: bool) -> None:
+        """Makes the estimator one for the delays of all present channels; it forgets nothing unless all begin."""
+        known, declared = self.estimator.histories.channel, self.loop.channel
+        used = [declared] if self.channels.is_plain else [*self.channels.now, *([] if all_begin else [known])]
+        if (wanted := covering(used, declared)) != known:
+            histories = self.loop.histories(wanted)
+            if all_begin:
+                self.estimator = VectorEstimator(self.loop.plant, histories, self.size)
+            else:
+                self.estimator.follow(histories)
+
+    def _receive(self, rng: np.random.Generator, u: np.ndarray, requested: Any) -> np.ndarray:
+        estimator = self.estimator
+        sends, samples = self.network.send(rng, self.steps, requested), None
+        self.packets = self.packets + sends
+        if np.count_nonzero(sends):
+            samples = self.network.channel.quantize(self.process.measure(rng, self.state))
+            if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
+                damaged = np.asarray(~np.isfinite(samples).all(axis=0))
+                self.network.discard(damaged)
+                estimator.damaged |= sends & damaged
+                estimator.alarm |= estimator.damaged
+                samples[:, damaged] = 0.0  # times a gain of zero it is to be nothing
+        arrivals = self.network.arrivals()
+        estimator.advance(u, samples, arrivals)
+        arrived = np.zeros(self.size, np.bool_)
+        for _, arrives in arrivals:
+            arrived |= arrives
+        return arrived
+
+
+def with_columns(values: np.ndarray, mask: np.ndarray, new: Any) -> np.ndarray:
+    """Returns an array (..., N) with others where `mask` (N,) says so, of a type that holds both."""
+    found = values.astype(np.result_type(values, new))
+    found[..., mask] = new
+    return found
