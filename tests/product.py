@@ -271,14 +271,14 @@ def vector_env(num_envs: int = 1, **settings: Any) -> ncs_gym.NCSVectorEnv:
     return ncs_gym.NCSVectorEnv(num_envs, **settings)
 
 
-def gym_env(**settings: Any) -> gym.Env:
-    """The environment that `gym.make` gives for a plant."""
-    return gym.make("ncs_gym/LinearNCS-v0", **settings)
+def gym_env(env_id: str = "ncs_gym/LinearNCS-v0", **settings: Any) -> gym.Env:
+    """The environment that `gym.make` gives for a plant, or for an id."""
+    return gym.make(env_id, **settings)
 
 
-def gym_vector_env(num_envs: int, **settings: Any) -> gym.vector.VectorEnv:
-    """The environment that `gym.make_vec` gives for a plant."""
-    return gym.make_vec("ncs_gym/LinearNCS-v0", num_envs, **settings)
+def gym_vector_env(num_envs: int, env_id: str = "ncs_gym/LinearNCS-v0", **settings: Any) -> gym.vector.VectorEnv:
+    """The environment that `gym.make_vec` gives for a plant, or for an id."""
+    return gym.make_vec(env_id, num_envs, **settings)
 
 
 def safety_shield(env: gym.Env, *certificate: Any, **settings: Any) -> shields.SafetyShield:
