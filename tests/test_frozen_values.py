@@ -45,6 +45,7 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
+from ncs_gym.envs.loop import Loop
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
@@ -107,6 +108,7 @@ VALUES = [
     Gaussian(np.eye(2), 0.1),
     Through(np.eye(2), np.ones(2)),
     Sum((Box(np.zeros(2), np.ones(2)), Ball(1.0))),
+    Loop(plant=truck_trailer()),
 ]
 PASSING = {Annotation}  # made anew for every frame
 
