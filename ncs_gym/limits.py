@@ -53,14 +53,13 @@ def as_points(value: Any, size: int, name: str) -> np.ndarray:
     return np.array([as_point(row, size, name) for row in numbers]).reshape(len(numbers), size)
 
 
-def sides(limits: Any, size: int, name: str, *, may_meet: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Returns the low and the high ends of limits, shape (size,) each; infinite where there is none.
 
     Args:
         limits: Pair (low, high), each a number or shape (size,), possibly infinite.
         size: Number of limited quantities.
         name: What the error message calls the limits.
-        may_meet: Whether a low end may be the high one.
 
     Raises:
         ValueError: If it is no such pair, or a low end is not below the high one.
@@ -69,10 +68,9 @@ def sides(limits: Any, size: int, name: str, *, may_meet: bool = False) -> tuple
     if len(ends) != 2 or any(side is None or side.shape not in ((), (size,)) or np.isnan(side).any() for side in ends):
         raise ValueError(f"{name} must be a pair (low, high), each a number or shape ({size},), got {shown(limits)}")
     low, high = (np.broadcast_to(np.asarray(side), (size,)).copy() for side in ends)
-    if not (low <= high if may_meet else low < high).all():
-        order = "low <= high" if may_meet else "low < high"
+    if not (low < high).all():
         raise ValueError(
-            f"{name} must be (low, high), each a number or a vector, with {order} everywhere, got {shown(limits)}"
+            f"{name} must be (low, high), each a number or a vector, with low < high everywhere, got {shown(limits)}"
         )
     return low, high
 
@@ -142,42 +140,6 @@ def in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ro
 def joined(parts: Sequence[Rows]) -> Rows:
     """Returns all rows of several."""
     return Rows(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-
-
-def as_row_ends(value: Any, rows: int, name: str = "box_ends", *, around_zero: bool = True) -> np.ndarray:
-    """Returns the low and the high ends of rows, shape (2, rows); -1 and 1 for None.
-
-    Args:
-        value: A pair, in lists of which None stands for an infinite end, as in files; or None.
-        rows: Their number.
-        name: What the error message calls them.
-        around_zero: Whether zero has to be between them.
-
-    Raises:
-        ValueError: If they are no such ends, or a row has none.
-    """
-    if value is None:
-        return np.array([[-1.0], [1.0]]) * np.ones(rows)
-    if isinstance(value, list) and len(value) == 2:
-        value = [_with_infinity(side, sign) for side, sign in zip(value, (-np.inf, np.inf), strict=True)]
-    low, high = sides(value, rows, name)
-    if around_zero and not ((low < 0.0) & (high > 0.0)).all():
-        raise ValueError(f"{name} must have 0 between them, got {shown(value)}")
-    if not (np.isfinite(low) | np.isfinite(high)).all():
-        raise ValueError(f"one of {name} must be finite for each row, got {shown(value)}")
-    return np.stack([low, high])
-
-
-def listed_ends(ends: np.ndarray) -> list[Any]:
-    """Returns ends of any shape as nested lists for a file, in which None stands for an infinite one."""
-    if ends.ndim > 1:
-        return [listed_ends(each) for each in ends]
-    return [each if np.isfinite(each) else None for each in ends.tolist()]
-
-
-def _with_infinity(ends: Any, infinity: float) -> Any:
-    """Returns ends that may be a file's, in which None stands for an infinite one."""
-    return [infinity if each is None else each for each in ends] if isinstance(ends, list) else ends
 
 
 class Within(NamedTuple):
