@@ -18,8 +18,7 @@ from ncs_gym.bounds import Bounds, Gaussian, Sum, Through
 from ncs_gym.limits import Limits, as_points
 from ncs_gym.model import Model
 from ncs_gym.plants import between_samples, plant_file, statespace
-from ncs_gym.plants.assumptions import assumptions_of
-from ncs_gym.plants.description import described
+from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import DELTA, HardBounds, Source, source_of, weight_of
 from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import with_past_inputs
