@@ -20,6 +20,8 @@ from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_numb
 
 # Sizes are squared, and must not become zero or infinite by that.
 SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
+# Probability that Gaussian noise of the library is truncated at, and that of what is zero.
+DELTA = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,3 +281,18 @@ class Bounds(ReadOnlyArrays):
                 object.__setattr__(self, name, made(getattr(self, name), size))
             except ValueError as error:
                 raise ValueError(f"Bounds({name}=...): {error}") from error
+
+
+def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
+    """Returns Gaussian noise, of which 95 % count, whose bounds are in proportion to the safe box.
+
+    Args:
+        half_widths: Of the safe box, shape (n,).
+        H: Output matrix, shape (p, n).
+        disturbance: Bound of process noise, as a fraction of the half-widths.
+        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs; of the first error in each
+            state, of the smallest half-width.
+    """
+    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
+    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
+    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import Bounds, Gaussian, Sum, Through
+from ncs_gym.bounds import DELTA, Bounds, Gaussian, Sum, Through
 from ncs_gym.limits import Limits, as_points
 from ncs_gym.model import Model
 from ncs_gym.plants import between_samples, plant_file, statespace
 from ncs_gym.plants.description import assumptions_of, described
-from ncs_gym.plants.hard_bounds import DELTA, HardBounds, Source, source_of, weight_of
+from ncs_gym.plants.hard_bounds import HardBounds, Source, source_of, weight_of
 from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.plants.resting_point import Rest, at_rest, with_residual
@@ -359,11 +359,6 @@ class LinearPlant(LimitValues, HardBounds):
                 "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
                 f"what was asked for (a plant has {instead}, mixed_rows and mixed_ends)"
             )
-
-    @cached_property
-    def symmetric_box(self) -> np.ndarray:
-        """Rows c_j of the largest box |c_j x| <= 1 inside the safe box, shape (k, n)."""
-        return read_only(self.box / np.minimum(-self.box_low, self.box_high)[:, None])
 
     @property
     def members(self) -> Any:

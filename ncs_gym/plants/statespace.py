@@ -7,9 +7,6 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import Bounds, Gaussian
-from ncs_gym.plants.hard_bounds import DELTA
-from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from ncs_gym.validation import shown
 
 # Durations of steps that differ by less than this are the same.
@@ -35,21 +32,6 @@ def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray
     except OverflowError as error:
         raise ValueError(f"the model grows beyond all numbers within a step of {dt:g} s: give a smaller dt") from error
     return sampled[:n, :n], sampled[:n, n:]
-
-
-def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
-    """Returns Gaussian noise, of which 95 % count, whose bounds are in proportion to the safe box.
-
-    Args:
-        half_widths: Of the safe box, shape (n,).
-        H: Output matrix, shape (p, n).
-        disturbance: Bound of process noise, as a fraction of the half-widths.
-        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs; of the first error in each
-            state, of the smallest half-width.
-    """
-    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
-    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
-    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))
 
 
 def matrices_of(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
