@@ -91,7 +91,7 @@ class Model(ReadOnlyArrays):
             made["offset"] = offset = as_vector(self.offset, n, "offset")
             made |= {"lacking": _residual(A, B, offset, x, u), "step_offset": np.abs(offset)}
         if self.continuous is not None:
-            made["continuous"] = as_matrix(self.continuous, (n, n + m), "continuous_model")
+            made["continuous"] = as_matrix(self.continuous, (n, n + m), "continuous")
         made["delays"] = as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY)
         for name, value in made.items():
             object.__setattr__(self, name, value)

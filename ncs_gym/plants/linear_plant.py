@@ -227,7 +227,7 @@ class LinearPlant(LimitValues, HardBounds):
                 f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
             )
         if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
-            raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
+            raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
 
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.

@@ -47,7 +47,7 @@ def matrices_of(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
         )
     if not all(hasattr(model, name) for name in "ABCD"):
         raise ValueError(
-            "sys must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
+            "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
             f"(A, B, C, D) or (A, B, C, D, dt), got {shown(sys)}"
         )
     return model.A, model.B, model.C, model.D, _sampling_time(model, getattr(model, "dt", None))

@@ -1,7 +1,7 @@
 """What acts on the plant inside the bound that the certificates assume: the base class, the kinds, and the checks.
 
-Ball, box and sinusoid stay within d'd <= gamma plus the declared bound, and truncated process noise is added to them.
-Sphere and adversary use the whole of E(D), process noise included.
+Ball, box and sinusoid stay within the ball and the other sets that a plant's bounds declare, and truncated process
+noise is added to them. Sphere and adversary use the whole of E(D), process noise included.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NOISES = ("truncated", "gaussian", "extreme")
 
 
 class Disturbance(ReadOnlyArrays, ABC):
-    """A disturbance in the ball d'd <= gamma plus `disturbance_bound`; truncated process noise is added to it.
+    """A disturbance in the ball d'd <= `gamma` of a plant plus its `disturbance_bound`; process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
     settings, so that one object serves any number of environments; a vector environment refuses what does. The class
@@ -169,12 +169,13 @@ class BoxDisturbance(Disturbance):
         if bound is None:
             length = float(np.sum(np.square(corner)))
             if length > plant.gamma * (1.0 + ROUNDING):
-                return f"the corner of the box has squared length {length:g} > gamma = {plant.gamma:g}"
+                allowed = f"the ball in the plant's Bounds(disturbance=...) has radius {np.sqrt(plant.gamma):g}"
+                return f"the corner of the box is {np.sqrt(length):g} long, {allowed}"
             return ""
         # Of sets with the coordinates as axes, all corners lie equally far out.
         size = sum_gauge(corner, plant.gamma * np.eye(plant.n), diagonal_inside(bound))
         if size > 1.0 + ROUNDING:
-            return f"the box is {size:.6g} times as large as one in the ball of gamma plus disturbance_bound may be"
+            return f"the box is {size:.6g} times as large as one within the plant's Bounds(disturbance=...) may be"
         return ""
 
 
