@@ -237,7 +237,9 @@ def as_set(value: Any) -> Any:
             return kinds[name](**content)
     half = as_setting(value)
     if half is None or half.ndim > 1:
-        raise ValueError(f"a set must be a number, a vector of half-widths or a {', '.join(kinds)}, got {shown(value)}")
+        raise ValueError(
+            f"a set must be a number, a vector of half-widths or one of {', '.join(kinds)}, got {shown(value)}"
+        )
     return Box(-half, half)
 
 

@@ -70,7 +70,8 @@ def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     low, high = (np.broadcast_to(np.asarray(side), (size,)).copy() for side in ends)
     if not (low < high).all():
         raise ValueError(
-            f"{name} must be (low, high), each a number or a vector, with low < high everywhere, got {shown(limits)}"
+            f"{name} must be (low, high), each a number or a vector, with low < high everywhere: give all low "
+            f"ends, then all high ones, got {shown(limits)}"
         )
     return low, high
 
@@ -254,8 +255,8 @@ class Limits(ReadOnlyArrays):
         fits = (widths > SMALLEST_NUMBER) & (widths < LARGEST_NUMBER) | (widths == np.inf)
         if not fits.all() or not np.isfinite(widths).any():
             raise ValueError(
-                f"{name} limits must be positive half-widths of shape ({size},), or a pair (low, high) of vectors, got "
-                f"{shown(getattr(self, name))}"
+                f"{name} limits must be positive half-widths of shape ({size},), not all infinite, or a pair (low, "
+                f"high) of vectors, got {shown(getattr(self, name))}"
             )
         return np.broadcast_to(widths, (size,))
 

@@ -76,7 +76,10 @@ class Model(ReadOnlyArrays):
         if not isinstance(at, tuple | list) or len(at) != 2:
             raise ValueError(f"at must be a pair of a state and an input, got {shown(at)}")
         named = zip(("state", "input"), at, (n, m), strict=True)
-        x, u = (np.zeros(size) if of is None else as_point(of, size, f"the {name} of at") for name, of, size in named)
+        x, u = (
+            np.zeros(size) if of is None else as_point(of, size, f"the {name} in at=(state, input)")
+            for name, of, size in named
+        )
         made = {
             "at": frozen_inside(self.at),
             "A": A,
@@ -103,6 +106,7 @@ class Model(ReadOnlyArrays):
         A = as_matrix(A, (None, None), "A")
         A = as_matrix(A, (len(A), len(A)), "A")
         B = as_matrix(B, (len(A), None), "B")
+        C = None if C is None else as_matrix(C, (None, len(A)), "C")
         dt = as_number(dt, "dt", low=0.0, low_open=True)
         return cls(*zero_order_hold(A, B, dt), C, dt, at, continuous=np.concatenate([A, B], axis=1))
 
@@ -149,7 +153,9 @@ class Model(ReadOnlyArrays):
             ValueError: If the model was not sampled from one in continuous time.
         """
         if self.continuous is None:
-            raise ValueError("only a model that was sampled from one in continuous time says what is held over a step")
+            raise ValueError(
+                "what is held over a step is known of a model that Model.sampled made from one in continuous time"
+            )
         n = len(self.A)
         return zero_order_hold(self.continuous[:, :n], as_matrix(E, (n, None), "E"), self.dt)[1]
 

@@ -43,6 +43,8 @@ def described(plant: LinearPlant) -> str:
         "safe box": [row_limit(plant, j) for j in np.flatnonzero(~plant.is_past_row).tolist()],
         "input limits": [input_limit(plant, i) for i in range(plant.m)],
     }
+    if plant.model.delays:
+        lines["input limits"].append(f"inputs take effect {counted(plant.model.delays, 'step')} later")
     if len(plant.mixed_rows):
         lines["both together"] = [mixed_limit(plant, j) for j in range(len(plant.mixed_rows))]
     if plant.between_samples is not None:
@@ -110,9 +112,6 @@ def row_limit(plant: LinearPlant, j: int) -> str:
         i = limited[0]
         low, high = sorted([low / float(row[i]), high / float(row[i])])
         return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
-    if low == -high:  # in units of the limit
-        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
-        return f"|{terms.removeprefix('+')}| <= 1"
     return _sum_between(row, low, high, plant.operating_state, plant.state_names)
 
 
@@ -145,11 +144,6 @@ def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, n
 
 def _factor(size: float) -> str:
     return "" if size == 1.0 else f"{size:.4g} "
-
-
-def _deviation(plant: LinearPlant, i: int) -> str:
-    center = plant.operating_state[i]
-    return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
 
 
 def outputs_of(plant: LinearPlant) -> tuple[list[str], list[str]]:

@@ -185,7 +185,8 @@ class LinearPlant(LimitValues, HardBounds):
         """Keeps names and units of states and inputs."""
         labels = {} if self.labels is None else self.labels
         if not isinstance(labels, Mapping) or not {*labels} <= {"states", "inputs"}:
-            raise ValueError(f"labels must have names with their units, by states and inputs, got {shown(labels)}")
+            form = '{"states": {name: unit, ...}, "inputs": {name: unit, ...}}'
+            raise ValueError(f"labels must be {form}, either of which may be left out, got {shown(labels)}")
         for name, size, letter in (("state", self.n - self.past, "x"), ("input", self.m, "u")):
             given = labels.get(f"{name}s", {})
             if not isinstance(given, Mapping):
