@@ -59,11 +59,11 @@ class Model(ReadOnlyArrays):
     offset: Any = None
     continuous: Any = None
     delays: int = 0
-    state: np.ndarray = field(init=False)
-    input: np.ndarray = field(init=False)
-    is_given: tuple[bool, bool] = field(init=False)
-    lacking: np.ndarray = field(init=False)
-    step_offset: np.ndarray = field(init=False)
+    state: np.ndarray = field(init=False, repr=False)
+    input: np.ndarray = field(init=False, repr=False)
+    is_given: tuple[bool, bool] = field(init=False, repr=False)
+    lacking: np.ndarray = field(init=False, repr=False)
+    step_offset: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         A = as_matrix(self.A, (None, None), "A")

@@ -22,6 +22,7 @@ from ncs_gym import (
     Remainder,
     Sum,
     Through,
+    linear_model,
 )
 from shields import SafetyShield
 
@@ -174,6 +175,8 @@ def test_zero_is_said_on_purpose_and_warns_of_nothing():
         (lambda: Model.sampled(A, B, [[1.0]], 0.1), "^C must have shape"),
         (lambda: Model.of(A, 0.1), "^the system must be a state-space model"),
         (lambda: MODEL.held(np.eye(2)), "in continuous time"),
+        (lambda: linear_model(np.add, Limits(input=1.0), BOUNDS, 0.1), r"give Limits\(state=...\)"),
+        (lambda: linear_model(np.add, Limits((-1.0, 1.0), (0.0, 8.0)), BOUNDS, 0.1), r"give at=\(state, input\)"),
         (lambda: MODEL.with_delays(-1), "delays must be a whole number"),
         (
             lambda: LinearPlant(MODEL, LIMITS, Bounds(Gaussian(np.eye(2), 0.1), Gaussian(np.eye(2), 0.2), 0.0)),
