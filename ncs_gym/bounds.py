@@ -216,12 +216,6 @@ def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.eye(inside.size) if E is None else E, inside.middle)]
 
 
-def require_about_zero(own: Any, name: str) -> None:
-    """Raises ValueError, calling a set by this name, if its middle, which an `ellipsoid` does not have, is not zero."""
-    if np.any(own.middle):
-        raise ValueError(f"{name} must have its middle at zero, got {shown(np.asarray(own.middle).tolist())}")
-
-
 def as_set(value: Any) -> Any:
     """Returns the set that is given, that of a document, or the box of half-widths, a number or shape (n,).
 
@@ -264,7 +258,9 @@ class Bounds(ReadOnlyArrays):
     def __post_init__(self) -> None:
         self._put(lambda value, _: as_set(value), (0, 0))
         for name in ("sensor", "first_error"):
-            require_about_zero(getattr(self, name), f"Bounds({name}=...)")
+            if np.any(middle := getattr(self, name).middle):
+                found = shown(np.asarray(middle).tolist())
+                raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {found}")
 
     def sized(self, n: int, p: int) -> Bounds:
         """Returns the bounds of a plant with n states and p outputs, each of which is a sum of sets.

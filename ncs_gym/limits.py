@@ -131,11 +131,7 @@ def in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ro
     limited = np.isfinite(low) | np.isfinite(high)
     rows, low, high = rows[limited], low[limited], high[limited]
     half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.minimum(-low, high))
-    symmetric = -low == high
-    low, high = np.where(symmetric, -1.0, low / half), np.where(symmetric, 1.0, high / half)
-    return Rows(
-        (1.0 / half)[:, None] * rows, np.where(low < -1e300, -np.inf, low), np.where(high > 1e300, np.inf, high)
-    )
+    return Rows((1.0 / half)[:, None] * rows, low / half, high / half)
 
 
 def joined(parts: Sequence[Rows]) -> Rows:

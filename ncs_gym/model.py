@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.limits import as_point
-from ncs_gym.plants.statespace import SAME_STEP, matrices_of, zero_order_hold
+from ncs_gym.plants.statespace import SAME_STEP, zero_order_hold
 from ncs_gym.validation import (
     SMALLEST_NUMBER,
     ReadOnlyArrays,
@@ -123,7 +123,7 @@ class Model(ReadOnlyArrays):
         Raises:
             ValueError: If it is no such model, D is not zero, or dt is missing or another than the model's.
         """
-        *matrices, own = matrices_of(system)
+        *matrices, own = _matrices_of(system)
         A = as_matrix(matrices[0], (None, None), "A of the model")
         A = as_matrix(A, (len(A), len(A)), "A of the model")
         B = as_matrix(matrices[1], (len(A), None), "B of the model")
@@ -178,3 +178,36 @@ def _residual(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarra
     raise ValueError(
         f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
     )
+
+
+def _matrices_of(system: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
+    if isinstance(system, (tuple, list)) and len(system) in (4, 5):
+        A, B, C, D, own = (*system, 0)[:5]
+        return A, B, C, D, _sampling_time(system, own)
+    model: Any = system
+    if not hasattr(model, "A") and (hasattr(model, "to_ss") or hasattr(model, "num")):
+        raise ValueError(
+            f"{shown(system)} is a transfer function, whose states would be nobody's: limits and names are of states, "
+            "so give a state-space model with states of yours"
+        )
+    if not all(hasattr(model, name) for name in "ABCD"):
+        raise ValueError(
+            "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
+            f"(A, B, C, D) or (A, B, C, D, dt), got {shown(system)}"
+        )
+    return model.A, model.B, model.C, model.D, _sampling_time(model, getattr(model, "dt", None))
+
+
+def _sampling_time(model: Any, own: Any) -> Any:
+    """Returns the sampling time of a model; raises ValueError if it leaves open whether there is one."""
+    if own is None:
+        from scipy.signal import lti  # takes long to import, and is there if the model is scipy's
+
+        if isinstance(model, lti):
+            return 0
+        raise ValueError(
+            "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with dt=0 "
+            "or with its sampling time in seconds"
+        )
+    return own
