@@ -37,10 +37,10 @@ class Box(UncertainSet):
 
     def __post_init__(self) -> None:
         ends: list[Any] = [as_setting(self.low), as_setting(self.high)]
-        if any(end is None or end.ndim > 1 or not end.size for end in ends) or len({*map(np.shape, ends)} - {()}) > 1:
-            raise ValueError(
-                f"a box needs two ends, numbers or vectors of one size, got {shown(self.low)} and {shown(self.high)}"
-            )
+        fits = all(each is not None and each.ndim <= 1 and each.size and np.isfinite(each).all() for each in ends)
+        if not fits or len({*map(np.shape, ends)} - {()}) > 1:
+            found = f"{shown(self.low)} and {shown(self.high)}"
+            raise ValueError(f"a box needs two finite ends, numbers or vectors of one size, got {found}")
         for name, end in zip(("low", "high"), np.array(np.broadcast_arrays(*ends)), strict=True):
             object.__setattr__(self, name, end)
         object.__setattr__(self, "middle", 0.5 * (self.high + self.low))
