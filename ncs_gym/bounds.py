@@ -20,6 +20,8 @@ from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_numb
 
 # Sizes are squared, and must not become zero or infinite by that.
 SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
+# Probability that Gaussian noise of the library is truncated at, and that of what is zero.
+DELTA = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +37,10 @@ class Box(UncertainSet):
 
     def __post_init__(self) -> None:
         ends: list[Any] = [as_setting(self.low), as_setting(self.high)]
-        if any(end is None or end.ndim > 1 or not end.size for end in ends) or len({*map(np.shape, ends)} - {()}) > 1:
-            raise ValueError(
-                f"a box needs two ends, numbers or vectors of one size, got {shown(self.low)} and {shown(self.high)}"
-            )
+        fits = all(each is not None and each.ndim <= 1 and each.size and np.isfinite(each).all() for each in ends)
+        if not fits or len({*map(np.shape, ends)} - {()}) > 1:
+            found = f"{shown(self.low)} and {shown(self.high)}"
+            raise ValueError(f"a box needs two finite ends, numbers or vectors of one size, got {found}")
         for name, end in zip(("low", "high"), np.array(np.broadcast_arrays(*ends)), strict=True):
             object.__setattr__(self, name, end)
         object.__setattr__(self, "middle", 0.5 * (self.high + self.low))
@@ -214,12 +216,6 @@ def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.eye(inside.size) if E is None else E, inside.middle)]
 
 
-def require_about_zero(own: Any, name: str) -> None:
-    """Raises ValueError, calling a set by this name, if its middle, which an `ellipsoid` does not have, is not zero."""
-    if np.any(own.middle):
-        raise ValueError(f"{name} must have its middle at zero, got {shown(np.asarray(own.middle).tolist())}")
-
-
 def as_set(value: Any) -> Any:
     """Returns the set that is given, that of a document, or the box of half-widths, a number or shape (n,).
 
@@ -235,7 +231,9 @@ def as_set(value: Any) -> Any:
             return kinds[name](**content)
     half = as_setting(value)
     if half is None or half.ndim > 1:
-        raise ValueError(f"a set must be a number, a vector of half-widths or a {', '.join(kinds)}, got {shown(value)}")
+        raise ValueError(
+            f"a set must be a number, a vector of half-widths or one of {', '.join(kinds)}, got {shown(value)}"
+        )
     return Box(-half, half)
 
 
@@ -260,7 +258,9 @@ class Bounds(ReadOnlyArrays):
     def __post_init__(self) -> None:
         self._put(lambda value, _: as_set(value), (0, 0))
         for name in ("sensor", "first_error"):
-            require_about_zero(getattr(self, name), f"Bounds({name}=...)")
+            if np.any(middle := getattr(self, name).middle):
+                found = shown(np.asarray(middle).tolist())
+                raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {found}")
 
     def sized(self, n: int, p: int) -> Bounds:
         """Returns the bounds of a plant with n states and p outputs, each of which is a sum of sets.
@@ -279,3 +279,18 @@ class Bounds(ReadOnlyArrays):
                 object.__setattr__(self, name, made(getattr(self, name), size))
             except ValueError as error:
                 raise ValueError(f"Bounds({name}=...): {error}") from error
+
+
+def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
+    """Returns Gaussian noise, of which 95 % count, whose bounds are in proportion to the safe box.
+
+    Args:
+        half_widths: Of the safe box, shape (n,).
+        H: Output matrix, shape (p, n).
+        disturbance: Bound of process noise, as a fraction of the half-widths.
+        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs; of the first error in each
+            state, of the smallest half-width.
+    """
+    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
+    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
+    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))

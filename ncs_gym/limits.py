@@ -53,14 +53,13 @@ def as_points(value: Any, size: int, name: str) -> np.ndarray:
     return np.array([as_point(row, size, name) for row in numbers]).reshape(len(numbers), size)
 
 
-def sides(limits: Any, size: int, name: str, *, may_meet: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def sides(limits: Any, size: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Returns the low and the high ends of limits, shape (size,) each; infinite where there is none.
 
     Args:
         limits: Pair (low, high), each a number or shape (size,), possibly infinite.
         size: Number of limited quantities.
         name: What the error message calls the limits.
-        may_meet: Whether a low end may be the high one.
 
     Raises:
         ValueError: If it is no such pair, or a low end is not below the high one.
@@ -69,10 +68,10 @@ def sides(limits: Any, size: int, name: str, *, may_meet: bool = False) -> tuple
     if len(ends) != 2 or any(side is None or side.shape not in ((), (size,)) or np.isnan(side).any() for side in ends):
         raise ValueError(f"{name} must be a pair (low, high), each a number or shape ({size},), got {shown(limits)}")
     low, high = (np.broadcast_to(np.asarray(side), (size,)).copy() for side in ends)
-    if not (low <= high if may_meet else low < high).all():
-        order = "low <= high" if may_meet else "low < high"
+    if not (low < high).all():
         raise ValueError(
-            f"{name} must be (low, high), each a number or a vector, with {order} everywhere, got {shown(limits)}"
+            f"{name} must be (low, high), each a number or a vector, with low < high everywhere: give all low "
+            f"ends, then all high ones, got {shown(limits)}"
         )
     return low, high
 
@@ -132,52 +131,12 @@ def in_units_of_range(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Ro
     limited = np.isfinite(low) | np.isfinite(high)
     rows, low, high = rows[limited], low[limited], high[limited]
     half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.minimum(-low, high))
-    symmetric = -low == high
-    low, high = np.where(symmetric, -1.0, low / half), np.where(symmetric, 1.0, high / half)
-    return Rows(
-        (1.0 / half)[:, None] * rows, np.where(low < -1e300, -np.inf, low), np.where(high > 1e300, np.inf, high)
-    )
+    return Rows((1.0 / half)[:, None] * rows, low / half, high / half)
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
     """Returns all rows of several."""
     return Rows(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-
-
-def as_row_ends(value: Any, rows: int, name: str = "box_ends", *, around_zero: bool = True) -> np.ndarray:
-    """Returns the low and the high ends of rows, shape (2, rows); -1 and 1 for None.
-
-    Args:
-        value: A pair, in lists of which None stands for an infinite end, as in files; or None.
-        rows: Their number.
-        name: What the error message calls them.
-        around_zero: Whether zero has to be between them.
-
-    Raises:
-        ValueError: If they are no such ends, or a row has none.
-    """
-    if value is None:
-        return np.array([[-1.0], [1.0]]) * np.ones(rows)
-    if isinstance(value, list) and len(value) == 2:
-        value = [_with_infinity(side, sign) for side, sign in zip(value, (-np.inf, np.inf), strict=True)]
-    low, high = sides(value, rows, name)
-    if around_zero and not ((low < 0.0) & (high > 0.0)).all():
-        raise ValueError(f"{name} must have 0 between them, got {shown(value)}")
-    if not (np.isfinite(low) | np.isfinite(high)).all():
-        raise ValueError(f"one of {name} must be finite for each row, got {shown(value)}")
-    return np.stack([low, high])
-
-
-def listed_ends(ends: np.ndarray) -> list[Any]:
-    """Returns ends of any shape as nested lists for a file, in which None stands for an infinite one."""
-    if ends.ndim > 1:
-        return [listed_ends(each) for each in ends]
-    return [each if np.isfinite(each) else None for each in ends.tolist()]
-
-
-def _with_infinity(ends: Any, infinity: float) -> Any:
-    """Returns ends that may be a file's, in which None stands for an infinite one."""
-    return [infinity if each is None else each for each in ends] if isinstance(ends, list) else ends
 
 
 class Within(NamedTuple):
@@ -292,8 +251,8 @@ class Limits(ReadOnlyArrays):
         fits = (widths > SMALLEST_NUMBER) & (widths < LARGEST_NUMBER) | (widths == np.inf)
         if not fits.all() or not np.isfinite(widths).any():
             raise ValueError(
-                f"{name} limits must be positive half-widths of shape ({size},), or a pair (low, high) of vectors, got "
-                f"{shown(getattr(self, name))}"
+                f"{name} limits must be positive half-widths of shape ({size},), not all infinite, or a pair (low, "
+                f"high) of vectors, got {shown(getattr(self, name))}"
             )
         return np.broadcast_to(widths, (size,))
 

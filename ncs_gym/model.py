@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.limits import as_point
-from ncs_gym.plants.statespace import SAME_STEP, matrices_of, zero_order_hold
+from ncs_gym.plants.statespace import SAME_STEP, zero_order_hold
 from ncs_gym.validation import (
     SMALLEST_NUMBER,
     ReadOnlyArrays,
@@ -59,11 +59,11 @@ class Model(ReadOnlyArrays):
     offset: Any = None
     continuous: Any = None
     delays: int = 0
-    state: np.ndarray = field(init=False)
-    input: np.ndarray = field(init=False)
-    is_given: tuple[bool, bool] = field(init=False)
-    lacking: np.ndarray = field(init=False)
-    step_offset: np.ndarray = field(init=False)
+    state: np.ndarray = field(init=False, repr=False)
+    input: np.ndarray = field(init=False, repr=False)
+    is_given: tuple[bool, bool] = field(init=False, repr=False)
+    lacking: np.ndarray = field(init=False, repr=False)
+    step_offset: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         A = as_matrix(self.A, (None, None), "A")
@@ -76,7 +76,10 @@ class Model(ReadOnlyArrays):
         if not isinstance(at, tuple | list) or len(at) != 2:
             raise ValueError(f"at must be a pair of a state and an input, got {shown(at)}")
         named = zip(("state", "input"), at, (n, m), strict=True)
-        x, u = (np.zeros(size) if of is None else as_point(of, size, f"the {name} of at") for name, of, size in named)
+        x, u = (
+            np.zeros(size) if of is None else as_point(of, size, f"the {name} in at=(state, input)")
+            for name, of, size in named
+        )
         made = {
             "at": frozen_inside(self.at),
             "A": A,
@@ -91,7 +94,7 @@ class Model(ReadOnlyArrays):
             made["offset"] = offset = as_vector(self.offset, n, "offset")
             made |= {"lacking": _residual(A, B, offset, x, u), "step_offset": np.abs(offset)}
         if self.continuous is not None:
-            made["continuous"] = as_matrix(self.continuous, (n, n + m), "continuous_model")
+            made["continuous"] = as_matrix(self.continuous, (n, n + m), "continuous")
         made["delays"] = as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY)
         for name, value in made.items():
             object.__setattr__(self, name, value)
@@ -103,6 +106,7 @@ class Model(ReadOnlyArrays):
         A = as_matrix(A, (None, None), "A")
         A = as_matrix(A, (len(A), len(A)), "A")
         B = as_matrix(B, (len(A), None), "B")
+        C = None if C is None else as_matrix(C, (None, len(A)), "C")
         dt = as_number(dt, "dt", low=0.0, low_open=True)
         return cls(*zero_order_hold(A, B, dt), C, dt, at, continuous=np.concatenate([A, B], axis=1))
 
@@ -119,7 +123,7 @@ class Model(ReadOnlyArrays):
         Raises:
             ValueError: If it is no such model, D is not zero, or dt is missing or another than the model's.
         """
-        *matrices, own = matrices_of(system)
+        *matrices, own = _matrices_of(system)
         A = as_matrix(matrices[0], (None, None), "A of the model")
         A = as_matrix(A, (len(A), len(A)), "A of the model")
         B = as_matrix(matrices[1], (len(A), None), "B of the model")
@@ -149,7 +153,9 @@ class Model(ReadOnlyArrays):
             ValueError: If the model was not sampled from one in continuous time.
         """
         if self.continuous is None:
-            raise ValueError("only a model that was sampled from one in continuous time says what is held over a step")
+            raise ValueError(
+                "what is held over a step is known of a model that Model.sampled made from one in continuous time"
+            )
         n = len(self.A)
         return zero_order_hold(self.continuous[:, :n], as_matrix(E, (n, None), "E"), self.dt)[1]
 
@@ -172,3 +178,36 @@ def _residual(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarra
     raise ValueError(
         f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
     )
+
+
+def _matrices_of(system: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
+    if isinstance(system, (tuple, list)) and len(system) in (4, 5):
+        A, B, C, D, own = (*system, 0)[:5]
+        return A, B, C, D, _sampling_time(system, own)
+    model: Any = system
+    if not hasattr(model, "A") and (hasattr(model, "to_ss") or hasattr(model, "num")):
+        raise ValueError(
+            f"{shown(system)} is a transfer function, whose states would be nobody's: limits and names are of states, "
+            "so give a state-space model with states of yours"
+        )
+    if not all(hasattr(model, name) for name in "ABCD"):
+        raise ValueError(
+            "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
+            f"(A, B, C, D) or (A, B, C, D, dt), got {shown(system)}"
+        )
+    return model.A, model.B, model.C, model.D, _sampling_time(model, getattr(model, "dt", None))
+
+
+def _sampling_time(model: Any, own: Any) -> Any:
+    """Returns the sampling time of a model; raises ValueError if it leaves open whether there is one."""
+    if own is None:
+        from scipy.signal import lti  # takes long to import, and is there if the model is scipy's
+
+        if isinstance(model, lti):
+            return 0
+        raise ValueError(
+            "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with dt=0 "
+            "or with its sampling time in seconds"
+        )
+    return own

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.limits import as_row_ends, listed_ends
+from ncs_gym.limits import sides
 from ncs_gym.plants.between_samples import MOST_POINTS
 from ncs_gym.validation import (
     FILLED_IN_LATER,
@@ -56,8 +56,7 @@ class Polytope(ReadOnlyArrays):
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
             require_size(len(rows), len(multipliers))
-            ends = None if self.low is None and self.high is None else [self.low, self.high]
-            ends = as_row_ends(ends, len(rows), "the ends of the polytope", around_zero=False)
+            ends = _ends_of(self.low, self.high, len(rows))
             n = rows.shape[1]
             center = np.zeros(n) if self.center is None else as_vector(self.center, n, "the center of the polytope")
             lower = multipliers
@@ -160,6 +159,29 @@ def require_size(rows: int, multipliers: int) -> None:
         )
 
 
+def _ends_of(low: Any, high: Any, rows: int) -> np.ndarray:
+    """Returns the ends of rows, shape (2, rows): -1 and 1 for None; in a file's list None stands for an infinite one.
+
+    Raises:
+        ValueError: If they are no such ends, or a row has none.
+    """
+    if low is None and high is None:
+        return np.array([[-1.0], [1.0]]) * np.ones(rows)
+    given = tuple(
+        [infinity if each is None else each for each in side] if isinstance(side, list) else side
+        for side, infinity in ((low, -np.inf), (high, np.inf))
+    )
+    ends = np.stack(sides(given, rows, "the ends of the polytope"))
+    if not np.isfinite(ends).any(axis=0).all():
+        raise ValueError(f"one of the ends of the polytope must be finite for each row, got {shown(given)}")
+    return ends
+
+
+def _listed(ends: np.ndarray) -> list[float | None]:
+    """Returns ends, shape (r,), for a file, in which None stands for an infinite one."""
+    return [each if np.isfinite(each) else None for each in ends.tolist()]
+
+
 def polytope_content(polytope: Polytope) -> dict[str, Any]:
     """Returns the JSON values of a polytope; of the multipliers the pairs [number of the row, value] that count.
 
@@ -168,7 +190,7 @@ def polytope_content(polytope: Polytope) -> dict[str, Any]:
     content = {"rows": polytope.rows.tolist(), "multipliers": _pairs_of(polytope.multipliers)}
     if polytope.is_symmetric:
         return content
-    ends = {"low": listed_ends(polytope.low), "high": listed_ends(polytope.high)}
+    ends = {"low": _listed(polytope.low), "high": _listed(polytope.high)}
     return content | ends | {"lower_multipliers": _pairs_of(polytope.lower_multipliers)}
 
 

@@ -102,7 +102,7 @@ def largest_error(
     state = Ellipsoid(example.L).sample(rng, STARTS).T
     process = PlantSimulation(plant, example.disturbance, False, STARTS)
     memory, network = process.begin(rng, STARTS), VectorChannelState(channel, rng, STARTS)
-    estimator = make_filter(example, plant, state + plant.sample_initial_error(rng, STARTS).T)
+    estimator = make_filter(example, plant, state + plant.of_first_error.drawn(rng, STARTS).T)
     gain, limit, largest = plant.B @ example.K, plant.u_max[:, None], 0.0
     for step in range(STEPS):
         largest = max(largest, float(np.square(gain @ (estimator.mean - state)).sum(axis=0).max()))

@@ -122,8 +122,8 @@ def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float,
     sampled, given = (each * widths / widths[:n, None] for each in (sampled, np.concatenate([A, B], axis=1)))
     if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
         raise ValueError(
-            "continuous_model is not the one that A and B were sampled from: make the plant by "
-            "Model.sampled, or give continuous=None"
+            "continuous of the Model is not the one that A and B were sampled from: make it by Model.sampled, or give "
+            "continuous=None"
         )
 
 

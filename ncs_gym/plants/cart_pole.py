@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ncs_gym.bounds import noise_in_proportion
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import noise_in_proportion
 
 GRAVITY = 9.81
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box; no gamma, so that every state has

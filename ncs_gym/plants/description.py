@@ -19,6 +19,8 @@ _INDENT, _WIDTH = 16, 80
 _ZERO = 1e-12
 # Stands for a space at which no line ends.
 _UNBROKEN = "\N{NO-BREAK SPACE}"
+# What a plant without each kind of uncertainty assumes.
+_WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noise", "the first estimate is exact")
 
 
 def described(plant: LinearPlant) -> str:
@@ -39,18 +41,10 @@ def described(plant: LinearPlant) -> str:
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
         "safe box": [row_limit(plant, j) for j in np.flatnonzero(~plant.is_past_row).tolist()],
-        "input limits": [
-            _between(name, low, high, center, unit)
-            for name, low, high, center, unit in zip(
-                plant.input_names,
-                plant.input_low.tolist(),
-                plant.input_high.tolist(),
-                plant.operating_input.tolist(),
-                plant.input_units,
-                strict=True,
-            )
-        ],
+        "input limits": [input_limit(plant, i) for i in range(plant.m)],
     }
+    if plant.model.delays:
+        lines["input limits"].append(f"inputs take effect {counted(plant.model.delays, 'step')} later")
     if len(plant.mixed_rows):
         lines["both together"] = [mixed_limit(plant, j) for j in range(len(plant.mixed_rows))]
     if plant.between_samples is not None:
@@ -65,6 +59,30 @@ def described(plant: LinearPlant) -> str:
         for number, text in enumerate(texts)
     )
     return "\n".join(shown_lines).replace(_UNBROKEN, " ")
+
+
+def assumptions_of(plant: LinearPlant) -> tuple[str, ...]:
+    """Returns what is assumed of everything uncertain about a plant."""
+    first = [plant.initial_cov, *([] if plant.initial_bound is None else [plant.initial_bound.shape_matrix])]
+    zero = (
+        not np.any(plant.nominal_disturbance.shape_matrix),
+        not np.any(plant.nominal_sensor_error.shape_matrix),
+        not any(np.any(part) for part in first),
+    )
+    assumed = [f"It is assumed that {text}." for text, is_zero in zip(_WITHOUT, zero, strict=True) if is_zero]
+    noises = {
+        "disturbances": plant.process_noise_cov,
+        "sensor noise": plant.measurement_noise_cov,
+        "the first error": plant.initial_cov,
+    }
+    if truncated := [name for name, covariance in noises.items() if np.any(covariance)]:
+        kept = f"{100.0 * (1.0 - plant.delta):.6g} % (delta = {plant.delta:g}) of {', '.join(truncated)}"
+        assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
+    if plant.remainder is not None:
+        assumed.append(plant.remainder.sentence)
+    if plant.between_samples is not None:
+        assumed.append("What disturbances have done by any time within a step respects the bound of a whole step.")
+    return tuple(assumed)
 
 
 def _sized(size: float, unit: str) -> str:
@@ -94,21 +112,7 @@ def row_limit(plant: LinearPlant, j: int) -> str:
         i = limited[0]
         low, high = sorted([low / float(row[i]), high / float(row[i])])
         return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
-    terms, size, center = limited_sum(plant, j)
-    return f"|{terms}| <= 1" if low == -high else _between(terms, low / size, high / size, center, "")
-
-
-def limited_sum(plant: LinearPlant, j: int) -> tuple[str, float, float]:
-    """Returns what row j of the safe box sums up, by what the row is divided for that, and the operating point of it.
-
-    Where the ends are symmetric these are deviations in units of the limit, else values in units of the largest entry.
-    """
-    row = plant.box[j]
-    if plant.box_low[j] == -plant.box_high[j]:
-        terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in np.flatnonzero(row).tolist())
-        return terms.removeprefix("+"), 1.0, 0.0
-    terms, size = _sum_of(row, plant.state_names)
-    return terms, size, float(row @ plant.operating_state) / size
+    return _sum_between(row, low, high, plant.operating_state, plant.state_names)
 
 
 def input_limit(plant: LinearPlant, i: int) -> str:
@@ -121,32 +125,25 @@ def mixed_limit(plant: LinearPlant, j: int) -> str:
     """Returns what row j of the limits of states and inputs together limits."""
     low, high = plant.mixed_ends[:, j].tolist()
     row, center = np.roll(plant.mixed_rows[j], plant.m), np.concatenate([plant.operating_input, plant.operating_state])
-    return _sum_between(row, low, high, center, [*plant.input_names, *plant.state_names])
+    return _sum_between(row, low, high, center, plant.input_names + plant.state_names)
 
 
 def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, names: Sequence[str]) -> str:
-    """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units."""
-    terms, size = _sum_of(row, names)
-    return _between(terms, low / size, high / size, float(row @ center) / size, "")
+    """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units.
 
-
-def _sum_of(row: np.ndarray, names: Sequence[str]) -> tuple[str, float]:
-    """Returns the sum that a row stands for, in units of its largest entry, and the size of that."""
+    Those are units of its largest entry.
+    """
     size = float(np.abs(row).max())
     terms = "".join(
         f" {'-' if row[i] < 0.0 else '+'} {_factor(abs(float(row[i])) / size)}{names[i]}"
         for i in np.flatnonzero(row).tolist()
     )
-    return terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}", size
+    terms = terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}"
+    return _between(terms, low / size, high / size, float(row @ center) / size, "")
 
 
 def _factor(size: float) -> str:
     return "" if size == 1.0 else f"{size:.4g} "
-
-
-def _deviation(plant: LinearPlant, i: int) -> str:
-    center = plant.operating_state[i]
-    return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
 
 
 def outputs_of(plant: LinearPlant) -> tuple[list[str], list[str]]:

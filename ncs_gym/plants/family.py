@@ -27,13 +27,21 @@ from ncs_gym.validation import as_flag, as_names, as_number, shown
 ROOM = 1e-12
 MOST_PARAMETERS = 6
 # What is the same of all members, but was rounded around other operating points, agrees to this, relatively.
-_ROUNDED = ("box", "box_ends", "input_ends", "mixed_rows", "mixed_ends")
+_ROUNDED = {
+    **dict.fromkeys(("box", "box_ends"), "Limits of states"),
+    "input_ends": "Limits of inputs",
+    **dict.fromkeys(("mixed_rows", "mixed_ends"), "Limits of rates, or of states and inputs together"),
+}
 SAME = 1e-9
 # What is exactly the same of all members, beside their disturbances.
-_SAME = (
-    *("H", "dt", "past", "between_samples", "gamma", "process_noise_cov", "measurement_noise_cov", "initial_cov"),
-    *("delta", "sensor_bound", "initial_bound", "state_names", "state_units", "input_names", "input_units"),
-)
+_SAME = {
+    **{name: name for name in ("H", "dt", "between_samples", "delta")},
+    "past": "delay, or a rate",
+    **dict.fromkeys(("gamma", "process_noise_cov"), "Bounds(disturbance=...)"),
+    **dict.fromkeys(("measurement_noise_cov", "sensor_bound"), "Bounds(sensor=...)"),
+    **dict.fromkeys(("initial_cov", "initial_bound"), "Bounds(first_error=...)"),
+    **dict.fromkeys(("state_names", "state_units", "input_names", "input_units"), "labels"),
+}
 # Bounds of disturbances that hold this rounding agree to this, relative to the terms of a step.
 SAME_BOUND = 1e-8
 
@@ -152,7 +160,7 @@ def _require_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearP
     room = np.zeros(first.n) if cover is None else np.diag(cover.shape_matrix - _disturbance_shape(first))
     if (excess > room).any():
         raise ValueError(
-            f"the members of a family may differ in A and B alone, and {name} has another disturbance_bound"
+            f"the members of a family may differ in A and B alone, and {name} differs in Bounds(disturbance=...)"
         )
 
 
@@ -211,7 +219,7 @@ def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bo
         function=function,
         interval=interval,
         center=_center_of(plants),
-        check=_Shared(first, cover, "another one"),
+        check=_Shared(first, cover, "one inside the ranges"),
     )
     _check_monotone(family, room)
     return family, plants
@@ -277,11 +285,11 @@ class _Shared:
         """Raises ValueError unless a plant, counted from where the first one is, has all that members share."""
         _require_member(self.first, plant)
         moved = _around_center(plant, _resting_points([self.first])[0])
-        for name in (*_ROUNDED, *_SAME):
+        for name, given in (_ROUNDED | _SAME).items():
             one, other = getattr(self.first, name), getattr(moved, name)
             if not _is_same(one, other, SAME if name in _ROUNDED else 0.0):
                 raise ValueError(
-                    f"the members of a family may differ in A and B alone, and {self.name} has another {name}"
+                    f"the members of a family may differ in A and B alone, and {self.name} differs in {given}"
                 )
         _require_covered(self.first, self.cover, plant, self.name)
 

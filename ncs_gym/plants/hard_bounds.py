@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import Ball, Sum
+from ncs_gym.bounds import DELTA, Ball, Sum
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from ncs_gym.validation import ReadOnlyArrays, read_only
@@ -24,8 +24,6 @@ FLAT_INFLATION = 1e-12
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
-# Of what is truncated where nothing is.
-DELTA = 0.05
 # A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
 FREE_REACH = 100.0
 
@@ -48,7 +46,7 @@ class Source(NamedTuple):
         ball = Ellipsoid(self.ball * np.eye(len(self.noise.covariance)))
         return [ball, self.noise.bound, *([] if self.bound is None else [self.bound])]
 
-    def drawn(self, rng: np.random.Generator, count: int | None, *, truncated: bool) -> np.ndarray:
+    def drawn(self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True) -> np.ndarray:
         """Returns noise, truncated or not, plus a uniform point of the bound unless that is one, (n,) or (count, n)."""
         samples = self.noise.sample(rng, count, truncated=truncated)
         if self.bound is None or not self.bound.shape_matrix.any():
@@ -265,18 +263,6 @@ class HardBounds(ReadOnlyArrays):
         P0 = summed(self.of_first_error, self.n + 2)
         Q = Q if self.remainder_bound is None else Q + self.remainder_bound.shape_matrix
         return read_only(Q), read_only(R), read_only(P0)
-
-    def sample_sensor_noise(
-        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
-    ) -> np.ndarray:
-        """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
-        return self.of_sensor.drawn(rng, count, truncated=truncated)
-
-    def sample_initial_error(
-        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
-    ) -> np.ndarray:
-        """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
-        return self.of_first_error.drawn(rng, count, truncated=truncated)
 
 
 def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:

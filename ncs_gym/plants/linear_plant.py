@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import Bounds, Gaussian, Sum, Through
+from ncs_gym.bounds import DELTA, Bounds, Gaussian, Sum, Through
 from ncs_gym.limits import Limits, as_points
 from ncs_gym.model import Model
 from ncs_gym.plants import between_samples, plant_file, statespace
-from ncs_gym.plants.assumptions import assumptions_of
-from ncs_gym.plants.description import described
-from ncs_gym.plants.hard_bounds import DELTA, HardBounds, Source, source_of, weight_of
+from ncs_gym.plants.description import assumptions_of, described
+from ncs_gym.plants.hard_bounds import HardBounds, Source, source_of, weight_of
 from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.plants.resting_point import Rest, at_rest, with_residual
@@ -186,7 +185,8 @@ class LinearPlant(LimitValues, HardBounds):
         """Keeps names and units of states and inputs."""
         labels = {} if self.labels is None else self.labels
         if not isinstance(labels, Mapping) or not {*labels} <= {"states", "inputs"}:
-            raise ValueError(f"labels must have names with their units, by states and inputs, got {shown(labels)}")
+            form = '{"states": {name: unit, ...}, "inputs": {name: unit, ...}}'
+            raise ValueError(f"labels must be {form}, either of which may be left out, got {shown(labels)}")
         for name, size, letter in (("state", self.n - self.past, "x"), ("input", self.m, "u")):
             given = labels.get(f"{name}s", {})
             if not isinstance(given, Mapping):
@@ -228,7 +228,7 @@ class LinearPlant(LimitValues, HardBounds):
                 f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
             )
         if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
-            raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
+            raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
 
     def resampled(self, dt: float) -> LinearPlant:
         """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
@@ -360,11 +360,6 @@ class LinearPlant(LimitValues, HardBounds):
                 "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
                 f"what was asked for (a plant has {instead}, mixed_rows and mixed_ends)"
             )
-
-    @cached_property
-    def symmetric_box(self) -> np.ndarray:
-        """Rows c_j of the largest box |c_j x| <= 1 inside the safe box, shape (k, n)."""
-        return read_only(self.box / np.minimum(-self.box_low, self.box_high)[:, None])
 
     @property
     def members(self) -> Any:

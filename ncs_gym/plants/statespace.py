@@ -1,16 +1,10 @@
-"""Models in continuous time and from elsewhere: sampled exactly."""
+"""Models in continuous time, sampled exactly."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import Bounds, Gaussian
-from ncs_gym.plants.hard_bounds import DELTA
-from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from ncs_gym.validation import shown
 
 # Durations of steps that differ by less than this are the same.
 SAME_STEP = 1e-9
@@ -35,51 +29,3 @@ def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray
     except OverflowError as error:
         raise ValueError(f"the model grows beyond all numbers within a step of {dt:g} s: give a smaller dt") from error
     return sampled[:n, :n], sampled[:n, n:]
-
-
-def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
-    """Returns Gaussian noise, of which 95 % count, whose bounds are in proportion to the safe box.
-
-    Args:
-        half_widths: Of the safe box, shape (n,).
-        H: Output matrix, shape (p, n).
-        disturbance: Bound of process noise, as a fraction of the half-widths.
-        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs; of the first error in each
-            state, of the smallest half-width.
-    """
-    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
-    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
-    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))
-
-
-def matrices_of(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
-    if isinstance(sys, (tuple, list)) and len(sys) in (4, 5):
-        A, B, C, D, own = (*sys, 0)[:5]
-        return A, B, C, D, _sampling_time(sys, own)
-    model: Any = sys
-    if not hasattr(model, "A") and (hasattr(model, "to_ss") or hasattr(model, "num")):
-        raise ValueError(
-            f"{shown(sys)} is a transfer function, whose states would be nobody's: limits and names are of states, so "
-            "give a state-space model with states of yours"
-        )
-    if not all(hasattr(model, name) for name in "ABCD"):
-        raise ValueError(
-            "sys must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
-            f"(A, B, C, D) or (A, B, C, D, dt), got {shown(sys)}"
-        )
-    return model.A, model.B, model.C, model.D, _sampling_time(model, getattr(model, "dt", None))
-
-
-def _sampling_time(model: Any, own: Any) -> Any:
-    """Returns the sampling time of a model; raises ValueError if it leaves open whether there is one."""
-    if own is None:
-        from scipy.signal import lti  # takes long to import, and is there if the model is scipy's
-
-        if isinstance(model, lti):
-            return 0
-        raise ValueError(
-            "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with dt=0 "
-            "or with its sampling time in seconds"
-        )
-    return own

@@ -28,8 +28,6 @@ ANGLE, RATE = 0.25, 1.5
 ROUNDING, TORQUE_ROUNDING = 1e-9, 3.0 * 2.0**-24
 # At least this much of the fastest rate: the sums of a step are rounded in float64.
 STEP_ROUNDING = 1e-14
-# What the proof is about.
-PROVED_FOR = ("A", "B", "box", "u_max", "dt", "remainder")
 
 
 @dataclass(frozen=True, kw_only=True)

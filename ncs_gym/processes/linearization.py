@@ -139,6 +139,8 @@ def linear_model(
     moving = process if isinstance(process, Process) else FunctionProcess(process)
     if not isinstance(limits, Limits):
         raise ValueError(f"limits must be Limits, got {shown(limits)}")
+    if limits.state is None:
+        raise ValueError("the remainder is bounded over limits of every state: give Limits(state=...)")
     n, m = (_size_of(each, of) for each, of in zip((limits.state, limits.input), at or (None, None), strict=True))
     own = replace(limits, rate=None)
     frame = LinearPlant(Model(np.zeros((n, n)), np.zeros((n, m)), None, dt, at), own, _NOTHING)
@@ -190,6 +192,8 @@ def _size_of(limits: Any, point: Any) -> int:
     numbers = as_setting(limits if point is None else point)
     if numbers is None:  # a number and a vector
         return max((np.size(end) for end in limits), default=1) if isinstance(limits, tuple) else 1
+    if point is None and numbers.shape == (2,) and numbers[0] <= 0.0:  # ends of one, no half-widths of two
+        return 1
     return numbers.shape[-1] if numbers.ndim else 1
 
 

@@ -148,13 +148,13 @@ class PlantSimulation:
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         if self._is_extreme:
             return (1.0 - ROUNDING) * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
-        return self.plant.sample_sensor_noise(rng, count, truncated=self._truncated).T
+        return self.plant.of_sensor.drawn(rng, count, truncated=self._truncated).T
 
     def first_error(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
         """Returns the error of a first estimate, shape (n,), or of `count` of them, shape (n, count)."""
         if self._is_extreme:
             return (1.0 - ROUNDING) * self.plant.nominal_initial_error.sample_boundary(rng, count).T
-        return self.plant.sample_initial_error(rng, count, truncated=self._truncated).T
+        return self.plant.of_first_error.drawn(rng, count, truncated=self._truncated).T
 
     def forget(self) -> None:
         """Forgets noise drawn ahead: after seeding, everything depends on the seed alone."""

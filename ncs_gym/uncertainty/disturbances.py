@@ -1,7 +1,7 @@
 """What acts on the plant inside the bound that the certificates assume: the base class, the kinds, and the checks.
 
-Ball, box and sinusoid stay within d'd <= gamma plus the declared bound, and truncated process noise is added to them.
-Sphere and adversary use the whole of E(D), process noise included.
+Ball, box and sinusoid stay within the ball and the other sets that a plant's bounds declare, and truncated process
+noise is added to them. Sphere and adversary use the whole of E(D), process noise included.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.shared import begun_many, storing_nothing
-from ncs_gym.uncertainty.declared_bound import diagonal_inside, sample_box
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, sum_gauge
 from ncs_gym.validation import (
     LARGEST_NUMBER,
@@ -39,7 +38,7 @@ NOISES = ("truncated", "gaussian", "extreme")
 
 
 class Disturbance(ReadOnlyArrays, ABC):
-    """A disturbance in the ball d'd <= gamma plus `disturbance_bound`; truncated process noise is added to it.
+    """A disturbance in the ball d'd <= `gamma` of a plant plus its `disturbance_bound`; process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
     settings, so that one object serves any number of environments; a vector environment refuses what does. The class
@@ -170,12 +169,13 @@ class BoxDisturbance(Disturbance):
         if bound is None:
             length = float(np.sum(np.square(corner)))
             if length > plant.gamma * (1.0 + ROUNDING):
-                return f"the corner of the box has squared length {length:g} > gamma = {plant.gamma:g}"
+                allowed = f"the ball in the plant's Bounds(disturbance=...) has radius {np.sqrt(plant.gamma):g}"
+                return f"the corner of the box is {np.sqrt(length):g} long, {allowed}"
             return ""
         # Of sets with the coordinates as axes, all corners lie equally far out.
         size = sum_gauge(corner, plant.gamma * np.eye(plant.n), diagonal_inside(bound))
         if size > 1.0 + ROUNDING:
-            return f"the box is {size:.6g} times as large as one in the ball of gamma plus disturbance_bound may be"
+            return f"the box is {size:.6g} times as large as one within the plant's Bounds(disturbance=...) may be"
         return ""
 
 
@@ -209,6 +209,37 @@ class SinusoidDisturbance(Disturbance):
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         axis, phase = memory[:-1], memory[-1]
         return axis * np.sin(2.0 * np.pi * step / self.period + phase)
+
+
+def sample_box(bound: Ellipsoid, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+    """Returns points that are uniform in the box inside an ellipsoid along its principal axes.
+
+    For a bound given by half-widths that is the box of these half-widths.
+
+    Args:
+        bound: The ellipsoid.
+        rng: Source of randomness.
+        count: Number of points; None for a single one.
+
+    Returns:
+        Shape (n,), or (n, count).
+    """
+    axes = bound.factor * bound.drawn_axes / np.sqrt(np.count_nonzero(bound.drawn_axes))
+    return axes @ rng.uniform(-1.0, 1.0, bound.dim if count is None else (bound.dim, count))
+
+
+def diagonal_inside(bound: Ellipsoid) -> np.ndarray:
+    """Returns the diagonal shape of an ellipsoid inside one, shape (n, n): that itself if its axes are the coordinates.
+
+    It is j diag(P), j the smallest eigenvalue of P in units in which its diagonal is 1.
+    """
+    variances = np.diag(bound.shape_matrix)
+    kept = variances > 0.0
+    if not kept.any() or np.array_equal(bound.shape_matrix, np.diag(variances)):
+        return bound.shape_matrix
+    scale = np.sqrt(variances[kept])
+    smallest = np.linalg.eigvalsh(bound.shape_matrix[np.ix_(kept, kept)] / np.outer(scale, scale))[0]
+    return max(float(smallest), 0.0) * np.diag(variances)
 
 
 @cache

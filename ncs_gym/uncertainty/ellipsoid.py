@@ -43,6 +43,7 @@ class UncertainSet(ReadOnlyArrays, ABC):
     middle: Any = 0.0
     is_left_out: ClassVar[bool] = False
     kinds: ClassVar[dict[str, type[UncertainSet]]] = {}
+    __array_ufunc__ = None  # numpy would add a set to each entry of an array, and not to the box of half-widths
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Makes documents of sets know the class."""

@@ -144,9 +144,14 @@ def with_noise(
 
 
 def unknown_bounds(plant: LinearPlant) -> list[str]:
-    """Returns the declared bounds of a plant of which the paper's theorems know nothing."""
-    names = ("disturbance_bound", "remainder_bound", "sensor_bound", "initial_bound")
-    declared = {name: getattr(plant, name) for name in names}
+    """Returns the declared bounds of a plant of which the paper's theorems know nothing, as a user gave them."""
+    other = "another set in Bounds({}=...)".format
+    declared = {
+        other("disturbance"): plant.disturbance_bound,
+        "a remainder": plant.remainder_bound,
+        other("sensor"): plant.sensor_bound,
+        other("first_error"): plant.initial_bound,
+    }
     return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]
 
 

@@ -36,11 +36,12 @@ def synthesize(
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if unknown := unknown_bounds(plant):
         raise ValueError(
-            f"the paper's method knows gamma and covariances alone, not {' and '.join(unknown)}: use shields.synthesize"
+            f"the paper's method knows a Ball of disturbances and Gaussians alone, not {' and '.join(unknown)}: use "
+            "shields.synthesize"
         )
     free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
     if free:
-        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box", "S", free)
+        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: limit them", "S", free)
     provenance = {"search": search, "dkappa": dkappa, "drho": drho}
 
     def meets_constraints(solution: OPSolution) -> bool:

@@ -183,8 +183,7 @@ def design_problem(
         without = [name for name, column in zip(plant.state_names, limits.box_rows.T, strict=True) if not column.any()]
         among = f" (of {', '.join(without)})" if without else ""
         raise Infeasible(
-            f"the safe box leaves {free} of {plant.n} directions unbounded{among}: add rows to box with generous "
-            "limits",
+            f"the safe box leaves {free} of {plant.n} directions unbounded{among}: give generous Limits of these",
             "S",
             free,
         )

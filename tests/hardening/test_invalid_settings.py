@@ -163,7 +163,7 @@ SETTINGS = [
 # Where a message names another setting: the shape of an ellipsoid, what does not fit a matrix, a field of a task.
 NAMED = {"shape_matrix": "shape", "A": "B must have shape", "H": "noise_cov must have shape", "task": ""}
 NAMED |= {"B": "operating_input must have shape"}
-NAMED |= {"disturbance": "squared length"}
+NAMED |= {"disturbance": "the corner of the box"}
 
 
 def assert_refused(call, what="it"):

@@ -1,6 +1,7 @@
 """The sets that bound what is uncertain: all answer the same questions, and each owns what it refuses."""
 
 import json
+import warnings
 from fractions import Fraction
 
 import numpy as np
@@ -54,6 +55,12 @@ def test_a_number_is_a_half_width_per_entry_and_a_ball_says_so():
     np.testing.assert_array_equal(Ball(0.5).sized(2).ellipsoid().shape_matrix, 0.25 * np.eye(2))
 
 
+@pytest.mark.parametrize("half_widths", [0.1, [0.1, 0.2], np.array([0.1, 0.2]), np.float64(0.1)])
+def test_half_widths_are_added_to_a_set_from_both_sides(half_widths):
+    for each in (half_widths + Ball(1.0), Ball(1.0) + half_widths):
+        assert each.sized(2).support(np.array([0.0, 1.0])) == 1.0 + np.max(half_widths)
+
+
 def test_supports_of_a_sum_add_up_and_its_middles_too():
     one, other = Box([-1.0, 0.0], [3.0, 4.0]), Through([[1.0], [1.0]], Box(0.0, 2.0))
     both = one + other
@@ -72,7 +79,8 @@ def test_arrays_of_sets_cannot_be_written_to():
     [
         (lambda: Box([0.0, 1.0], [1.0]), "vectors of one size"),
         (lambda: Box(1.0, 0.0), "half-widths of a box must be 0 or from"),
-        (lambda: Box([0.0], [np.inf]), "half-widths of a box must be 0 or from"),
+        (lambda: Box([0.0], [np.inf]), "two finite ends"),
+        (lambda: as_set(np.inf), "two finite ends"),
         (lambda: Ball(-1.0), "the radius of a ball must be a number >= 0"),
         (lambda: Gaussian([[1.0, 2.0], [2.0, 1.0]], 0.1), "positive semidefinite"),
         (lambda: Gaussian([[1.0]], 0.0), "delta must be"),
@@ -80,7 +88,10 @@ def test_arrays_of_sets_cannot_be_written_to():
         (lambda: Through([[1e-30]], 1e-30), "must be 0 or at least"),
         (lambda: Sum((Gaussian([[1.0]], 0.1), Gaussian([[1.0]], 0.1))), "one Gaussian"),
         (lambda: Box([0.0], [1.0]) + Box([0.0, 0.0], [1.0, 1.0]), "dimension 1 is needed, got one in dimension 2"),
-        (lambda: as_set([[1.0, 1.0], [1.0, 2.0]]), "a set must be a number, a vector of half-widths or a"),
+        (
+            lambda: as_set([[1.0, 1.0], [1.0, 2.0]]),
+            "a set must be a number, a vector of half-widths or one of Ellipsoid,",
+        ),
         (lambda: as_set({"Box": {"low": 0.0}}), "a set must be a number"),
         (lambda: as_set(None), "a set must be a number"),
         (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
@@ -97,7 +108,7 @@ def test_arrays_of_sets_cannot_be_written_to():
     ],
 )
 def test_what_is_no_set_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message), warnings.catch_warnings(action="error"):
         make()
 
 

@@ -22,6 +22,7 @@ from ncs_gym import (
     Remainder,
     Sum,
     Through,
+    linear_model,
 )
 from shields import SafetyShield
 
@@ -155,7 +156,7 @@ def test_zero_is_said_on_purpose_and_warns_of_nothing():
         (lambda: LinearPlant(MODEL, LIMITS, 0.1), "bounds must be a Bounds"),
         (lambda: LinearPlant(MODEL, Limits([1.0], 1.0), BOUNDS), "state limits must be a pair"),
         (lambda: LinearPlant(MODEL, LIMITS, Bounds([0.1] * 3, 0.1, 0.1)), r"Bounds\(disturbance=...\)"),
-        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"outputs": {}}), "labels must have names"),
+        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"outputs": {}}), 'labels must be {"states": {name: unit'),
         (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"states": ["x", "y"]}), "a dictionary of names"),
         (lambda: LinearPlant(ABOUT, LIMITS, BOUNDS), "state limits are absolute beside at="),
         (lambda: LinearPlant(MODEL, Limits((-1.0, 5.0), 1.0), BOUNDS), "positive half-widths of shape"),
@@ -163,11 +164,19 @@ def test_zero_is_said_on_purpose_and_warns_of_nothing():
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], (-np.inf, 5.0)), BOUNDS), "input limits must be finite"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, [([0.0, 1.0], [0.0], -1.0, 1.0)]), BOUNDS), "something"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, between_samples=4), BOUNDS), "between_samples needs"),
+        (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], np.inf), BOUNDS), "not all infinite"),
+        (lambda: LinearPlant(MODEL, Limits([(-1, 1), (-2, 2)], 1.0), BOUNDS), "all low ends, then all high ones"),
         (lambda: Limits([1.0, 2.0]), "need input="),
         (lambda: Limits(input=1.0, rows=[([1.0], -1.0, 1.0)]), "rows of limits must be a list"),
         (lambda: Model(A, B, [[0.0, 0.0]], 0.1), "every row of H"),
         (lambda: Model(A, B, None, 0.1, at=3.0), "at must be a pair"),
+        (lambda: Model(A, B, None, 0.1, at=[0.5, 0.0]), r"the state in at=\(state, input\) must have shape"),
+        (lambda: Model(A, B, None, 0.1, continuous=A), "^continuous must have shape"),
+        (lambda: Model.sampled(A, B, [[1.0]], 0.1), "^C must have shape"),
+        (lambda: Model.of(A, 0.1), "^the system must be a state-space model"),
         (lambda: MODEL.held(np.eye(2)), "in continuous time"),
+        (lambda: linear_model(np.add, Limits(input=1.0), BOUNDS, 0.1), r"give Limits\(state=...\)"),
+        (lambda: linear_model(np.add, Limits((-1.0, 1.0), (0.0, 8.0)), BOUNDS, 0.1), r"give at=\(state, input\)"),
         (lambda: MODEL.with_delays(-1), "delays must be a whole number"),
         (
             lambda: LinearPlant(MODEL, LIMITS, Bounds(Gaussian(np.eye(2), 0.1), Gaussian(np.eye(2), 0.2), 0.0)),

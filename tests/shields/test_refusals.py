@@ -71,15 +71,19 @@ REFUSED = [
         (
             lambda name=name: paper_synthesis(altered(plant(), **{name: 1e-4})),
             ValueError,
-            f"the paper's method knows gamma and covariances alone, not {name}",
+            rf"knows a Ball of disturbances and Gaussians alone, not another set in Bounds\({given}=...\)",
         )
-        for name in ("disturbance_bound", "sensor_bound", "initial_bound")
+        for name, given in (
+            ("disturbance_bound", "disturbance"),
+            ("sensor_bound", "sensor"),
+            ("initial_bound", "first_error"),
+        )
     ),
     (lambda: paper_synthesis(library_plant(truck_trailer, box=[[0.5, 0.0]])), Infeasible, "unbounded"),
     (
         lambda: certify(free_plant(), np.eye(2), np.ones((1, 2))),
         Infeasible,
-        r"leaves 1 of 2 directions unbounded \(of x2\): add rows to box with generous limits",
+        r"leaves 1 of 2 directions unbounded \(of x2\): give generous Limits of these",
     ),
     (
         lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]),

@@ -345,10 +345,10 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
 @pytest.mark.parametrize(
     ("changed", "name"),
     [
-        ({"disturbance_bound": 0.05}, "disturbance_bound"),
-        ({"box": [1.0, 1.0]}, "box"),
+        ({"disturbance_bound": 0.05}, r"Bounds\(disturbance=...\)"),
+        ({"box": [1.0, 1.0]}, "Limits of states"),
         ({"H": [[1.0, 0.1], [0.0, 1.0]]}, "H"),
-        ({"u_max": 2.0}, "input_ends"),
+        ({"u_max": 2.0}, "Limits of inputs"),
     ],
 )
 def test_what_members_share_is_compared_inside_the_ranges(changed, name):
@@ -357,12 +357,12 @@ def test_what_members_share_is_compared_inside_the_ranges(changed, name):
         return linear_plant(**SMALL | model | (changed if abs(angle) < where else {}))
 
     where = 0.6  # on the grid
-    with pytest.raises(ValueError, match=f"another one has another {name}"):
+    with pytest.raises(ValueError, match=f"one inside the ranges differs in {name}"):
         family_of(of, {"angle": (-1.16, 1.16)}, monotone=True)
     where = 1e-3  # between its points
     env = loop_env(family_of(of, {"angle": (-1.16, 1.16)}, monotone=True))
     env.reset(options={"parameters": {"angle": 0.5}})
-    with pytest.raises(ValueError, match=f"another one has another {name}"):
+    with pytest.raises(ValueError, match=f"one inside the ranges differs in {name}"):
         env.reset(options={"parameters": {"angle": 0.0}})
 
 
@@ -425,9 +425,9 @@ REFUSED = {
     "one plant": (lambda: family_of(TRUCKS[:1]), "two plants or more"),
     "no truth value": (lambda: family_of(TRUCKS, at_rest="no"), "at_rest must be"),
     "no plant": (lambda: family_of([*TRUCKS, 3]), "must be plants"),
-    "another box": (lambda: family_of(two(box=[1.0, 1.0])), "member 1 has another box"),
-    "another noise": (lambda: family_of(two(disturbance_bound=0.1)), "another disturbance_bound"),
-    "a step": (lambda: family_of(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "another dt"),
+    "another box": (lambda: family_of(two(box=[1.0, 1.0])), "member 1 differs in Limits of states"),
+    "another noise": (lambda: family_of(two(disturbance_bound=0.1)), r"differs in Bounds\(disturbance=...\)"),
+    "a step": (lambda: family_of(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "differs in dt"),
     "a remainder": (lambda: family_of(two(remainder=LEFT_OUT)), "a remainder of its own"),
     "between samples": (lambda: family_of([SAMPLED, SAMPLED]), "between_samples is not proved for a family"),
     "between samples later": (lambda: altered(HULL, between_samples=4), "between_samples"),

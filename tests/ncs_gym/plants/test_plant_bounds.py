@@ -121,15 +121,13 @@ def test_loop_keeps_every_error_in_its_set_and_raises_no_alarm(name):
         infos = many.step(rng.uniform(-1, 1, (20, 1)).astype(np.float32))[-1]
 
 
-@pytest.mark.parametrize(
-    ("bound", "sample"), [("sensor_bound", "sample_sensor_noise"), ("initial_bound", "sample_initial_error")]
-)
-def test_noise_is_drawn_from_the_declared_bound_up_to_its_edge(bound, sample):
+@pytest.mark.parametrize(("bound", "source"), [("sensor_bound", "of_sensor"), ("initial_bound", "of_first_error")])
+def test_noise_is_drawn_from_the_declared_bound_up_to_its_edge(bound, source):
     plant = plain(**{bound: [0.2, 0.01]})
     rng = np.random.default_rng(0)
-    gauges = getattr(plant, bound).gauge(getattr(plant, sample)(rng, 2000))
+    gauges = getattr(plant, bound).gauge(getattr(plant, source).drawn(rng, 2000))
     assert 0.99 < gauges.max() <= 1.0 + 1e-12
-    assert getattr(plant, sample)(rng).shape == (2,)
+    assert getattr(plant, source).drawn(rng).shape == (2,)
 
 
 def test_estimator_picks_useful_gains_from_declared_bounds_alone():

@@ -127,7 +127,7 @@ def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
         assert np.abs(d[:2]).max() > 0.0  # the adversary does not waste itself on stored inputs
         np.testing.assert_array_equal(d[2:], 0.0)
     np.testing.assert_array_equal(plant.process_noise.sample(rng)[2:], 0.0)
-    np.testing.assert_array_equal(plant.sample_initial_error(rng)[2:], 0.0)
+    np.testing.assert_array_equal(plant.of_first_error.drawn(rng)[2:], 0.0)
     assert (np.diag(plant.disturbance.shape_matrix)[2:] < 1e-12).all()
     assert (np.diag(plant.initial_error.shape_matrix)[2:] < 1e-12).all()
 

@@ -7,7 +7,7 @@ import pytest
 
 from ncs_gym import Ellipsoid
 from ncs_gym.bounds import Box, Through, as_set
-from ncs_gym.uncertainty.declared_bound import diagonal_inside, sample_box
+from ncs_gym.uncertainty.disturbances import diagonal_inside, sample_box
 
 
 def test_half_widths_give_the_smallest_ellipsoid_around_their_box():

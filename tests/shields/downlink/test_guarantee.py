@@ -302,7 +302,7 @@ def test_safe_loop_speaks_the_protocol(downlink):
     actuator = Actuator(loop.input_delay, PLANT.m)
     up, down = ChannelState(UPLINK, rng), ChannelState(downlink, rng)
     state = 0.2 * Ellipsoid(certificate.L).sample_boundary(rng)
-    loop.start(state + PLANT.sample_initial_error(rng))
+    loop.start(state + PLANT.of_first_error.drawn(rng))
     actuator.start(loop.episode)
     packets, applied, scheduled, worst = [], None, [np.zeros(1)] * loop.input_delay, 0.0
     for step in range(300):
@@ -316,7 +316,7 @@ def test_safe_loop_speaks_the_protocol(downlink):
         applied = actuator.apply(step)
         np.testing.assert_array_equal(applied, scheduled[step])
         state = PLANT.A @ state + PLANT.B @ applied + PLANT.disturbance.sample_boundary(rng)
-        sample = PLANT.H @ state + PLANT.sample_sensor_noise(rng) if up.sends_at(step + 1) else None
+        sample = PLANT.H @ state + PLANT.of_sensor.drawn(rng) if up.sends_at(step + 1) else None
         packets = up.exchange(rng, step + 1, sample, loop.episode)
     assert 0.8 < worst <= 1.0
 

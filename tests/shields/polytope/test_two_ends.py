@@ -181,7 +181,8 @@ def is_invariant(found, plant):
 
 def within_symmetric(plant):
     """The plant with the largest symmetric limits inside its own."""
-    return altered(plant, box=plant.symmetric_box, u_max=np.minimum(-plant.input_low, plant.input_high))
+    rows = plant.box / np.minimum(-plant.box_low, plant.box_high)[:, None]
+    return altered(plant, box=rows, u_max=np.minimum(-plant.input_low, plant.input_high))
 
 
 def test_ellipsoid_is_not_kept_around_a_resting_point():

@@ -50,7 +50,7 @@ class World:
 
     def start(self, **settings):
         plant = self.plant
-        self.loop.start(self.state + plant.sample_initial_error(self.rng), **settings)
+        self.loop.start(self.state + plant.of_first_error.drawn(self.rng), **settings)
         self.actuator.start(self.loop.episode)
         self.packets, self.echoes, self.step = [], [], 0
 
@@ -63,7 +63,7 @@ class World:
         if is_on:
             if is_heard:
                 self.actuator.receive([loop.command()])
-            sample = plant.H @ self.state + plant.sample_sensor_noise(self.rng)
+            sample = plant.H @ self.state + plant.of_sensor.drawn(self.rng)
             self.packets = [Packet(self.step, sample, loop.episode)]
             u = self.actuator.apply(self.step)
             self.echoes = [self.actuator.echo]

@@ -13,8 +13,8 @@ from shields import Infeasible
 from tests.product import sampled_plant, synthesize
 from tests.verdicts import verified
 
-# Each has its source, what is invented of it, its model, what `LinearPlant.from_statespace` is given, and the age that
-# its network promises.
+# Each has its source, what is invented of it, its model, what else describes the plant, and the age that its network
+# promises.
 CALLS = json.loads((Path(__file__).parents[2] / "data" / "first_calls.json").read_text())
 # Which are refused, and why.
 REFUSED = {"zone_22": r"those that bind: 20 <= air <= 24 .*radii shrink to"}
