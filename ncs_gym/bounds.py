@@ -126,6 +126,7 @@ class Through(UncertainSet):
     """{E w : w in a set}, E of shape (n, q); half-widths of w are a set, too.
 
     A Gaussian is refused, since what holds except with a probability must be seen as that: it has a covariance E P E'.
+    A remainder is, too, since it holds only inside the limits.
     """
 
     E: Any
@@ -136,6 +137,8 @@ class Through(UncertainSet):
         object.__setattr__(self, "set", as_set(self.set).sized(self.E.shape[1]))
         if isinstance(self.set, Gaussian) or (isinstance(self.set, Sum) and self.set.gaussian):
             raise ValueError("a Gaussian through E is a Gaussian of covariance E P E': give that one")
+        if any(each.is_left_out for each in getattr(self.set, "parts", (self.set,))):
+            raise ValueError("what a model leaves out is not taken through E: give the remainder of the states itself")
         object.__setattr__(self, "size", len(self.E))
         object.__setattr__(self, "middle", self.E @ np.broadcast_to(self.set.middle, self.E.shape[1]))
         self._make_arrays_read_only()
@@ -194,6 +197,8 @@ class Sum(UncertainSet):
         return self if sized == self.parts else Sum(sized)
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        if not self.parts:
+            raise ValueError("a sum of no sets has no dimension: give 0")
         around = [each.ellipsoid(weight) for each in self.parts]
         return ellipsoid_around_sum(np.eye(around[0].dim) if weight is None else weight, *around)
 

@@ -42,6 +42,7 @@ class UncertainSet(ReadOnlyArrays, ABC):
     size: int | None = None
     middle: Any = 0.0
     is_left_out: ClassVar[bool] = False
+    __array_ufunc__ = None  # an array plus a set is a sum
     kinds: ClassVar[dict[str, type[UncertainSet]]] = {}
 
     def __init_subclass__(cls, **keywords: Any) -> None:
