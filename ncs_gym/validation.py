@@ -118,6 +118,14 @@ def frozen_inside(value: Any) -> Any:
     return tuple(map(frozen_inside, value)) if type(value) in (list, tuple) else value
 
 
+def as_given(value: Any) -> Any:
+    """Returns a setting of numbers as it was given, which nothing changes any more: sequences as tuples or arrays."""
+    if isinstance(value, np.ndarray | list | tuple):
+        return read_only(value) if isinstance(value, np.ndarray) else tuple(map(as_given, value))
+    numbers = None if isinstance(value, bool | int | float | None) else as_setting(value)
+    return value if numbers is None else frozen(numbers)
+
+
 def frozen(array: np.ndarray) -> np.ndarray:
     """Returns the array itself, which nobody may write to any more."""
     array.setflags(write=False)

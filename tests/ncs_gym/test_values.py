@@ -2,7 +2,10 @@
 
 import json
 import warnings
+from array import array
+from collections import deque
 from dataclasses import replace
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -119,7 +122,7 @@ PLANTS = {
         Bounds(Ball(0.01) + Gaussian(1e-6 * np.eye(2), 0.1), Ellipsoid(np.eye(2)), Through([[1], [2]], 0.1)),
     ),
     "remainder": lambda: LinearPlant(
-        MODEL, LIMITS, Bounds(Sum((0.01, Remainder(Ellipsoid(1e-4 * np.eye(2)), True, "given"))), 0.0, 0.0)
+        MODEL, LIMITS, Bounds(Sum((0.01, Remainder(Ellipsoid(1e-4 * np.eye(2)), True, "inf"))), 0.0, 0.0)
     ),
 }
 
@@ -132,6 +135,26 @@ def test_document_of_a_plant_makes_it_again(name):
     assert again.fingerprint == plant.fingerprint
     assert again.document == plant.document
     assert replace(plant).fingerprint == plant.fingerprint
+
+
+class Pair(NamedTuple):
+    low: object
+    high: object
+
+
+class OwnList(list):
+    pass
+
+
+@pytest.mark.parametrize("kind", [list, OwnList, np.array, deque, lambda numbers: array("d", numbers)])
+def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
+    low, at, row = kind([-1.0, -2.0]), kind([0.0, 1.0]), kind([1.0, 1.0])
+    model = Model(A, B, None, 0.1, at=Pair(at, [0.0]))
+    plant = LinearPlant(model, Limits(Pair(low, [3.0, 4.0]), (-1.0, 1.0), [(row, None, -2.0, 3.0)]), BOUNDS)
+    for each in (low, at, row):
+        each[0] = 0.5
+    assert replace(plant, model=replace(model)).fingerprint == plant.fingerprint
+    assert LinearPlant.read(json.loads(json.dumps(plant.document))).fingerprint == plant.fingerprint
 
 
 def test_sets_of_a_plant_hold_the_sum_of_all_that_is_declared():
