@@ -119,9 +119,12 @@ def frozen_inside(value: Any) -> Any:
 
 
 def as_given(value: Any) -> Any:
-    """Returns a setting of numbers as it was given, which nothing changes any more: sequences as tuples or arrays."""
-    if isinstance(value, np.ndarray | list | tuple):
-        return read_only(value) if isinstance(value, np.ndarray) else tuple(map(as_given, value))
+    """Returns a setting of numbers as it was given, which nothing changes any more: lists as tuples, others as arrays.
+
+    What is no setting of numbers stays as it is, for whoever refuses it.
+    """
+    if isinstance(value, list | tuple):
+        return tuple(map(as_given, value))
     numbers = None if isinstance(value, bool | int | float | None) else as_setting(value)
     return value if numbers is None else frozen(numbers)
 
