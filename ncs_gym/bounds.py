@@ -210,13 +210,20 @@ class Sum(UncertainSet):
 
 
 def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns E, shape (n, q), and w, shape (q,), of each part of a set whose middle is E w, w not zero."""
+    """Returns all E, shape (n, q), and w, shape (q,), whose E w add up to the middle of a set; none is zero.
+
+    Where E is a product, what its rounding lost follows as another one.
+    """
     if isinstance(own, Sum):
         return [each for part in own.parts for each in pushes_of(part)]
-    E, inside = (own.E, own.set) if isinstance(own, Through) else (None, own)
-    if inside is None or not np.any(inside.middle):
-        return []
-    return [(np.eye(inside.size) if E is None else E, inside.middle)]
+    if not isinstance(own, Through):
+        return [(np.eye(own.size), own.middle)] if np.any(own.middle) else []
+    pushes: list[tuple[np.ndarray, np.ndarray]] = []
+    for E, w in pushes_of(own.set):
+        product = exact.product(own.E, E)
+        lost = exact.product(np.hstack([own.E, -product]), np.vstack([E, np.eye(len(w))]))
+        pushes += [(each, w) for each in (product, lost) if each.any()]
+    return pushes
 
 
 def require_about_zero(own: Any, name: str) -> None:

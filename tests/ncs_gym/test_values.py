@@ -5,6 +5,7 @@ import warnings
 from array import array
 from collections import deque
 from dataclasses import replace
+from fractions import Fraction
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -107,6 +108,25 @@ def test_disturbance_with_two_ends_moves_the_point():
     x, u = plant.operating_state, plant.operating_input
     np.testing.assert_allclose(plant.A @ x + plant.B @ u + E @ [0.1], x, atol=1e-12)
     np.testing.assert_allclose(plant.disturbance_bound.shape_matrix, 0.04 * E @ E.T, rtol=1e-6, atol=1e-20)
+
+
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+@pytest.mark.parametrize("seed", [3, 10, 18])
+def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
+    inner, w = np.random.default_rng(seed).uniform(0.1, 1.0, (2, 2)), np.array([0.3, 0.7])
+    large = 1e12 * np.array([1.0, -(inner[0] @ w) / (inner[1] @ w)])
+    E = np.stack([large, [0.01, 0.02]])
+    plant = LinearPlant(
+        Model(0.5 * np.eye(2), B, None, 0.1), LIMITS, Bounds(Through(E, Through(inner, Box(w, w))), 0, 0)
+    )
+
+    def times(matrix, vector):
+        return [sum(Fraction(a) * b for a, b in zip(row, vector, strict=True)) for row in matrix.tolist()]
+
+    push = times(E, times(inner, [*map(Fraction, w.tolist())]))
+    x, u = ([*map(Fraction, each.tolist())] for each in (plant.operating_state, plant.operating_input))
+    terms = zip(times(plant.A, x), times(plant.B, u), push, x, strict=True)
+    assert plant.disturbance.gauge([float(Ax + Bu + d - own) for Ax, Bu, d, own in terms]) <= 1.0
 
 
 PLANTS = {
