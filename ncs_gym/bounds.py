@@ -128,6 +128,7 @@ class Through(UncertainSet):
     """{E w : w in a set}, E of shape (n, q); half-widths of w are a set, too.
 
     A Gaussian is refused, since what holds except with a probability must be seen as that: it has a covariance E P E'.
+    A remainder is, too, since it holds only inside the limits.
     """
 
     E: Any
@@ -138,6 +139,8 @@ class Through(UncertainSet):
         object.__setattr__(self, "set", as_set(self.set).sized(self.E.shape[1]))
         if isinstance(self.set, Gaussian) or (isinstance(self.set, Sum) and self.set.gaussian):
             raise ValueError("a Gaussian through E is a Gaussian of covariance E P E': give that one")
+        if any(each.is_left_out for each in getattr(self.set, "parts", (self.set,))):
+            raise ValueError("what a model leaves out is not taken through E: give the remainder of the states itself")
         object.__setattr__(self, "size", len(self.E))
         object.__setattr__(self, "middle", self.E @ np.broadcast_to(self.set.middle, self.E.shape[1]))
         self._make_arrays_read_only()
@@ -196,6 +199,8 @@ class Sum(UncertainSet):
         return self if sized == self.parts else Sum(sized)
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
+        if not self.parts:
+            raise ValueError("a sum of no sets has no dimension: give 0")
         around = [each.ellipsoid(weight) for each in self.parts]
         return ellipsoid_around_sum(np.eye(around[0].dim) if weight is None else weight, *around)
 
@@ -207,13 +212,20 @@ class Sum(UncertainSet):
 
 
 def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns E, shape (n, q), and w, shape (q,), of each part of a set whose middle is E w, w not zero."""
+    """Returns all E, shape (n, q), and w, shape (q,), whose E w add up to the middle of a set; none is zero.
+
+    Where E is a product, what its rounding lost follows as another one.
+    """
     if isinstance(own, Sum):
         return [each for part in own.parts for each in pushes_of(part)]
-    E, inside = (own.E, own.set) if isinstance(own, Through) else (None, own)
-    if inside is None or not np.any(inside.middle):
-        return []
-    return [(np.eye(inside.size) if E is None else E, inside.middle)]
+    if not isinstance(own, Through):
+        return [(np.eye(own.size), own.middle)] if np.any(own.middle) else []
+    pushes: list[tuple[np.ndarray, np.ndarray]] = []
+    for E, w in pushes_of(own.set):
+        product = exact.product(own.E, E)
+        lost = exact.product(np.hstack([own.E, -product]), np.vstack([E, np.eye(len(w))]))
+        pushes += [(each, w) for each in (product, lost) if each.any()]
+    return pushes
 
 
 def as_set(value: Any) -> Any:

@@ -16,10 +16,10 @@ from ncs_gym.validation import (
     SMALLEST_NUMBER,
     ReadOnlyArrays,
     as_count,
+    as_given,
     as_numbers,
     as_setting,
     as_vector,
-    frozen_inside,
     shown,
     warn_caller,
 )
@@ -175,7 +175,7 @@ class Limits(ReadOnlyArrays):
         ):
             raise ValueError(f"rows of limits must be a list of (c_x, c_u, low, high), got {shown(self.rows)}")
         for name in ("state", "input", "rows", "rate"):
-            object.__setattr__(self, name, frozen_inside(getattr(self, name)))
+            object.__setattr__(self, name, as_given(getattr(self, name)))
         if self.between_samples is not None:
             points = as_count(self.between_samples, "between_samples", low=1, high=MOST_POINTS)
             object.__setattr__(self, "between_samples", points if points > 1 else None)

@@ -14,11 +14,11 @@ from ncs_gym.validation import (
     SMALLEST_NUMBER,
     ReadOnlyArrays,
     as_count,
+    as_given,
     as_matrix,
     as_number,
     as_numbers,
     as_vector,
-    frozen_inside,
     shown,
 )
 
@@ -81,7 +81,7 @@ class Model(ReadOnlyArrays):
             for name, of, size in named
         )
         made = {
-            "at": frozen_inside(self.at),
+            "at": as_given(self.at),
             "A": A,
             "B": B,
             "H": H,

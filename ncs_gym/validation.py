@@ -118,6 +118,17 @@ def frozen_inside(value: Any) -> Any:
     return tuple(map(frozen_inside, value)) if type(value) in (list, tuple) else value
 
 
+def as_given(value: Any) -> Any:
+    """Returns a setting of numbers as it was given, which nothing changes any more: lists as tuples, others as arrays.
+
+    What is no setting of numbers stays as it is, for whoever refuses it.
+    """
+    if isinstance(value, list | tuple):
+        return tuple(map(as_given, value))
+    numbers = None if isinstance(value, bool | int | float | None) else as_setting(value)
+    return value if numbers is None else frozen(numbers)
+
+
 def frozen(array: np.ndarray) -> np.ndarray:
     """Returns the array itself, which nobody may write to any more."""
     array.setflags(write=False)

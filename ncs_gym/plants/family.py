@@ -101,8 +101,12 @@ def family(
 
 
 def _with_bound(plant: LinearPlant, bound: Ellipsoid | None) -> Bounds:
-    """Returns the bounds of a plant with another ellipsoid in place of what is no ball and no Gaussian, (n, n)."""
-    kept = [each for each in plant.bounds.disturbance.parts if isinstance(each, Ball | Gaussian)]
+    """Returns the bounds of a plant with another ellipsoid, (n, n), in place of what its own one holds.
+
+    That is all but a Gaussian, and but balls where no past inputs are (`source_of`).
+    """
+    kinds = Gaussian if plant.past else Ball | Gaussian
+    kept = [each for each in plant.bounds.disturbance.parts if isinstance(each, kinds)]
     n = len(plant.model.A)
     others = [] if bound is None else [Ellipsoid(bound.shape_matrix[:n, :n])]
     return replace(plant.bounds, disturbance=Sum((*kept, *others)))
@@ -126,10 +130,12 @@ def _center_of(plants: list[LinearPlant]) -> np.ndarray:
 
 
 def _around_center(plant: LinearPlant, center: np.ndarray) -> LinearPlant:
-    """Returns a plant whose limits are those in deviations from another state and input, shape (n + m,)."""
-    if not (center - _resting_points([plant])[0]).any():
-        return plant
+    """Returns a plant whose model is about a state and input, shape (n + m,), under disturbances that move neither."""
     point = center[: len(plant.model.A)], center[plant.n :]
+    own = plant.operating_state[: len(point[0])], plant.operating_input
+    about = (np.concatenate(pair) for pair in (own, (plant.model.state, plant.model.input)))
+    if all(np.array_equal(np.concatenate(point), each) for each in about):
+        return plant
     bounds = _with_bound(plant, plant.disturbance_bound)
     model, limits = replace(plant.model, at=point, offset=None), plant.limits.absolute(plant.model)
     return replace(plant, model=model, limits=limits, bounds=bounds)

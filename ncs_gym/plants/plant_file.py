@@ -48,6 +48,7 @@ def values_in(given: Mapping[str, Any] | str | os.PathLike[str]) -> tuple[Any, .
     if not isinstance(document, Mapping) or document.get("format") != _FORMAT:
         raise ValueError(f"{name} is not a plant of format {_FORMAT!r}")
     try:
-        return *(kind(**read_back(document[key])) for key, kind in _KINDS.items()), document["labels"]
-    except (KeyError, TypeError) as error:  # a value is missing, or has other entries
+        given = {**document, "limits": read_back(document["limits"])}
+        return *(kind(**given[key]) for key, kind in _KINDS.items()), given["labels"]
+    except (KeyError, TypeError, RecursionError) as error:  # a value is missing, or has other entries
         raise ValueError(f"{name} is not that of a plant: {reason_of(error)}") from error

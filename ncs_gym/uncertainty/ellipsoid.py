@@ -42,6 +42,7 @@ class UncertainSet(ReadOnlyArrays, ABC):
     size: int | None = None
     middle: Any = 0.0
     is_left_out: ClassVar[bool] = False
+    __array_ufunc__ = None  # an array plus a set is a sum
     kinds: ClassVar[dict[str, type[UncertainSet]]] = {}
     __array_ufunc__ = None  # numpy would add a set to each entry of an array, and not to the box of half-widths
 

@@ -14,7 +14,7 @@ from ncs_gym import exact
 from ncs_gym.bounds import Box
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import ReadOnlyArrays, as_flag, as_matrix, as_names, as_numbers, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_flag, as_matrix, as_names, as_numbers, as_vector, read_only, shown
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -75,6 +75,8 @@ class Family(ReadOnlyArrays):
             if not ((interval[0] <= members) & (members <= interval[1])).all():
                 raise ValueError("the members of a family must lie in its interval")
             object.__setattr__(self, "interval", np.array(interval))
+        if self.center is not None:
+            object.__setattr__(self, "center", as_vector(self.center, members.shape[2] - 1, "the center"))
         if (self.names != ("member",)) != (self.interval is not None):
             raise ValueError("a family of parameters needs the interval of its entries, and one of plants has none")
         if self.function is not None and (self.interval is None or self.check is None):
@@ -85,19 +87,26 @@ class Family(ReadOnlyArrays):
     @property
     def document(self) -> dict[str, Any]:
         """What a file holds: all but the function, so that a family read from one is that of the members listed."""
-        return {name: getattr(self, name) for name in ("names", "parameters", "members", "interval", "at_rest")}
+        names = "names", "parameters", "members", "interval", "center", "at_rest"
+        return {name: getattr(self, name) for name in names}
 
     def bound_for(self, plant: LinearPlant) -> Ellipsoid:
         """Returns what the plant of the middle leaves out of every member, in the dimension of its own states.
 
         Raises:
-            ValueError: If members are of another size, move past inputs otherwise, or differ in what an unlimited state
-                does.
+            ValueError: If members are of another size or about another point, move past inputs otherwise, or differ in
+                what an unlimited state does.
         """
         n, size = plant.n, (plant.n, plant.n + plant.m + 1)
+        point = np.concatenate([plant.operating_state, plant.operating_input])
         if self.members.shape[1:] != size:
             raise ValueError(
                 f"the members of the family must be [A, B, s] of shape {size}, got {self.members.shape[1:]}"
+            )
+        if not np.array_equal(point, np.zeros(len(point)) if self.center is None else self.center):
+            raise ValueError(
+                "the members of the family are in deviations from another operating point than that of this plant "
+                "(which the middle of a disturbance moves): make the family anew of members that rest there"
             )
         listed = self.members if self.interval is None else self.interval
         off = np.abs(listed - np.column_stack([plant.A, plant.B, np.zeros(n)]))

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid
+from ncs_gym import Ellipsoid, Remainder
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through, as_set
 from tests.plants import small
 
@@ -68,6 +68,12 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
     assert both.support(np.array([1.0, -2.0])) == one.support(np.array([1.0, -2.0])) + 1.0
 
 
+def test_an_array_and_a_set_are_a_sum_on_either_side():
+    for both in (np.array([0.1, 0.2]) + Box(-1.0, 3.0), Box(-1.0, 3.0) + np.array([0.1, 0.2])):
+        np.testing.assert_array_equal(both.middle, [1.0, 1.0])
+        np.testing.assert_allclose(both.sized(2).support(np.eye(2)), [2.1, 2.2])
+
+
 def test_arrays_of_sets_cannot_be_written_to():
     for own in (Box([0.0], [1.0]).low, Through(E, 0.1).E, Gaussian(np.eye(2), 0.1).covariance):
         with pytest.raises(ValueError, match="read-only"):
@@ -97,6 +103,10 @@ def test_arrays_of_sets_cannot_be_written_to():
         (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
         (lambda: Through(E, Gaussian(np.eye(2), 0.1)), "a Gaussian of covariance E P E'"),
         (lambda: Through(E, Ball(0.1) + Gaussian(np.eye(2), 0.1)), "a Gaussian of covariance E P E'"),
+        (lambda: Through(E, Remainder(Ellipsoid(np.eye(2)), True, "given")), "is not taken through E"),
+        (lambda: Through(E, Ball(0.1) + Remainder(Ellipsoid(np.eye(2)), True, "given")), "is not taken through E"),
+        (lambda: Through(E, Sum(())), "a sum of no sets"),
+        (lambda: Sum(()).ellipsoid(), "a sum of no sets"),
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
         (lambda: Bounds(0.1, 0.1, Box([0.0, -1.0], [0.2, 1.0])), r"first_error=...\) must have its middle at zero"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),

@@ -2,7 +2,11 @@
 
 import json
 import warnings
+from array import array
+from collections import deque
 from dataclasses import replace
+from fractions import Fraction
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -107,6 +111,25 @@ def test_disturbance_with_two_ends_moves_the_point():
     np.testing.assert_allclose(plant.disturbance_bound.shape_matrix, 0.04 * E @ E.T, rtol=1e-6, atol=1e-20)
 
 
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+@pytest.mark.parametrize("seed", [3, 10, 18])
+def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
+    inner, w = np.random.default_rng(seed).uniform(0.1, 1.0, (2, 2)), np.array([0.3, 0.7])
+    large = 1e12 * np.array([1.0, -(inner[0] @ w) / (inner[1] @ w)])
+    E = np.stack([large, [0.01, 0.02]])
+    plant = LinearPlant(
+        Model(0.5 * np.eye(2), B, None, 0.1), LIMITS, Bounds(Through(E, Through(inner, Box(w, w))), 0, 0)
+    )
+
+    def times(matrix, vector):
+        return [sum(Fraction(a) * b for a, b in zip(row, vector, strict=True)) for row in matrix.tolist()]
+
+    push = times(E, times(inner, [*map(Fraction, w.tolist())]))
+    x, u = ([*map(Fraction, each.tolist())] for each in (plant.operating_state, plant.operating_input))
+    terms = zip(times(plant.A, x), times(plant.B, u), push, x, strict=True)
+    assert plant.disturbance.gauge([float(Ax + Bu + d - own) for Ax, Bu, d, own in terms]) <= 1.0
+
+
 PLANTS = {
     "servo": servo,
     "around a point": around_a_point,
@@ -120,7 +143,7 @@ PLANTS = {
         Bounds(Ball(0.01) + Gaussian(1e-6 * np.eye(2), 0.1), Ellipsoid(np.eye(2)), Through([[1], [2]], 0.1)),
     ),
     "remainder": lambda: LinearPlant(
-        MODEL, LIMITS, Bounds(Sum((0.01, Remainder(Ellipsoid(1e-4 * np.eye(2)), True, "given"))), 0.0, 0.0)
+        MODEL, LIMITS, Bounds(Sum((0.01, Remainder(Ellipsoid(1e-4 * np.eye(2)), True, "inf"))), 0.0, 0.0)
     ),
 }
 
@@ -133,6 +156,26 @@ def test_document_of_a_plant_makes_it_again(name):
     assert again.fingerprint == plant.fingerprint
     assert again.document == plant.document
     assert replace(plant).fingerprint == plant.fingerprint
+
+
+class Pair(NamedTuple):
+    low: object
+    high: object
+
+
+class OwnList(list):
+    pass
+
+
+@pytest.mark.parametrize("kind", [list, OwnList, np.array, deque, np.longdouble, lambda numbers: array("d", numbers)])
+def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
+    low, at, row = kind([-1.0, -2.0]), kind([0.0, 1.0]), kind([1.0, 1.0])
+    model = Model(A, B, None, 0.1, at=Pair(at, [0.0]))
+    plant = LinearPlant(model, Limits(Pair(low, [3.0, 4.0]), (-1.0, 1.0), [(row, None, -2.0, 3.0)]), BOUNDS)
+    for each in (low, at, row):
+        each[0] = 0.5
+    assert replace(plant, model=replace(model)).fingerprint == plant.fingerprint
+    assert LinearPlant.read(json.loads(json.dumps(plant.document))).fingerprint == plant.fingerprint
 
 
 def test_sets_of_a_plant_hold_the_sum_of_all_that_is_declared():

@@ -377,6 +377,45 @@ def test_two_ended_disturbances_move_each_member(few_points):
 
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+def test_middle_of_members_that_a_disturbance_moves_to_one_point_is_about_that_point():
+    def pushed(a):
+        push = ([[1.0], [0.0]], [0.0], [1.0])
+        return linear_plant(**SMALL | {"A": [[0.5, 0.0], [0.0, a]], "box": [3.0, 2.0], "disturbance_bound": push})
+
+    plant = family_of([pushed(0.5), pushed(0.7)])
+    np.testing.assert_array_equal(plant.operating_state, [1.0, 0.0])
+    np.testing.assert_allclose(plant.own_limits, [[-4.0, -2.0], [2.0, 2.0]])
+
+
+def test_balls_count_once_where_inputs_are_under_way():
+    def late(a, at):
+        model = {"A": [[a]], "B": [[1.0]], "dt": 1.0, "operating_state": [at], "operating_input": [0.0]}
+        limits = {"state_limits": (-3.0, 5.0), "input_limits": (-1.0, 1.0), "input_delay": 1}
+        return linear_plant(**model, **limits, gamma=1e-4, sensor_bound=0.0, initial_bound=0.0)
+
+    plant = family_of([late(0.4, 0.5), late(0.6, 1.0)], at_rest=True)
+    np.testing.assert_array_equal(plant.operating_state, [0.75, 0.0])
+    np.testing.assert_allclose(plant.disturbance_bound.shape_matrix, np.diag([1e-4, 0.0]), rtol=1e-3)
+
+
+def read_back(plant):
+    return LinearPlant.read(json.loads(json.dumps(plant.document)))
+
+
+@pytest.mark.parametrize("known", [lambda plant: plant, read_back], ids=["made", "read"])
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+def test_members_belong_to_the_point_that_they_are_in_deviations_from(known):
+    point = {"operating_state": [1.0, 0.5], "operating_input": [0.3]}
+    for plant in (family_of(two(B=[[0.0], [0.4]])), family_of([linear_plant(**SMALL | point)] * 2)):
+        plant = known(plant)
+        x, u = plant.operating_state + 0.1, plant.operating_input
+        moved = {"operating_state": x, "state_limits": (x - 1.0, x + 3.0), "input_limits": (u - 3.0, u + 3.0)}
+        for change in ({"disturbance_bound": ([[1.0], [0.0]], [0.0], [0.01])}, {"operating_input": u} | moved):
+            with pytest.raises(ValueError, match="in deviations from another operating point"):
+                altered(plant, **change)
+
+
+@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
 def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low, few_points):
     def of(a):
