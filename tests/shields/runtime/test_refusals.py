@@ -204,7 +204,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     ],
     (lambda: certified_root(np.ones((2, 2))), CertificateError, "too thin"),
     (lambda: certified_root(0.5 * (THIN @ THIN.T + (THIN @ THIN.T).T)), CertificateError, "too thin"),
-    (lambda: paper_synthesis(with_remainder()), ValueError, "remainder_bound"),
+    (lambda: paper_synthesis(with_remainder()), ValueError, "a remainder"),
     # Loops: their settings, and calls before an episode has begun.
     (lambda: SafeLoop(OF_CART, CART, CONTRACT), ValueError, "channel must be a Channel"),
     (lambda: SafeLoop(OF_CART, CART, Channel(quantization_step=0.1)), ValueError, "rounds more coarsely"),
