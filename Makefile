@@ -75,7 +75,7 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 # pages have them, hints, the same bits in every process, and what worker processes do.
 SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/test_study.py \
 	tests/experiments/commands/test_requirements.py \
-	tests/test_published_plants.py tests/hardening/test_bounded_inputs.py::test_what_is_said_of_a_document_with_long_texts_is_short \
+	tests/test_published_plants.py \
 	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \
 	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process \
 	tests/hardening/test_portability.py::test_operating_points_that_are_found_are_the_same_under_other_kernels \

@@ -1,6 +1,5 @@
 """The commands of `benchmarks/` are those that pages, Makefile, CI and docstrings name."""
 
-import json
 import re
 from functools import wraps
 from importlib import import_module
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import hashes, project
+from benchmarks import project
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -52,15 +51,6 @@ def test_docstring_of_a_module_names_its_commands_which_start_without_options(na
         assert asked_for(name, each).replace("_", "-") == each
 
 
-def test_values_without_a_name_are_taken_and_unknown_ones_refused(capsys):
-    assert asked_for("speed", "first-shield ncs_gym/CartPole-v0 ncs_gym/CSTR-v0") == "first_shield"
-    for module, given in (("shield", "cost --modes nope"), ("speed", "nonsense"), ("silence", "back --idss Pendulum")):
-        with pytest.raises(SystemExit) as ended:
-            asked_for(module, given)
-        assert ended.value.code == 2
-    assert "nope" in capsys.readouterr().err
-
-
 def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(monkeypatch, capsys):
     monkeypatch.setattr(project, "walked", lambda run: (0, 0))
     project.complexity()
@@ -74,25 +64,3 @@ def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(mo
     names = {path.name for path in project.templates_and_data()}
     assert {"comparison.html.j2", "style.css", "ppo.json", "tuned.json", "cart_pole_nonlinear.json"} <= names
     assert not {"agent.json", "CSTR-v0.json"} & names
-
-
-def test_hashes_come_out_again_and_one_that_does_not_is_named(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(hashes, "STEPS", 12)
-    name, file = "ncs_gym/TruckTrailer-v0", tmp_path / "hashes.json"
-
-    def asked(command):
-        try:
-            run(None, (hashes.record, hashes.compare), [command, str(file), "--names", name])
-        except SystemExit as ended:
-            return ended.code, capsys.readouterr().out
-
-    asked("record")
-    found = json.loads(file.read_text())
-    assert capsys.readouterr().out.splitlines() == [f"{what}: {digest}" for what, digest in found.items()]
-    assert {f"{name} {what}" for what in ("bare", *hashes.MODES, "loop", "vector project SameStep")} < set(found)
-    assert asked("compare") == (0, f"0 of {len(found)} hashes differ\n")
-    file.write_text(json.dumps(found | {f"{name} loop": "0" * 16}))
-    other = f"{name} loop: {found[f'{name} loop']}, before {'0' * 16}"
-    assert asked("compare") == (1, f"{other}\n1 of {len(found)} hashes differ\n")
-    monkeypatch.setattr(hashes, "STEPS", 15)
-    assert f"\n{len(found)} of {len(found)} hashes differ" in asked("compare")[1]

@@ -14,24 +14,19 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from agents import SB3VecEnv
-from agents.loop import CostPenalty
-from experiments.baselines.filters import EstimateFilterSettings
 from ncs_gym import (
     Channel,
     NCSEnv,
     Networked,
     RandomChannel,
-    RequestActions,
     VectorNetworked,
     VectorRandomChannel,
-    VectorRequestActions,
 )
 from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.ncs_gym.networked.environments import Counter
-from tests.plants import varying_truck
-from tests.product import linear_plant, loop_env, safety_shield, vector_env, vector_shield
+from tests.product import linear_plant, loop_env, safety_shield, vector_shield
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "ncs_gym.md").read_text()
 ENVIRONMENTS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0")
@@ -158,15 +153,6 @@ def test_actions_of_infos_move_another_environment_alike_also_where_limits_have_
     assert changed > 20
 
 
-def test_correction_is_what_the_docstring_says(loop):
-    env_id, certificate = loop
-    steps = infos(safety_shield(gym.make(env_id), certificate), 100, share=1.0)
-    assert any(info["shield_correction"] > 0.0 for info in steps)
-    for info in steps:
-        correction = np.linalg.norm(info["input_committed"] - info["input_proposed"])
-        assert info["shield_correction"] == pytest.approx(correction, abs=1e-12)
-
-
 def spoil(told):
     """Writes into everything that somebody was told and can write into."""
     if isinstance(told, np.ndarray) and told.dtype != object:
@@ -264,24 +250,3 @@ def test_nobody_changes_a_network_by_writing_into_what_it_told(kind, network):
         assert_tells_what_is_the_listeners_own(
             lambda mode=mode: VectorRandomChannel(VectorNetworked(counters(mode, kind), channel, **network), [LATE])
         )
-
-
-CONVOY = "ncs_gym/ConvoyOnRequest-v0"
-TRUCK = EstimateFilterSettings("trusting", certificate_of(gym.make(ENVIRONMENTS[0]).unwrapped.plant))
-OTHERS = {
-    "a plant that varies": lambda: loop_env(varying_truck()),
-    "plants that vary": lambda: vector_env(plant=varying_truck(), **FEW),
-    "requests": lambda: RequestActions(gym.make(CONVOY), 0.1),
-    "requests of many": lambda: VectorRequestActions(gym.make_vec(CONVOY, **FEW), 0.1),
-    "requests of a network": lambda: RequestActions(Networked(Counter(), Channel(on_request=True)), 0.1),
-    "a filter": lambda: TRUCK(gym.make_vec(ENVIRONMENTS[0], **FEW)),
-    "a filter with autoreset in the step": lambda: TRUCK(
-        gym.make_vec(ENVIRONMENTS[0], autoreset_mode="SameStep", **FEW)
-    ),
-    "a penalty": lambda: CostPenalty(gym.make_vec(ENVIRONMENTS[0], **FEW), 1.0),
-}
-
-
-@pytest.mark.parametrize("make", OTHERS.values(), ids=OTHERS)
-def test_nobody_changes_other_wrappers_by_writing_into_what_they_told(make):
-    assert_tells_what_is_the_listeners_own(make)

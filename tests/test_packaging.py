@@ -3,10 +3,7 @@
 import ast
 import importlib
 import importlib.util
-import json
-import os
 import re
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -19,7 +16,7 @@ import pytest
 import yaml
 
 import ncs_gym
-from ncs_gym.installation import GENERIC_NAMES, install_command
+from ncs_gym.installation import GENERIC_NAMES
 from tests.command import ncs, ncs_process
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -152,12 +149,6 @@ def test_only_what_solves_programs_imports_a_solver():
     assert users == {"shields/synthesis", "shields/paper", "shields/runtime/backup_plans", "experiments/baselines"}
 
 
-def test_environment_and_shields_do_not_import_the_learners():
-    for path in MODULES:
-        if name_of(path).startswith(ORDER[:2]):
-            assert not imports_of(path, LEARNERS), path
-
-
 def test_nothing_that_compiles_at_first_use_is_imported_or_pinned():
     for path in MODULES:
         assert not imports_of(path, COMPILERS), path
@@ -223,10 +214,6 @@ def test_tested_packages_are_those_of_this_tree(package):
     assert Path(importlib.util.find_spec(package).origin).parent == ROOT / package
 
 
-def test_no_init_file_below_tests():
-    assert not list((ROOT / "tests").rglob("__init__.py"))
-
-
 def test_command_is_declared_and_runs_as_a_module():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {"ncs": "experiments.__main__:main"}
@@ -243,29 +230,6 @@ def test_make_alone_says_what_there_is():
     assert alone == help_
     (phony,) = re.findall(r"^\.PHONY: (.*?[^\\])$", (ROOT / "Makefile").read_text(), re.MULTILINE | re.DOTALL)
     assert set(re.findall(r"^  ([a-z-]+) +\S", alone, re.MULTILINE)) == set(phony.replace("\\", "").split())
-
-
-def test_address_is_written_everywhere_and_taken_out_again(tmp_path):
-    shutil.copytree(ROOT / ".ci", tmp_path / ".ci")
-    times = {"pyproject.toml": 1, "CITATION.cff": 1, "README.md": 2, "mkdocs.yml": 1, "examples/tour.ipynb": 1}
-    (tmp_path / "examples").mkdir()
-    for name in times:
-        shutil.copy(ROOT / name, tmp_path / name)
-    for address in ("https://example.org/old", "https://example.org/ncs/gym"):
-        subprocess.run([sys.executable, tmp_path / ".ci" / "address.py", address], check=True, capture_output=True)
-    for name, count in times.items():
-        assert (tmp_path / name).read_text().count("https://example.org") == count, name
-    install = 'pip install "ncs-gym[train] @ git+https://example.org/ncs/gym"\n'
-    assert f"\n{install}" in (tmp_path / "README.md").read_text()
-    cells = json.loads((tmp_path / "examples" / "tour.ipynb").read_text())["cells"]
-    assert '%pip install -q "ncs-gym[train] @ git+https://example.org/ncs/gym"' in "".join(cells[1]["source"])
-    project = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]
-    assert project["urls"]["Source"] == "https://example.org/ncs/gym"
-    cited = yaml.safe_load((tmp_path / "CITATION.cff").read_text())
-    assert cited["repository-code"] == "https://example.org/ncs/gym"
-    assert yaml.safe_load((tmp_path / "mkdocs.yml").read_text())["repo_url"] == "https://example.org/ncs/gym"
-    subprocess.run([sys.executable, tmp_path / ".ci" / "address.py", ""], check=True, capture_output=True)
-    assert all((tmp_path / name).read_text() == (ROOT / name).read_text() for name in times)
 
 
 def test_files_that_the_makefile_names_exist():
@@ -292,54 +256,6 @@ def test_package_of_the_same_name_elsewhere_is_refused_in_one_sentence(name, tmp
     if name != "experiments":
         assert run.returncode == 2
         assert len(run.stderr.strip().splitlines()) == 1
-
-
-@pytest.fixture(scope="module")
-def installed_copy(tmp_path_factory):
-    """The four packages as in site-packages: no project around them."""
-    folder = tmp_path_factory.mktemp("site")
-    for package in ORDER:
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    return folder
-
-
-def run_in(folder, *arguments):
-    environment = os.environ | {"PYTHONPATH": str(folder)}
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", GENERIC_NAMES)
-def test_package_that_was_overwritten_is_told_of(installed_copy, name, tmp_path):
-    init = installed_copy / name / "__init__.py"
-    ours = init.read_text()
-    init.write_text('"""Agents of another distribution."""\n')
-    try:
-        imported = run_in(installed_copy, "-c", "import ncs_gym")
-        command = run_in(installed_copy, "-c", "from experiments.__main__ import main; main()", "--version")
-    finally:
-        init.write_text(ours)
-    assert imported.returncode == 0
-    assert command.returncode == 2
-    assert len(command.stderr.strip().splitlines()) == 1
-    for said in (imported.stderr, command.stderr):
-        assert f"{init} is not this project's: another distribution" in said
-        assert "--force-reinstall" in said
-
-
-def test_training_behind_the_shields_of_another_package_says_so(installed_copy, tmp_path):
-    (tmp_path / "shields.py").write_text("")
-    code = f"import sys, agents; sys.path.insert(0, {str(tmp_path)!r}); agents.LoopConfig"
-    run = run_in(installed_copy, "-c", code)
-    assert f"the package 'shields' that Python finds ({tmp_path / 'shields.py'})" in run.stderr.splitlines()[-1]
-
-
-def test_what_to_install_is_said_for_a_clone_and_for_a_wheel(installed_copy):
-    assert install_command("render") == f"in {ROOT}, pip install -e '.[render]'"
-    run = run_in(installed_copy, "-c", "import ncs_gym.installation as i; print(i.install_command('render'))")
-    assert run.stdout == "pip install 'ncs-gym[render]'\n", run.stderr
 
 
 def test_version_is_one():

@@ -20,17 +20,14 @@ from benchmarks.study import (
     comparisons_table,
     difference,
     environment,
-    evaluation_table,
     impairments_table,
     margins_table,
     network_table,
-    outer_interval,
     prices_table,
     quotable,
-    quoted,
     switched,
 )
-from benchmarks.study_figures import return_figure, study_figures
+from benchmarks.study_figures import study_figures
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.runs.loops import changed_channel
@@ -135,22 +132,12 @@ def test_arms_have_rates_of_every_run_and_intervals_over_runs(made):
     assert nothing["rate_ci95"][0] == 0.0 < nothing["rate_ci95"][1]  # resampling zeros would say that it is certain
 
 
-def test_interval_of_a_rate_contains_the_exact_one():
-    assert outer_interval([0.0, 0.012], [0.0001, 0.022]) == [0.0, 0.022]
-    assert outer_interval([0.5, 0.7], [0.56, 0.69]) == [0.5, 0.7]
-    assert outer_interval(None, [0.0, 0.1]) is None
-
-
 def test_price_is_that_of_the_best_arm_that_violates_anywhere(made):
     agents, regulators = env_of(made)["prices"]
     assert (agents["second"], agents["mean"]) == ("unshielded", pytest.approx(-9.0))
     assert regulators["second"] == "lqr+psf"
     assert regulators["mean"] == pytest.approx(-0.5)
     assert "-9.0" in prices_table(made[0])
-
-
-def test_rates_are_percentages(made):
-    assert "50.0" in row(evaluation_table(env_of(made)), "unshielded")
 
 
 def test_margins_are_the_smallest_without_a_violation(made):
@@ -187,41 +174,6 @@ def test_tables_have_every_arm_and_no_negative_zero(made):
         assert not re.search(r"(?<![\d.])-0(\.0+)?(?![\d.])", text)
         assert max(map(len, text.splitlines())) <= 80
     assert quotable(json.loads(json.dumps(made[0]))) == quotable(made[0])
-
-
-def test_quoted_tables_replace_what_stands_between_the_marks():
-    page = "before\n<!-- study: agents -->\n```\nold\n```\n<!-- end -->\nafter <!-- end -->"
-    once = quoted(page, {"agents": "new"})
-    assert once == "before\n<!-- study: agents -->\n```\nnew\n```\n<!-- end -->\nafter <!-- end -->"
-    assert quoted(once, {"agents": "new"}) == once
-
-
-@pytest.mark.parametrize("page", ["no mark", "<!-- study: x -->\n<!-- end -->"])
-def test_a_page_without_a_known_mark_is_refused(page):
-    with pytest.raises(ValueError, match="a page must quote tables between"):
-        quoted(page, {"agents": "new"})
-
-
-def test_rows_of_the_figure_have_names_and_small_margins_are_left_out():
-    summary = study(**{"trusting:10": (10.0, 0.0, 0.5), "penalized:10": (11.0, 0.0, 0.5)})[0]
-    figure = return_figure(summary)
-    named = [text.get_text() for text in figure.axes[0].get_yticklabels()]
-    assert {"penalized:10", "trusting:20", "lqr+psf", "lqr+psf:20", "lookahead"} <= set(named)  # a price is no margin
-    assert not {"trusting:10", "lqr+psf:10"} & set(named)
-    assert len(set(named)) == len(named)
-    assert figure.legends == []
-    assert {line.get_marker() for axis in figure.axes for line in axis.lines} <= {"o", "None"}
-
-
-@pytest.mark.parametrize("environments", [1, 3])
-def test_names_of_the_rows_do_not_cover_one_another(made, environments):
-    summary = made[0] | {"environments": {f"Plant-v{i}": env_of(made) for i in range(environments)}}
-    figure = return_figure(summary)
-    figure.canvas.draw()
-    texts = [text for axis in figure.axes for text in (*axis.get_yticklabels(), axis.title, axis.xaxis.label)]
-    boxes = [text.get_window_extent() for text in texts if text.get_visible() and text.get_text()]
-    # Tick labels of shared panels are not drawn and lie where those of the first one would.
-    assert not any(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])
 
 
 def test_figures_show_every_arm_and_every_run(made):

@@ -106,16 +106,6 @@ def test_environments_that_take_a_step_to_reset_show_it_as_one_transition():
             assert np.abs(observation).max() <= 0.05
 
 
-def test_seeds_make_runs_equal():
-    runs = []
-    for seed in (0, 0, 1):
-        env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3))
-        env.seed(seed)
-        runs.append([env.reset(), *(env.step(np.ones((3, 1), np.float32))[0] for _ in range(5))])
-    np.testing.assert_array_equal(runs[0], runs[1])
-    assert not np.array_equal(runs[0], runs[2])
-
-
 def test_options_reach_the_environment_once():
     env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=2))
     env.set_options({"state": np.array([0.5, 0.0])})
@@ -166,18 +156,6 @@ def test_infos_of_a_step_are_plain_dictionaries_of_what_callbacks_read():
         SB3VecEnv(env.vector_env, info_keywords="cost")
 
 
-def test_infos_that_are_arrays_are_of_their_environment_and_step():
-    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3), info_keywords=("state",))
-    env.reset()
-    seen = []
-    for _ in range(3):
-        infos = env.step(np.ones((3, 1), np.float32))[3]
-        seen += [(info["state"], info["state"].copy()) for info in infos]
-        np.testing.assert_array_equal([info["state"] for info in infos], env.batch_info["state"])
-    for state, then in seen:
-        np.testing.assert_array_equal(state, then)
-
-
 def test_infos_of_arrays_that_are_written_over_are_those_of_their_step():
     class Reused(gym.vector.VectorEnv):
         num_envs, metadata = 2, {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -201,44 +179,6 @@ def test_infos_of_arrays_that_are_written_over_are_those_of_their_step():
     env.reset()
     infos = [env.step(np.zeros((2, 1)))[3] for _ in range(3)]
     assert [info["count"] for _, info in infos] == [1.0, 2.0, 3.0]
-
-
-def test_last_infos_of_sync_environments_are_complete_when_all_end_at_once():
-    class Extra(gym.Wrapper):
-        def step(self, action):
-            *rest, info = self.env.step(action)
-            return *rest, info | {"k": 3.0, "is_success": 1.0}
-
-    vector = gym.make_vec(
-        "CartPole-v1",
-        num_envs=2,
-        vectorization_mode="sync",
-        max_episode_steps=4,
-        wrappers=[Extra],
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-    )
-    env = SB3VecEnv(vector, info_keywords=("k",))
-    env.seed(0)
-    env.reset()
-    for step in range(1, 9):
-        _, _, done, infos = env.step(np.array([step % 2] * 2))
-        assert done.all() == (step % 4 == 0)
-        assert all(info["k"] == 3.0 for info in infos)
-    assert infos[0]["episode"]["is_success"] == 1.0
-
-
-def test_dictionary_observations_are_refused():
-    class Named(gym.ObservationWrapper):
-        def __init__(self, env):
-            super().__init__(env)
-            self.observation_space = gym.spaces.Dict({"x": env.observation_space})
-
-        def observation(self, observation):
-            return {"x": observation}
-
-    vector = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync", wrappers=[Named])
-    with pytest.raises(ValueError, match="must be arrays"):
-        SB3VecEnv(vector)
 
 
 def test_attributes():

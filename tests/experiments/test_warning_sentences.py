@@ -1,6 +1,5 @@
 """Warnings of a command are sentences, each printed once on a line of its own."""
 
-import io
 import re
 import sys
 import warnings
@@ -9,7 +8,6 @@ from queue import Queue
 import pytest
 from tqdm import tqdm
 
-from experiments.__main__ import main
 from experiments.terminal import warnings_as_sentences, warnings_sent
 from tests.command import ncs
 
@@ -37,42 +35,9 @@ def test_warning_of_a_sweep_is_one_sentence_on_its_own_line(tmp_path, without_wo
     assert_said_once_for_each_delay(ncs(*SWEEP, "--out", tmp_path))
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def fail(settings):
-    raise ValueError(f"{'so many words ' * 15}end")
-
-
-@pytest.mark.parametrize(("kind", "width"), [(io.StringIO, 400), (Terminal, 60)])
-def test_long_sentences_fill_the_lines_of_a_terminal_and_one_elsewhere(monkeypatch, kind, width):
-    monkeypatch.setenv("COLUMNS", "60")
-    monkeypatch.setattr(sys, "stderr", kind())
-    monkeypatch.setattr(sys, "argv", ["ncs", "audit"])
-    monkeypatch.setattr("experiments.commands.audit.audit", fail)
-    with pytest.raises(SystemExit):
-        main()
-    with warnings_as_sentences():
-        warnings.warn("so many words " * 15, stacklevel=1)
-    lines = sys.stderr.getvalue().splitlines()
-    assert width / 2 < max(map(len, lines)) <= width
-    assert [line for line in lines if line.startswith("ncs: ")] == (lines if width > 60 else [lines[0], lines[4]])
-
-
 @pytest.mark.slow
 def test_warning_of_worker_processes_is_said_once(tmp_path):
     assert_said_once_for_each_delay(ncs(*SWEEP, "--jobs", 2, "--out", tmp_path))
-
-
-def test_where_a_warning_comes_from_is_shown_on_request(monkeypatch, without_workers):
-    def warn(settings):
-        warnings.warn("loud", stacklevel=1)
-
-    monkeypatch.setattr("experiments.commands.audit.audit", warn)
-    assert ncs("audit").stderr == "ncs: warning: loud\n"
-    assert re.search(r"test_warning_sentences\.py:\d+: UserWarning: loud", ncs("audit", NCS_DEBUG="1").stderr)
 
 
 def test_progress_bar_is_cleared_before_a_sentence(capsys):

@@ -2,7 +2,6 @@
 
 import re
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given
@@ -30,8 +29,6 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.envs.env import NCSEnv
-from shields import SafetyShield, VectorSafetyShield, synthesize, verify
-from shields.runtime.safety_filter import SafetyFilter
 from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS, examples
 
 PLANT = truck_trailer()
@@ -205,26 +202,3 @@ def test_matrices_with_one_wrong_entry_are_refused(data):
     texts = array.astype(object)
     texts.flat[entry] = data.draw(st.sampled_from(["1", None, 1j, [1.0], 10**400]))
     assert_refused(lambda: make(**{name: texts}))
-
-
-SHIELDED = {
-    "the shield's certificate": lambda env, many, certificate, value: SafetyShield(env, value),
-    "its mode": lambda env, many, certificate, value: SafetyShield(env, certificate, mode=value),
-    "its penalty": lambda env, many, certificate, value: SafetyShield(env, certificate, penalty=value),
-    "its environment": lambda env, many, certificate, value: SafetyShield(value, certificate),
-    "the vector shield's environment": lambda env, many, certificate, value: VectorSafetyShield(value, certificate),
-    "the vector shield's certificate": lambda env, many, certificate, value: VectorSafetyShield(many, value),
-    "the filter's plant": lambda env, many, certificate, value: SafetyFilter(certificate, value),
-    "the plant of verify": lambda env, many, certificate, value: verify(certificate, value),
-    "the certificate of verify": lambda env, many, certificate, value: verify(value, env.plant),
-    "the plant of synthesize": lambda env, many, certificate, value: synthesize(value),
-    "the contract of synthesize": lambda env, many, certificate, value: synthesize(env.plant, contract=value),
-}
-
-
-@pytest.mark.parametrize("argument", SHIELDED)
-def test_wrong_arguments_of_shields_are_refused(argument, certificate, loaded):
-    env, many = gym.make("ncs_gym/TruckTrailerCruise-v0").unwrapped, vector(plant=loaded)
-    for value in WRONG:
-        what = f"a value of type {type(value).__name__}"
-        assert_refused(lambda value=value: SHIELDED[argument](env, many, certificate, value), what)

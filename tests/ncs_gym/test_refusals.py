@@ -38,7 +38,6 @@ from ncs_gym import (
     Remainder,
     RequestActions,
     SetpointTracking,
-    Through,
     TraceChannel,
     UnstablePlantError,
     VectorRandomChannel,
@@ -58,7 +57,6 @@ from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from shields import SafetyShield
-from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS
 from tests.product import altered, linear_plant
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"
@@ -223,8 +221,7 @@ ENVIRONMENTS = [
         {
             "rendered_env": [3],
             "autoreset_mode": ["Later"],
-            "max_episode_steps": [None],
-            "horizon": [-1, 0, 1.5, "x", None],
+            "horizon": [0],
         },
         num_envs=2,
     ),
@@ -298,11 +295,8 @@ PLANTS = [
     *wrong(
         Model,
         {
-            "A": [np.ones((2, 3)), [1.0, 0.0]],
             "B": [np.ones((3, 1)), [0.5], [0, 0.5]],
-            "H": [[1.0, 0.0], [[1.0, 0.0], [0.0, 0.0]], 3],
-            "dt": [0.0, -1.0, None],
-            "at": [3.0, ([1.0], 0.0), ([1.0, 2.0], "10")],
+            "at": [([1.0], 0.0), ([1.0, 2.0], "10")],
             "offset": [[1.0], [1.0, 2.0]],
             "continuous": [[[-2.0, 1.0]]],
             "delays": [-1, 1.5, 101],
@@ -312,12 +306,12 @@ PLANTS = [
         H=None,
         dt=0.1,
     ),
-    *wrong(plant_of, {"model": [3, None], "limits": [3], "bounds": [0.1], "labels": [3, {"angle": "rad"}]}),
+    *wrong(plant_of, {"model": [3, None], "limits": [3], "labels": [{"angle": "rad"}]}),
     *wrong(
         with_limits(PLAIN),
         {
-            "state": [[1.0, 2.0, 3.0], [np.inf] * 2, [-1.0, 2.0], "wide", ([-1.0, -2.0], [-0.5, 2.0])],
-            "input": [None, (-1.0, np.inf), [1.0, 2.0], 0.0, (0.0, 1.0)],
+            "state": [[np.inf] * 2, ([-1.0, -2.0], [-0.5, 2.0])],
+            "input": [(-1.0, np.inf), (0.0, 1.0)],
             "rows": [
                 3,
                 [([1.0, 0.0], -1.0, 1.0)],
@@ -326,8 +320,8 @@ PLANTS = [
                 [([1.0, 0.0], [0.0], -1.0, 1.0)],
                 [([1.0, 0.0], None, 0.5, 1.0)],
             ],
-            "rate": [0.0, -1.0, [1.0, 2.0], 2.0],
-            "between_samples": [0, -3, 65, 2.5, True, "8", [8], 8],
+            "rate": [2.0],
+            "between_samples": [0, 65, 2.5, True, 8],
         },
         state=[1.0, 2.0],
         input=1.0,
@@ -341,7 +335,6 @@ PLANTS = [
         state=(18.0, 25.0),
         input=(0.0, 12.0),
     ),
-    *wrong(Bounds, {name: [1e-6 * np.eye(2), "small", -1.0, np.nan] for name in SETS}, **dict.fromkeys(SETS, 0.01)),
     *(partial(plant_of, bounds=Bounds(**dict.fromkeys(SETS, 0.01) | {name: [0.1, 0.2]})) for name in SETS),
     lambda: plant_of(bounds=Bounds(EXAMPLE, 0.1, 0.1)),
     lambda: plant_of(bounds=Bounds(0.1, 0.1, Remainder(Ellipsoid(np.eye(1)), True, "an example"))),
@@ -453,17 +446,7 @@ PROCESSES = [
     lambda: altered(modeled(), remainder=altered(weakened_remainder(), box=[0.2, 1.5]).remainder),
 ]
 UNCERTAINTY = [
-    *called(
-        lambda value: as_set(value).sized(2),
-        *(-1.0, np.nan, np.inf, [0.1, -0.2], 1e-200, 1e60, [0.1, 0.2, 0.3], np.eye(2), "small", True),
-        *(
-            Ellipsoid(np.eye(3)),
-            {"Through": {"E": np.ones((3, 1)), "set": 1.0}},
-            {"Ball": {}},
-            {"Ball": {"radius": -1}},
-        ),
-    ),
-    partial(Through, np.ones((2, 1)), [1.0, 2.0]),
+    *called(lambda value: as_set(value).sized(2), [0.1, -0.2], 1e-200, 1e60, True, {"Ball": {}}),
     *called(
         lambda value: as_disturbance(value, PLANT, False),
         *("gusts", 3, BoxDisturbance([0.1, 0.1]), BoxDisturbance([0.1, 0.1, 0.1])),
@@ -518,23 +501,14 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(call, error, tmp_path):
     assert set(gym.registry) == before
 
 
-UNUSABLE = [*NOTHING_USABLE, *WRONG_NUMBERS]
-ACTIONS = [[np.nan], [np.inf], [0.0, 0.0], 0.5, "go", None, [[0.1]]]
-OF_MANY = [np.zeros((3, 2)), np.zeros(3), *([[0.0], [wrong], [0.0]] for wrong in (np.inf, np.nan, 1j)), None, "a"]
 OPTIONS = [  # Of one environment and of three.
-    *({"state": wrong} for wrong in ([np.nan, 0.0], "a", None, *UNUSABLE)),
-    *(wrong for wrong in UNUSABLE if type(wrong) is not dict),
-    *({"sate": [0.0, 0.0]}, {"a": 1}, {1: 2}, {"channel": 0.3}, {"channel": [Channel()] * 2}),
-    *({"channel": Channel(quantization_step=0.1)}, {"downlink": Channel()}),
+    *({"state": [np.nan, 0.0]}, {"sate": [0.0, 0.0]}, {1: 2}, 3),
+    *({"channel": 0.3}, {"channel": Channel(quantization_step=0.1)}, {"downlink": Channel()}),
 ]
-MASKS = [np.ones(2, np.bool_), np.ones(3), np.zeros(3, np.bool_), *UNUSABLE]
 CALLS = [  # Whether with three environments, what is called, and the argument.
-    *((False, "step", each) for each in ACTIONS),
-    *((True, "step", each) for each in OF_MANY),
+    *((True, "step", each) for each in (np.zeros((3, 2)), [[0.0], [1j], [0.0]])),
     *((many, "reset", each) for many in (False, True) for each in OPTIONS),
-    (False, "reset", {"state": [1.0]}),
-    *((True, "reset", {"state": each}) for each in (np.zeros(3), np.full((3, 2), np.nan))),
-    *((True, "reset", {"reset_mask": each}) for each in MASKS),
+    *((True, "reset", {"reset_mask": each}) for each in (np.ones(2, np.bool_), np.ones(3), np.zeros(3, np.bool_))),
 ]
 
 

@@ -1,22 +1,18 @@
 """Settings of environments and estimators are read, and never set."""
 
 import inspect
-from copy import copy
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from ncs_gym import (
-    Actuator,
     Channel,
     ChannelContract,
-    Command,
     Estimator,
     NCSEnv,
     batch_reactor,
     certified_error_set,
-    truck_trailer,
 )
 from tests.product import loop_env
 
@@ -36,15 +32,6 @@ def test_settings_of_an_environment_and_its_state_are_not_set(make):
             setattr(inner, name, getattr(inner, name))
     inner.state[:] = 7.0  # a copy
     np.testing.assert_array_equal(inner.state, before)
-
-
-def test_settings_of_an_estimator_and_those_behind_wrappers_are_not_set():
-    estimator, env = Estimator(truck_trailer(), Channel()), gym.make(ID)
-    for name in ("plant", "channel", "buffer", "error_set"):
-        with pytest.raises(AttributeError):
-            setattr(estimator, name, getattr(estimator, name))
-    with pytest.raises(AttributeError):
-        env.set_wrapper_attr("channel", Channel(delay=3))
 
 
 @pytest.mark.parametrize("make", MAKES, ids=["one", "many"])
@@ -69,19 +56,3 @@ def test_what_estimators_share_cannot_be_written_to():
     many.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
         many.belief.table.shapes[...] = 1e-4
-
-
-def test_copies_of_estimators_and_actuators_share_nothing():
-    estimator, actuator = Estimator(truck_trailer(), Channel()), Actuator(1, 1)
-    estimator.reset(np.zeros(2))
-    others = copy(estimator), copy(actuator)
-    before = others[0].mean.copy()
-    for _ in range(5):
-        estimator.advance(np.ones(1), [])
-    actuator.receive([Command(0, [[1.0], [2.0]])])
-    actuator.apply(0)
-    np.testing.assert_array_equal(others[0].mean, before)
-    assert others[0].step == 0
-    assert others[1].echo.steps == 0
-    assert others[1].apply(1).item() == 0.0
-    assert others[1].missing

@@ -11,10 +11,6 @@ def test_matrix_and_sets_are_derived_from_L(certificate):
     np.testing.assert_array_equal(certificate.error_set.shape_matrix, certificate.Sigma)
 
 
-def test_short_form_has_no_numbers(certificate):
-    assert repr(certificate) == f"<Certificate for the plant {certificate.fingerprint[:16]}, without a contract>"
-
-
 @pytest.mark.parametrize(
     "content",
     [

@@ -24,20 +24,6 @@ def with_polytope(certificate, rows, multipliers, seed=0):
     return replace(certificate, polytope=polytope)
 
 
-@pytest.mark.cases(2)
-@pytest.mark.parametrize(
-    ("rows", "multipliers"),
-    [(1, 1), (26, 859), (MOST_ROWS, 2 * MOST_ROWS + 1), (MOST_ROWS, MOST_MULTIPLIERS), (2, MOST_MULTIPLIERS)],
-)
-def test_certificate_of_every_size_that_a_polytope_may_have_is_read_again(certificate, rows, multipliers, tmp_path):
-    saved = with_polytope(certificate, rows, multipliers)
-    saved.save(tmp_path / "c.json")
-    assert Certificate.load(tmp_path / "c.json") == saved
-    np.testing.assert_array_equal(
-        Certificate.load(tmp_path / "c.json").polytope.multipliers, saved.polytope.multipliers
-    )
-
-
 @settings(max_examples=30, deadline=None)
 @given(rows=st.integers(1, MOST_ROWS), multipliers=st.integers(1, 3 * MOST_ROWS), seed=st.integers(0, 9))
 def test_document_of_any_polytope_is_read_again(certificate, rows, multipliers, seed):

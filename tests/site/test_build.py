@@ -46,19 +46,6 @@ def test_broken_page_ends_the_build(tmp_path, text):
     assert built(tmp_path, text).returncode != 0
 
 
-def test_missing_picture_ends_the_build(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(HOOKS)
-    import build_site
-
-    (tmp_path / "api").mkdir()
-    (tmp_path / "api" / "x.html").write_text('<img alt="a" src="../there.png"> <img src="data:image/png;base64,x">')
-    (tmp_path / "there.png").touch()
-    build_site.require_pictures(tmp_path)
-    (tmp_path / "index.html").write_text('<p><img alt="a" src="there.png"><img alt="b" src="none.png">')
-    with pytest.raises(FileNotFoundError, match=r"index\.html shows a picture that there is not: none\.png"):
-        build_site.require_pictures(tmp_path)
-
-
 def test_notebook_becomes_a_page_with_its_pictures(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(HOOKS)
     import notebook_page

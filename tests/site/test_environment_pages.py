@@ -60,16 +60,6 @@ def test_plant_that_is_registered_gets_a_page(pages):
     assert "| 0 | u1 | 2 |" in section(page, "Action space")
 
 
-def test_downlink_is_said_in_words(pages):
-    env_id = "ncs_gym/TruckTrailerCruiseTwoWay-v0"
-    protocol = gym.make(env_id).unwrapped.downlink_protocol
-    text = words(section(pages.environment_page(env_id), "Channel and contract"))
-    assert f"Between controller and actuator is a network as well: `{protocol.channel}`" in text
-    assert f"An action takes effect {protocol.input_delay} steps later." in text
-    one_way = pages.environment_page("ncs_gym/TruckTrailerCruise-v0")
-    assert "actuator" not in section(one_way, "Channel and contract")
-
-
 def test_environment_of_another_package_has_no_page(pages):
     with pytest.raises(ValueError, match="not an environment of this package"):
         pages.environment_page("CartPole-v1")

@@ -59,11 +59,3 @@ def test_options_and_ids_stay_on_one_line():
     made = hook.on_page_content(f"<p>a--b <code>ncs train --a2c.n-steps 1 ncs_gym/CartPole-v0</code></p>{block}")
     kept = '<span class="unbroken">--a2c.n-steps</span> 1 <span class="unbroken">ncs_gym/CartPole-v0</span>'
     assert made == f"<p>a--b <code>ncs train {kept}</code></p>{block}"
-
-
-def test_percentages_stay_on_one_line():
-    hook = site_hook("unbroken")
-    block = "<pre><code>30 % lost</code></pre>"
-    assert hook.on_page_content(f"<p>30 % of % <code>5 %</code></p>{block}") == (
-        f"<p>30&nbsp;% of % <code>5 %</code></p>{block}"
-    )

@@ -45,17 +45,6 @@ def test_notebook_is_stored_as_it_was_run_from_top_to_bottom(cells):
     assert_shows_what_it_is_about("".join("".join(output.get("text", ())) for output in outputs))
 
 
-def test_first_cell_with_code_installs_what_is_missing(cells):
-    (install,) = ("".join(cell["source"]) for cell in cells if "%pip" in "".join(cell["source"]))
-    assert install == "".join(next(cell for cell in cells if cell["cell_type"] == "code")["source"])
-    assert '%pip install -q "..[train]"' in install  # from the folder examples/ of a clone; `make address` changes it
-
-
-def test_cells_have_names_and_are_programs(cells):
-    assert len({cell["id"] for cell in cells}) == len(cells)
-    compile(program_of(cells), NOTEBOOK.name, "exec")
-
-
 @pytest.mark.slow
 def test_notebook_runs_from_top_to_bottom(cells):
     command, given = [sys.executable, "-c", program_of(cells)], environment(MPLBACKEND="Agg")

@@ -1,7 +1,6 @@
 """A real Ray on this machine: what it does when processes die, and what a user sees."""
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -16,7 +15,7 @@ import pytest
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
 
 from experiments.backends.execution import results_of  # noqa: E402
-from experiments.backends.ray_tasks import RETRIES, _on_node, ray_tasks  # noqa: E402
+from experiments.backends.ray_tasks import RETRIES, _on_node  # noqa: E402
 from experiments.errors import ClusterError, RunError  # noqa: E402
 from experiments.runs.provenance import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
@@ -185,19 +184,6 @@ def test_interrupted_driver_stops_everything_and_keeps_what_is_finished(tmp_path
     assert 1 <= stored(out) < RUNS
 
 
-def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
-    shutil.copytree(local, tmp_path / "out")
-    for name in ("summary.json", "episodes.parquet"):
-        (tmp_path / "out" / name).unlink()
-    for path in sorted((tmp_path / "out" / "runs").glob("*.json"))[:3]:
-        path.unlink()
-    run = ncs("sweep", *GRID, "--engine", "ray", "--out", tmp_path / "out")
-    assert run.returncode == 0, run.stderr
-    assert f"{RUNS - 3} of {RUNS} runs were finished before" in run.stderr
-    assert len(lines_of_runs(run.stderr)) == 3
-    assert_same(tmp_path / "out", local)
-
-
 def test_error_of_a_run_is_not_retried_and_named(tmp_path):
     run = Small("its-name", "fail", tmp_path)
     with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1"):
@@ -214,20 +200,6 @@ def test_worker_that_always_dies_is_given_up_and_named(tmp_path):
 def test_node_with_another_source_is_refused_in_one_sentence():
     with pytest.raises(ClusterError, match=r"node .* has another source than the driver: install the same on every"):
         _on_node(versions() | {"source": "other"}, None)
-
-
-def test_workers_compute_with_as_many_threads_as_local_ones():
-    def threads():
-        import importlib
-        import os
-
-        import torch
-
-        importlib.import_module("agents.sb3_vec_env")  # as every training does, which sets torch's
-        return os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads()
-
-    with ray_tasks("local"):
-        assert ray.get(ray.remote(threads).remote()) == threads()
 
 
 @contextmanager
@@ -272,21 +244,4 @@ def test_running_cluster_is_used_and_outlives_the_driver(head, local, tmp_path):
     again = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
     assert again.returncode == 0, again.stderr
     assert process.poll() is None
-    assert_same(out, local)
-
-
-def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_path_factory, local, tmp_path):
-    out = tmp_path / "out"
-    with running_head(tmp_path_factory) as (address, own, process):
-        run = started("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
-        until_stored(out, 1, run)
-        process.terminate()
-        _, errors = run.communicate(timeout=TIMEOUT)
-    assert run.returncode == 2
-    assert "the same command goes on with what is missing" in errors.strip().splitlines()[-1]
-    assert "Traceback" not in errors
-    finished = stored(out)
-    assert 1 <= finished < RUNS
-    again = ncs("sweep", *GRID, "--jobs", "2", "--out", out)
-    assert f"{finished} of {RUNS} runs were finished before" in again.stderr
     assert_same(out, local)

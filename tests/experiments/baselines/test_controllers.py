@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from benchmarks.study import ENVS, REGULATED
-from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
+from experiments.baselines import CONTROLLERS, RegulatorWeights, controller
 from experiments.baselines.controllers import equilibrium
 from ncs_gym import Channel, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
@@ -114,25 +113,6 @@ def test_fallback_applies_its_gain_and_zero_nothing():
     assert not controller("zero input", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates}).any()
 
 
-@pytest.mark.parametrize("name", ["lqr", "mpc", "mpc:20"])
-def test_plant_of_one_state_and_one_limit_is_regulated(name):
-    bounds = {"disturbance_bound": 0.02, "sensor_bound": 0.01, "initial_bound": 0.02}
-    env = loop_env(linear_plant(A=[[0.8]], B=[[0.4]], dt=1.0, box=[1.0], u_max=0.1, **bounds))
-    policy = controller(name, env, Fallback.of_gain(np.zeros((1, 1))), 0)
-    (u,) = policy(np.array([[0.9]]), {"estimate": np.array([[0.9]])})
-    assert -1.0 <= u[0] < -0.5
-
-
-def test_random_inputs_depend_on_the_seed_alone():
-    env, estimates = env_of("ncs_gym/BatchReactor-v0"), np.zeros((500, 4))
-    one, again, other = (controller("random", env, Fallback.of_gain(np.zeros((2, 4))), seed) for seed in (1, 1, 2))
-    first = one(estimates, {"estimate": estimates})
-    np.testing.assert_array_equal(first, again(estimates, {"estimate": estimates}))
-    assert (first != other(estimates, {"estimate": estimates})).any()
-    assert 0.95 < np.abs(first).max() <= 1.0
-    assert np.abs(first.mean(axis=0)).max() < 0.1
-
-
 @pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.parametrize("env_id", [*SETPOINTS, "ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"])
 def test_actions_of_every_controller_fit_every_environment(name, env_id):
@@ -175,16 +155,6 @@ def test_mpc_keeps_limits_and_margins_that_the_regulator_leaves(env_id):
     assert with_margin < free
 
 
-def test_mpc_keeps_the_limits_between_samples_where_they_count():
-    weights = RegulatorWeights(1e-6, 0.0)
-    at_samples, always = (
-        nominal(ncs_env(gym.make("ncs_gym/BatchReactor-v0", between_samples=points)), "mpc", weights, 60, times=20)[0]
-        for points in (None, 4)
-    )
-    assert at_samples > 1.0 + 1e-3
-    assert always <= 1.0 + 1e-6
-
-
 @pytest.mark.parametrize("env_id", ["ncs_gym/CSTR-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"])
 def test_mpc_far_from_all_limits_is_the_regulator(env_id):
     env, rng = env_of(env_id), np.random.default_rng(0)
@@ -195,29 +165,6 @@ def test_mpc_far_from_all_limits_is_the_regulator(env_id):
     )
     assert np.abs(optimal).max() > 1e-5
     np.testing.assert_allclose(predicted, optimal, atol=1e-2 * np.abs(optimal).max())
-
-
-def test_regulator_moves_before_a_target_that_it_knows_does():
-    env = env_of("ncs_gym/LaneKeeping-v0")
-    policy = controller("lqr", env, Fallback.of_gain(np.zeros((1, 2))), 0)
-    later = np.concatenate([np.zeros(2), np.zeros(4), np.full(env.task.preview - 3, 0.4)])
-    estimate = {"estimate": np.zeros((1, 2))}
-    assert policy(later[None], estimate)[0, 0] > 0.01
-    assert policy(np.zeros_like(later)[None], estimate)[0, 0] == 0.0
-
-
-def test_price_of_changes_makes_the_regulator_change_less():
-    env = env_of("ncs_gym/Convoy-v0")
-    _, bold = nominal(env, "lqr", RegulatorWeights(0.01, 0.01))
-    _, calm = nominal(env, "lqr", RegulatorWeights(3.0, 0.01))
-    assert np.abs(np.diff(calm, axis=0)).max() < 0.5 * np.abs(np.diff(bold, axis=0)).max()
-
-
-def test_every_arm_of_the_study_has_weights_of_its_own():
-    for env_id in ENVS:
-        weights = {arm: tuned_weights(env_id, arm) for arm in REGULATED}
-        assert len(set(weights.values())) > 2
-    assert tuned_weights("ncs_gym/CartPole-v0", "lqr") == RegulatorWeights()
 
 
 def two_ended(task=None):

@@ -1,13 +1,8 @@
 """The command as a user meets it: in a process of its own where that matters, else in this one."""
 
-import errno
 import json
-import os
 import re
 import shutil
-import signal
-import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +13,7 @@ import shields
 from agents.agent import Agent
 from experiments.runs.policies import certificate_file
 from ncs_gym import truck_trailer
-from shields import Certificate, certify
+from shields import Certificate
 from tests.certificates import feasible_age_not_sought
 from tests.command import SMOKE, assert_one_sentence, killed, ncs, ncs_process, succeeded, without_pictures
 from tests.product import library_plant
@@ -170,63 +165,6 @@ def test_finished_study_is_not_overwritten(command, smoke):
     assert digests(out) == before
 
 
-def test_sweep_takes_arms_with_hyphens_and_refuses_one_twice(tmp_path, without_workers):
-    given = ("--losses", 0.3, "--delays", 0, "--burst-lengths", 0, "--seeds", 1, "--episodes", 2)
-    with without_pictures():
-        succeeded("sweep", *given, "--arms", "K-x_hat", "--out", tmp_path / "out")
-    assert [*json.loads((tmp_path / "out" / "summary.json").read_text())["cells"][0]["arms"]] == ["K x_hat"]
-    twice = ncs("sweep", *given, "--arms", "K-x_hat", "K x_hat", "--out", tmp_path / "twice")
-    assert_one_sentence(twice, "--arms must be different values")
-
-
-@pytest.mark.slow
-def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
-    (tmp_path / "episode.gif").write_text("mine")
-    tiny = ("--hyperparams", "n_envs=8", "n_steps=64", 'policy_kwargs={"net_arch": [8, 8], "log_std_init": -4.0}')
-    sweep = ("sweep", "--arms", "K x_hat", "--delays", 0, 1, 2, "--losses", 0.3)
-    for command in (("train", *tiny), sweep, ("render",)):
-        with without_pictures():
-            run = succeeded(*command, "--smoke", cwd=tmp_path)
-        if command[0] == "train":  # so little was tried that nothing happened
-            said = run.prose
-            assert "This training had no violation and no override, so it does not show what the shield is for" in said
-            assert "leave out --smoke" in said
-            assert run.stdout.splitlines()[-1].startswith("agent: ")
-    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"train-smoke", "sweep-smoke"}
-    settings = json.loads((tmp_path / "runs" / "train-smoke" / "settings.json").read_text())["settings"]
-    assert (settings["steps"], settings["episodes"]) == (4096, 10)
-    cells = json.loads((tmp_path / "runs" / "sweep-smoke" / "summary.json").read_text())["cells"]
-    assert [(cell["loss"], cell["delay"]) for cell in cells] == [(0.3, 0), (0.3, 2)]
-    assert "episode-smoke.gif" in run.stdout
-    assert "5 steps" in run.stdout
-    assert (tmp_path / "episode.gif").read_text() == "mine"
-    evaluated = succeeded("evaluate", tmp_path / "runs" / "train-smoke", "--smoke")
-    assert ", 5 episodes" in evaluated.stdout
-
-
-def test_folder_of_several_agents_is_refused_with_their_names(smoke):
-    assert_one_sentence(ncs("evaluate", smoke[0]), "holds 4 agents", "models (shielded-0, shielded-1, ")
-
-
-def test_horizon_is_refused_if_the_agents_own_shield_plans_nothing(smoke):
-    model = smoke[0] / "models" / "shielded-0"
-    assert_one_sentence(ncs("evaluate", model, "--horizon", 6), "--horizon 6 is for mode lookahead")
-
-
-def test_evaluation_takes_the_certificate_of_the_training(smoke, certificate, loaded, tmp_path):
-    models = tmp_path / "out" / "models"
-    shutil.copytree(smoke[0] / "models" / "shielded-0", models / "shielded-0")
-    foreign = certify(loaded, certificate.L, 0.99 * certificate.K)
-    assert foreign is not None
-    foreign.save(tmp_path / "out" / "certificate.json")
-    for model in (tmp_path / "out", models / "shielded-0"):
-        succeeded("evaluate", model, "--smoke", "--out", tmp_path / "e.json")
-        assert json.loads((tmp_path / "e.json").read_text())["certificate"] == foreign.checksum
-    certificate.save(models / "shielded-0" / "certificate.json")  # as an agent that is shared has it
-    assert ncs("evaluate", models / "shielded-0", "--smoke", "--out", tmp_path / "e.json").returncode == 0
-    assert json.loads((tmp_path / "e.json").read_text())["certificate"] == certificate.checksum
-
-
 def test_saved_agent_is_evaluated(smoke, tmp_path):
     model = smoke[0] / "models" / "unshielded-0"
     run = succeeded("evaluate", model, "--shield", "project", "--episodes", "5", "--out", tmp_path / "e.json")
@@ -251,33 +189,6 @@ def test_one_agent_is_trained(tmp_path, without_workers):
     evaluated = succeeded("evaluate", model / "model.zip", "--episodes", "2")  # beside what the agent is known by
     assert "shield: project" in evaluated.stdout
     assert "none is used" not in evaluated.stderr
-
-
-@pytest.mark.slow
-def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path, without_workers):
-    out = tmp_path / "one"
-    given = ["--arm", "lookahead", "--horizon", "3", "--hyperparams", "n_envs=8", "n_steps=64", "--steps", "512"]
-    given += ["--episodes", "3"]
-    run = succeeded("train", "--env", "ncs_gym/BatchReactor-v0", *given, "--out", out)
-    assert "from a" in run.stdout
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["arms"]["lookahead"]["train_violation_steps"] == 0
-    assert 0.0 < summary["arms"]["lookahead"]["plan_rate"] < 1.0
-    assert json.loads((out / "settings.json").read_text())["settings"]["horizon"] == 3
-    agent = Agent.load(out / "models" / "lookahead-0")
-    assert (agent.shield_mode, agent.horizon) == ("lookahead", 3)
-    for flags, mode, horizon in (
-        ([], "lookahead", 3),
-        (["--horizon", "2"], "lookahead", 2),
-        (["--shield", "project"], "project", None),
-    ):
-        evaluated = succeeded("evaluate", out, "--episodes", "3", "--out", tmp_path / "e.json", *flags)
-        document = json.loads((tmp_path / "e.json").read_text())
-        assert document["horizon"] == horizon
-        assert set(document["arms"]) == {f"shield: {mode}"}
-        assert (document["arms"][f"shield: {mode}"]["plan_rate"] > 0.0) is (mode == "lookahead")
-        assert ("from a" in evaluated.stdout) is (mode == "lookahead")
-        assert "The guarantee held after 600 of 600 steps." in evaluated.prose
 
 
 @pytest.mark.slow
@@ -375,39 +286,12 @@ def test_command_does_the_same_in_this_process_and_in_one_of_its_own(arguments, 
     assert ncs(*arguments, cwd=tmp_path) == (own.returncode, own.stdout, own.stderr)
 
 
-def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(monkeypatch, tmp_path):
-    def warn(chosen):
-        Path("here").write_text(os.environ["SAID"])
-        warnings.warn("loud", stacklevel=1)
-        os.system("echo native >&2")
-
-    before = os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr("experiments.commands.audit.audit", warn)
-    run = ncs("audit", cwd=tmp_path, SAID="this")
-    assert (run.returncode, (tmp_path / "here").read_text()) == (0, "this")
-    assert "ncs: warning: loud\n" in run.stderr
-    assert run.stderr.endswith("native\n")
-    assert before == (os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM))
-    assert "SAID" not in os.environ
-
-
 def test_help_of_a_comparison_shows_its_settings_on_two_screens():
     run = ncs("compare", "--help", COLUMNS="80")
     assert run.returncode == 0
     for flag in ("--env", "--channel", "--hyperparams", "--ray-address"):
         assert flag in run.stdout
     assert len(run.stdout.splitlines()) <= 100
-
-
-@pytest.mark.parametrize(("number", "remedy"), [(errno.ENOSPC, "make room"), (errno.EROFS, "choose a path")])
-def test_errors_of_the_disk_say_what_to_do(number, remedy, certificate, monkeypatch, tmp_path):
-    certificate.save(tmp_path / "c.json")
-
-    def fail(*arguments, **settings):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr("shields.atomic_write.tempfile.mkstemp", fail)
-    assert_one_sentence(ncs("verify", "c.json", "--out", "a.json", cwd=tmp_path), os.strerror(number), remedy)
 
 
 def test_infeasible_problem_is_one_sentence(tmp_path):

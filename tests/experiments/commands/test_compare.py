@@ -5,15 +5,13 @@ import numpy as np
 import pytest
 
 from agents import tuned_hyperparams
-from agents.agent_file import AgentError
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
-from experiments.commands.compare import findings_of, shortened
+from experiments.commands.compare import shortened
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import by_arm, run_of_arm
-from experiments.runs.loops import certificate_of
+from experiments.runs.arms import run_of_arm
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 
@@ -46,24 +44,6 @@ def test_a_smoke_run_evaluates_the_pretrained_agent_unless_something_else_is_ask
     without = shortened(CompareSettings(smoke=True, env="plants:plants/Own-v0"))
     assert (without.arms, without.baselines) == (("unshielded", "shielded"), CompareSettings().baselines)
     assert shortened(CompareSettings()) == CompareSettings()
-
-
-def test_the_pretrained_agent_needs_its_shield_which_the_arms_of_a_smoke_run_show():
-    settings, loop = shortened(CompareSettings(smoke=True)), LoopConfig(env=CRUISE)
-    proved = certificate_of(loop)
-    alone, behind = (run_of_arm(settings, loop, proved, name, 0) for name in ("pretrained", "pretrained+shielded"))
-    assert not any(run.trains for run in (alone, behind))
-    alone, behind = (run.execute(lambda steps: None) for run in (alone, behind))
-    assert sum(episode.violation_steps > 0 for episode in alone.episodes) > 5
-    assert sum(episode.violation_steps for episode in behind.episodes) == 0
-    assert sum(episode.interventions for episode in behind.episodes) > 10
-    with pytest.raises(AgentError, match="there is no pretrained agent of 'ncs_gym/LinearNCS-v0'"):
-        run_of_arm(settings, LoopConfig(env="ncs_gym/LinearNCS-v0"), proved, "pretrained", 0)
-
-
-def test_another_seed_draws_everything_anew(certificate):
-    first, second = ({run.training_seed for run in runs_of(certificate, seed=seed)} for seed in (0, 1))
-    assert not first & second
 
 
 @pytest.mark.parametrize("seed", [0, 10**9, 2**63])
@@ -166,12 +146,6 @@ def test_summary_of_an_arm_adds_up():
     assert summary["eval_return_ci95"][1] - 4.0 == pytest.approx(12.706 * 2.0, rel=1e-3)  # t with one degree of freedom
 
 
-def test_interval_of_a_fixed_policy_is_over_episodes():
-    runs = [result([1.0, 3.0], [0, 0]), result([5.0, 7.0], [0, 0], index=1)]
-    fixed = summary_of_runs(runs, fixed_policy=True)["eval_return_ci95"]
-    assert fixed[1] - 4.0 == pytest.approx(3.182 * 2.582 / 2, rel=1e-3)
-
-
 def covered(shielded, shielded_steps=200, unshielded=-5.0):
     means = {"unshielded": (unshielded, 200), "shielded": (shielded, shielded_steps), "zero input": (-65.0, 200)}
     named = {name: {"eval_return_mean": mean, "eval_steps": steps} for name, (mean, steps) in means.items()}
@@ -190,45 +164,6 @@ def test_an_agent_that_earns_no_more_than_the_zero_input_leaves_nothing_to_cover
 def test_returns_of_episodes_that_end_early_are_no_covered_fraction():
     assert covered(-20.0, shielded_steps=150) is None
     assert covered_fraction({"arms": {}, "references": {}}) is None
-
-
-@pytest.mark.parametrize(("trained", "evaluated"), [(0.0, 0.0), (0.0, 0.1), (0.1, 0.0)])
-def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(trained, evaluated):
-    shares = {"train_intervention_rate": trained, "intervention_rate": evaluated}
-    counts = {"eval_violation_rate_ci95": [0.0, 0.1], "guaranteed_episodes": 4, "eval_episodes": 4}
-    arm = {
-        "shielded": True,
-        "mode": "project",
-        "times_safe_set": 0.707,
-        "eval_violating_episodes": 0,
-        **counts,
-        **shares,
-    }
-    arm |= {"eval_steps": 200, "eval_return_mean": -5.0}
-    others = {name: arm | {"shielded": False, "train_violation_steps": 0} for name in ("unshielded", "zero input")}
-    others["zero input"]["eval_return_mean"] = -60.0
-    summary = {"arms": {"unshielded": others["unshielded"], "shielded": arm}, "references": others}
-    findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    nothing = [line for line in findings if "shielded: all that was proposed was safe" in line]
-    assert len(nothing) == (trained == evaluated == 0.0)
-    arm["train_steps"] = 100
-    findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    assert not any("train" in line for line in findings)  # nobody knows that it would change anything
-    elsewhere = arm | {"conditions": {"attacked": {"intervention_rate": 0.1}}}
-    several = summary | {"arms": summary["arms"] | {"shielded": elsewhere}}
-    findings = findings_of(several | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    assert not any("all that was proposed was safe" in line for line in findings)
-    findings = findings_of(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
-    assert any("came to 0.707 times the safe set" in line for line in findings) == (not nothing)
-    assert any("covers" in line for line in findings) == (trained > 0.0)
-
-
-def test_interquartile_mean_leaves_the_extreme_runs_out():
-    runs = [result([value, value], [0, 0], index=i) for i, value in enumerate((-1000.0, 1.0, 3.0, 50.0))]
-    summary = summary_of_runs(runs)
-    assert summary["eval_return_iqm"] == 2.0
-    low, high = summary["eval_return_iqm_bootstrap_ci95"]
-    assert -1000.0 <= low <= 2.0 <= high <= 50.0
 
 
 def test_paired_differences_are_those_of_runs_with_equal_index():
@@ -257,16 +192,3 @@ def test_policies_that_are_the_same_in_all_runs_are_paired_by_episodes():
     assert by_runs["return_ci95"][1] == pytest.approx(2.0 + 12.706 * 0.5, rel=1e-3)
     alone = paired_differences(episodes_table(run for run in runs if run.index == 0), "lqr")["lqr+shielded"]
     assert alone["return_ci95"][1] > 1.5  # of two episodes
-
-
-def test_no_violation_is_printed_with_its_upper_bound():
-    summary = arm_summary([result([1.0] * 10, [0] * 10)], "monitor", fixed_policy=True)
-    assert cells_of({"monitor": summary})["monitor"][0] == "0.0 [0.0, 30.8]"
-    assert re.search(r"monitor +[\d,]+ +\(20\.0\)\n", summary_text({"monitor": summary}, {}))
-
-
-def test_results_are_grouped_by_arm_in_the_order_of_runs():
-    results = [replace(result([0.0], [0], index=i), arm=arm) for arm in ("b", "a") for i in (1, 0)]
-    groups = by_arm(results)
-    assert list(groups) == ["b", "a"]
-    assert [one.index for one in groups["a"]] == [0, 1]

@@ -14,7 +14,6 @@ import gymnasium as gym
 import pytest
 
 from agents.hyperparams import complete_hyperparams
-from experiments.settings import SynthesizeSettings
 from ncs_gym import truck_trailer
 from shields import Certificate
 from tests.command import assert_one_sentence, environment, ncs, succeeded, without_pictures
@@ -139,37 +138,9 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers
     assert_one_sentence(unknown, "on the command line give --env module:id, with the name of that module")
 
 
-def test_own_plant_is_drawn(folder):
-    succeeded("render", *ENV, "--out", "frame.png", "--steps", 2, "--shield", "none", cwd=folder)
-    assert (folder / "frame.png").exists()
-
-
 def test_error_of_the_module_itself_is_told(folder):
     (folder / "own_plants.py").write_text("import something_that_is_missing")
     assert_one_sentence(ncs("synthesize", *ENV, cwd=folder), "something_that_is_missing")
-
-
-def test_id_of_this_package_may_name_its_module(certificate, tmp_path):
-    certificate.save(tmp_path / "c.json")
-    succeeded("verify", tmp_path / "c.json", "--env", "ncs_gym:ncs_gym/TruckTrailerCruise-v0")
-
-
-def test_plant_of_a_file_is_certified(tmp_path):
-    random_plant(3, 3, 2).save(tmp_path / "plant.json")
-    succeeded("synthesize", "--plant", "plant.json", cwd=tmp_path)
-    assert Certificate.load(tmp_path / "certificate.json").contract is None
-    checked = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
-    assert checked.stdout.endswith("\ncertificate.json verifies\n")
-    assert json.loads((tmp_path / "v.json").read_text())["env"] == "plant.json"
-
-
-def test_synthesis_ends_after_a_minute_unless_another_limit_is_given(tmp_path):
-    random_plant(3, 3, 2).save(tmp_path / "plant.json")
-    over = ncs("synthesize", "--plant", "plant.json", "--time-limit", 1e-9, cwd=tmp_path)
-    assert over.returncode == 2
-    assert over.stderr.splitlines()[-1].startswith("ncs: the time_limit of 1e-09 s was over at error set, before ")
-    succeeded("synthesize", "--plant", "plant.json", "--time-limit", "None", cwd=tmp_path)
-    assert SynthesizeSettings().time_limit == 60.0
 
 
 def test_plant_of_a_file_under_a_contract(plant_file, tmp_path):

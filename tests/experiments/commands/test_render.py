@@ -13,10 +13,10 @@ from agents.training import untrained
 from experiments.commands.render import render
 from experiments.runs.policies import policy_by_name
 from experiments.settings import RenderSettings
-from ncs_gym import Channel, truck_trailer
+from ncs_gym import Channel
 from ncs_gym.rendering import theme
 from tests.command import assert_one_sentence, ncs, succeeded
-from tests.product import safety_shield, synthesize
+from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -76,43 +76,6 @@ def test_pictures_are_twice_as_dense_as_animations_unless_asked_otherwise(tmp_pa
         assert np.abs(halved - np.asarray(other.convert("RGB"))).mean() < 2.0
 
 
-def test_lookahead_is_drawn_with_its_plan(tmp_path):
-    file = tmp_path / "certificate.json"
-    synthesize(truck_trailer(mass=4000.0), safe_set="ellipsoid").save(file)  # in a polytope hardly a plan is needed
-    for shield in ("project", "lookahead"):
-        render(settings(shield=shield, steps=12, certificate=file, out=tmp_path / f"{shield}.png", scale=1))
-    with Image.open(tmp_path / "project.png") as one, Image.open(tmp_path / "lookahead.png") as other:
-        plans = [(np.asarray(each.convert("RGB")) == theme.PLAN).all(axis=2) for each in (one, other)]
-    plane = slice(int(theme.PLANE.y), int(theme.PLANE.bottom)), slice(int(theme.PLANE.x), int(theme.PLANE.right))
-    assert not plans[0].any()
-    assert plans[1][plane].sum() > 20
-    assert plans[1].sum() > plans[1][plane].sum()  # the legend
-
-
-def test_stored_plan_keeps_its_color_in_a_gif(tmp_path):
-    render(settings(shield="lookahead", steps=12, out=tmp_path / "a.gif"))
-    with Image.open(tmp_path / "a.gif") as image:
-        image.seek(image.n_frames - 1)
-        assert (np.asarray(image.convert("RGB")) == theme.PLAN).all(axis=2).sum() > 20
-
-
-def test_picture_is_that_of_the_last_step(tmp_path):
-    render(settings(shield="none", steps=2, out=tmp_path / "a.png"))
-    render(settings(shield="none", steps=2, out=tmp_path / "a.gif", scale=2))
-    with Image.open(tmp_path / "a.png") as picture, Image.open(tmp_path / "a.gif") as animation:
-        animation.seek(2)
-        differences = np.asarray(picture.convert("RGB"), float) - np.asarray(animation.convert("RGB"), float)
-    assert np.abs(differences).mean() < 2.0
-
-
-def test_small_red_things_stay_red_in_a_gif(tmp_path):
-    render(settings(shield="none", steps=4, out=tmp_path / "a.gif"))
-    with Image.open(tmp_path / "a.gif") as image:
-        image.seek(4)
-        pixels = np.asarray(image.convert("RGB")).astype(int)
-    assert (np.abs(pixels - np.array(theme.DANGER)).max(axis=-1) < 8).sum() > 500
-
-
 def violations_of_lqr(env_id, certificate=None, shielded=False):
     env = gym.make(env_id)
     inner = env.unwrapped
@@ -131,11 +94,6 @@ def violations_of_lqr(env_id, certificate=None, shielded=False):
 def test_regulator_violates_unless_shielded(certificate):
     assert violations_of_lqr(CRUISE) > 0
     assert violations_of_lqr(CRUISE, certificate, shielded=True) == 0
-
-
-def test_regulator_violates_unless_shielded_on_an_unstable_plant():
-    assert violations_of_lqr("ncs_gym/CartPole-v0") > 0
-    assert violations_of_lqr("ncs_gym/CartPole-v0", shielded=True) == 0
 
 
 def test_random_policy_follows_the_seed():
@@ -158,13 +116,6 @@ def test_tuned_regulator_reaches_its_target():
     for _ in range(100):
         weak += env.step(np.zeros(1, np.float32))[1]
     assert strong > weak + 10.0
-
-
-def test_saved_model_acts_as_it_did(model):
-    folder, agent = model
-    observations = np.random.default_rng(0).standard_normal((5, 3)).astype(np.float32)
-    policy = policy_by_name(str(folder), CRUISE, gym.make(CRUISE).unwrapped, 0)
-    np.testing.assert_array_equal(policy(observations[0], {}), agent.act(observations[:1])[0])
 
 
 def test_settings_that_an_agent_was_trained_with_are_named(model, tmp_path, capsys):

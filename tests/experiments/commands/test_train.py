@@ -3,16 +3,13 @@
 import json
 from dataclasses import replace
 
-import gymnasium as gym
 import pytest
 
 from agents import Agent, SafetyCallback
 from experiments.__main__ import parse
 from experiments.errors import RunStopped
 from experiments.runs.output_folder import claim_folder
-from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs, succeeded
-from tests.product import safety_shield
 
 SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
 HINT = "This training had no violation and no override"
@@ -75,19 +72,3 @@ def test_damaged_history_is_one_sentence(tmp_path, without_workers, text):
 
 def stored(folder):
     return json.loads((folder / "runs" / "shielded-0.json").read_text())["result"]
-
-
-@pytest.mark.slow
-def test_agents_are_trained_and_evaluated_where_the_box_counts_at_all_times(tmp_path, without_workers):
-    folder = tmp_path / "cruise"
-    at_all_times = ("--between-samples", "4")
-    succeeded("train", "--steps", 512, *SHORT, folder, "--safe-set", "ellipsoid", *at_all_times)
-    certificate = Certificate.load(folder / "certificate.json")
-    assert certificate.between_samples == 4
-    model = next((folder / "models").iterdir())
-    assert ncs("evaluate", model, "--episodes", "2", *at_all_times).returncode == 0
-    assert ncs("evaluate", model, "--episodes", "2").returncode == 0  # files of agents keep it
-    with pytest.raises(CertificateError, match="or for a box that counts at all times"):
-        safety_shield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
-    succeeded("synthesize", "--out", tmp_path / "c.json", "--safe-set", "ellipsoid", *at_all_times)
-    assert Certificate.load(tmp_path / "c.json") == certificate

@@ -78,38 +78,12 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
     assert ArmStyle.of("shielded:switch+penalty").color == ArmStyle.of("shielded:switch").color
 
 
-def test_markers_tell_a_price_apart_and_filters_of_a_fixed_policy():
-    assert ArmStyle.of("penalized").size != ArmStyle.of("penalized:10").size
-    policies = [ArmStyle.of(f"lqr+{name}") for name in ("trusting", "psf:tube", "shielded", "lookahead")]
-    assert len({(style.color, style.hollow) for style in policies}) == len(policies)
-
-
 @pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
 def test_color_blind_readers_can_tell_the_colors_apart(seen):
     linear = {arm: np.power(to_rgb(color), 2.2) for arm, (color, _) in ARM_COLORS_AND_MARKERS.items()}
     shown = {arm: np.power(np.clip(seen @ color, 0.0, 1.0), 1 / 2.2) for arm, color in linear.items()}
     for one, other in combinations(shown, 2):
         assert np.linalg.norm(shown[one] - shown[other]) > 0.1, (one, other)
-
-
-def test_arms_have_the_same_color_in_every_figure(plant):
-    shown = arms("unshielded", "shielded:boundary")
-    training = training_figure(shown).axes[0]
-    scatter = scatter_figure(summary_of(shown)["arms"]).axes[0]
-    episode = episode_figure(random_plant(1, 2, 1), dict.fromkeys(shown, trajectory(np.zeros((3, 2))))).axes[0]
-    wanted = {ArmStyle.of(name).color.lower() for name in shown}
-    assert set(by_color(training)) == wanted
-    assert {to_hex(line.get_markeredgecolor()).lower() for line in scatter.get_lines()} >= wanted
-    assert set(by_color(episode)) >= wanted
-
-
-def test_legend_takes_rows_until_it_fits_the_figure(plant):
-    figure = training_figure(arms(*ALL_ARMS))
-    figure.draw_without_rendering()
-    box = figure.legends[0].get_window_extent()
-    assert len(figure.legends[0].get_texts()) == len(ALL_ARMS) + 1
-    assert box.x0 >= 0.0
-    assert box.x1 <= figure.bbox.x1
 
 
 def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watching_arms():
@@ -129,37 +103,11 @@ def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watchi
     assert thousands(-1234567.5) == "\N{MINUS SIGN}1,234,567.5"
 
 
-def test_training_of_one_run_has_no_band_and_the_caption_says_so():
-    figure = training_figure(arms("unshielded", "shielded", runs=1))
-    assert [bands(axis) for axis in figure.axes] == [[], [], []]
-    assert "no band" in figure.caption
-    assert not any("run" in text for text in texts(figure))
-
-
-def test_training_of_one_point_is_seen_and_an_unfinished_episode_is_said():
-    for axis in training_figure(arms("shielded", history=history(64))).axes:
-        (line,) = axis.get_lines()
-        assert line.get_marker() == "^"
-        assert 64 in line.get_xdata()
-        low, high = axis.get_ylim()
-        assert low < line.get_ydata()[-1] < high
-    unfinished = [replace(point, episode_return=float("nan")) for point in history(64)]
-    axis = training_figure(arms("shielded", history=unfinished)).axes[0]
-    assert [text.get_text() for text in axis.texts] == ["no episode was finished"]
-
-
 def test_intervention_rate_of_a_training_is_that_of_the_last_steps_only():
     window = RATE_WINDOW
     points = [TrainingPoint(i * window, 0.0, 0, (i > 1) * window // 2) for i in (1, 2, 3)]
     (line,) = lines(training_figure(arms("shielded", runs=1, history=points)).axes[2])
     np.testing.assert_allclose(line.get_ydata()[-3:], [0.0, 50.0, 0.0])
-
-
-def test_caption_of_a_training_names_the_arms_whose_return_contains_penalties_and_what_a_monitor_counts():
-    caption = training_figure(arms("penalized", "shielded+penalty", "shielded", "monitor")).caption
-    assert "penalties that penalized and shielded+penalty get" in caption
-    assert "would have" in caption
-    assert "penalties" not in training_figure(arms("unshielded", "shielded")).caption
 
 
 @pytest.mark.parametrize(
@@ -193,33 +141,6 @@ def test_time_series_show_the_episode_in_which_most_is_overridden_beside_an_unsh
     assert figure.axes[0].get_title() == "Episode 1 of run 1, attacked"
 
 
-def test_arms_that_are_drawn_together_have_a_color_each():
-    shown = ["unshielded", "shielded", "pretrained", "pretrained+shielded", "lqr", "lqr+shielded", "shielded+penalty"]
-    colors = [style.color for style in arm_styles(shown).values()]
-    assert len(set(colors)) == len(shown)
-    assert colors[:3] == [ArmStyle.of(name).color for name in shown[:3]]
-    assert len(arm_styles(ALL_ARMS)) == len(ALL_ARMS)  # more than there are colors
-
-
-def test_scatter_has_a_panel_for_every_scenario_that_was_asked_for():
-    shown = arms("unshielded", "shielded")
-    for runs in shown.values():
-        for result in runs:
-            result.scenarios["attacked"] = run(result.arm, violations=(3, 1)).episodes
-    figure = scatter_figure(summary_of(shown)["arms"])
-    assert [axis.get_title() for axis in figure.axes] == ["as trained", "attacked"]
-    means = [[line.get_xdata()[0] for line in axis.get_lines() if len(line.get_xdata()) == 1] for axis in figure.axes]
-    assert means == [[0.0, 0.0], [100.0, 100.0]]
-    assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
-
-
-def test_scatter_is_as_high_as_what_was_measured_whatever_an_interval_of_two_runs_says():
-    summary = summary_of(arms("unshielded"))["arms"]
-    low, high = scatter_figure(summary).axes[0].get_ylim()
-    assert summary["unshielded"]["eval_return_ci95"][0] < low < -3.0
-    assert -2.0 < high < summary["unshielded"]["eval_return_ci95"][1]
-
-
 def test_training_in_which_nothing_happened_has_no_figure(plant):
     nothing = [replace(point, episode_return=np.nan, violation_steps=0, interventions=0) for point in history(64, 128)]
     shown = arms("unshielded", "shielded", history=nothing)
@@ -251,36 +172,6 @@ def test_violations_of_the_limit_are_marked_and_only_then_in_the_legend():
         assert ("violation" in texts(figure)) is marked
 
 
-def test_violations_of_limits_that_states_do_not_show_are_marked_too():
-    """Of inputs and their changes, and between two samples: what the infos of the steps counted."""
-    plant = random_plant(1, 2, 1)
-    path = trajectory(np.zeros((11, 2)), violated=(2, 7))
-    (crosses,) = [
-        line for line in episode_figure(plant, {"unshielded": path}).axes[0].get_lines()
-        if line.get_marker() == "x"
-    ]  # fmt: skip
-    np.testing.assert_allclose(crosses.get_xdata(), plant.dt * np.array([3, 8]))
-
-
-def test_an_episode_that_ended_early_stands_beside_a_longer_one():
-    plant = random_plant(1, 4, 1)
-    shown = {
-        "unshielded": trajectory(np.zeros((5, 4)), arrivals=(0, 1)),
-        "shielded": trajectory(np.zeros((11, 4)), arrivals=(0, 1, 7)),
-    }
-    figure = episode_figure(plant, shown)
-    assert figure.axes[-1].get_xlim() == (0.0, 1.0)
-    assert [t[-3:] for t in texts(figure) if "packet" in t] == ["(2)", "(3)"]
-    assert "ended at its first violation" in episode_figure(plant, shown).caption
-
-
-def test_a_monitor_only_would_override():
-    plant = random_plant(1, 2, 1)
-    shown = {"monitor": trajectory(np.zeros((11, 2)), intervened=(1,))}
-    assert "would override, monitor (1)" in texts(episode_figure(plant, shown))
-    assert "would have" in episode_figure(plant, shown).caption
-
-
 def test_scatter_has_a_point_per_run_and_the_mean_with_its_intervals():
     summary = summary_of({"unshielded": [run("unshielded", i, violations=(4, 0)) for i in range(3)]})["arms"]
     (axis,) = scatter_figure(summary).axes
@@ -302,32 +193,6 @@ def test_scatter_without_a_violation_shows_what_the_probability_is_at_most_and_o
     assert not [line for line in figure.axes[0].get_lines() if line.get_marker() == "_"]
     assert figure.axes[0].get_xlim()[1] > 0.5
     assert "no interval" in figure.caption
-
-
-@pytest.mark.parametrize(
-    ("names", "runs", "says"),
-    [
-        (("lqr", "lqr+shielded"), 2, "interval of the mean return over episodes"),
-        (
-            ("lqr",),
-            1,
-            "A marker is one run; vertical bars are Student's 95 % interval of the mean return over episodes",
-        ),
-        (("lqr", "shielded"), 1, "an agent has no interval, that of a policy without training Student's 95 %"),
-        (("lqr", "shielded"), 3, "mean return over runs (of policies without training, over episodes)"),
-        (("unshielded", "shielded"), 3, "mean return over runs, horizontal"),
-    ],
-)
-def test_scatter_says_what_its_vertical_bars_are_over(names, runs, says):
-    assert says in scatter_figure(summary_of(arms(*names, runs=runs))["arms"]).caption
-
-
-def test_arms_that_coincide_have_markers_of_different_sizes():
-    shown = arms(*ALL_ARMS)
-    for axis in scatter_figure(summary_of(shown)["arms"]).axes:
-        means = [line.get_markersize() for line in axis.get_lines() if len(line.get_xdata()) == 1]
-        assert means == sorted(set(means), reverse=True)
-        assert len(means) == len(ALL_ARMS)
 
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):

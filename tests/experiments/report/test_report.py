@@ -7,7 +7,6 @@ import pytest
 from jinja2 import UndefinedError
 
 from experiments.report.html import comparison_report
-from experiments.runs.arms import Arm
 from shields import Report
 from shields.verification.condition import flag
 from tests.experiments.results import ALL_ARMS, run, summary_of
@@ -69,22 +68,6 @@ def test_page_is_well_formed_and_needs_nothing_from_elsewhere():
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert ("meta", {"charset": "utf-8"}) in reader.tags
     assert any(attributes.get("name") == "viewport" for _, attributes in reader.tags)
-
-
-def test_everything_from_outside_is_escaped():
-    page = comparison("shielded", env=ATTACK, certificate=ATTACK, hyperparams={ATTACK: ATTACK})
-    assert "<script" not in page
-    assert page.count("&lt;script&gt;") >= 4
-    assert ATTACK in "".join(Reader(page).text)
-
-
-def test_captions_findings_and_conditions_are_escaped():
-    summary = summary_of({"shielded": [run("shielded")]})
-    summary["references"] = {ATTACK: summary["arms"]["shielded"]}
-    summary["versions"] = {ATTACK: ATTACK}
-    page = comparison_report(summary, Report((flag(ATTACK, False),)), {"a": (f'"{ATTACK}. B', PNG)}, [ATTACK])
-    assert "<script" not in page
-    assert Reader(page).open == []
 
 
 def attacked(value, text, path=()):
@@ -170,13 +153,6 @@ def test_violations_have_their_exact_interval_and_those_of_state_and_estimate_st
     assert safety(comparison_report(summary, VERIFIED, {}, []))["shielded"][3:5] == ["1,234", "5,678"]
 
 
-def test_interventions_of_a_monitor_are_in_brackets_and_without_a_shield_there_are_none():
-    rows = safety(comparison("unshielded", "monitor", "shielded"))
-    assert [rows[name][1] for name in rows if name] == ["\N{EN DASH}", "(20.0 %)", "20.0 %"]
-    assert [rows[name][-1] for name in rows if name] == ["\N{EN DASH}", "\N{EN DASH}", "6 of 6"]
-    assert "what the shield would have overridden" in comparison("monitor")
-
-
 def test_returns_and_differences_have_students_and_the_bootstraps_interval():
     reader = Reader(comparison("unshielded", "shielded", runs=3))
     returns = {row[0]: row[1:] for row in reader.tables["Return of each arm"]}
@@ -187,11 +163,6 @@ def test_returns_and_differences_have_students_and_the_bootstraps_interval():
     assert reader.tables["Paired differences"][1][1:4] == ["+0.0", "[+0.0, +0.0]", "[+0.0, +0.0]"]
 
 
-def test_over_a_handful_of_runs_the_bootstrap_is_called_too_narrow_and_over_many_not():
-    assert comparison("unshielded", "shielded", runs=3).count("A percentile bootstrap over 3 runs is too narrow") == 2
-    assert "too narrow" not in comparison("unshielded", "shielded", runs=10)
-
-
 def test_one_run_has_no_interval_and_the_page_says_so():
     page = comparison("unshielded", "shielded", runs=1)
     assert "none: one run" in page
@@ -200,51 +171,6 @@ def test_one_run_has_no_interval_and_the_page_says_so():
     assert "how training varies is unknown" in page
     assert "bootstrap over" not in page
     assert "Paired differences" not in comparison("shielded")
-
-
-def test_policies_without_training_stand_below_a_rule():
-    summary = summary_of({"shielded": [run("shielded")]})
-    summary["references"] = {"zero input": summary["arms"]["shielded"] | {"mode": None, "train_steps": 0}}
-    page = comparison_report(summary, VERIFIED, {}, [])
-    assert page.count("<tr class=rule><td>zero input</td><td>\N{EN DASH}</td>") == 1
-    assert "zero input (does nothing)" in page
-
-
-def test_conditions_are_shown_and_a_broken_one_stands_out():
-    page = comparison_report(
-        summary_of({"shielded": [run("shielded")]}), Report((flag("(S)", False),)), {}, ["Finding 1."]
-    )
-    assert '<td>(S)</td><td>-1.00e+00</td><td><span class="broken">broken</span></td>' in page.replace("\n", "")
-    assert "<li>Finding 1.</li>" in page
-
-
-def test_hyperparameters_are_shown_by_their_names():
-    text = "".join(Reader(comparison("shielded")).text)
-    assert "hyperparams.n_envs" in text
-    assert "hyperparams.policy_kwargs.net_arch" in text
-    assert "8 8" in text
-    assert "3.11.9" in text
-    assert "c" * 64 in text
-
-
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
-def test_the_shield_is_explained_as_its_mode_acts(mode):
-    assert Arm.of("shielded", mode).mode == mode
-    assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
-    assert ("where not every input" in comparison("shielded", mode=mode)) == (mode == "boundary")
-
-
-@pytest.mark.parametrize(
-    ("arm", "words"),
-    [
-        ("lqr+psf:20", "no disturbance, and no proof. A margin of 20 percent of box and safe set is kept."),
-        ("trusting:40", "the shield's test, with the estimate taken for the true state"),
-        ("psf:tube", "whose limits are tightened by a tube; no proof."),
-        ("pretrained+shielded", "the small agent that comes with the package;"),
-    ],
-)
-def test_filters_with_margins_and_agents_of_the_package_are_explained(arm, words):
-    assert words in " ".join("".join(Reader(comparison("shielded", arm)).text).split())
 
 
 def test_every_condition_has_a_table_and_every_arm_an_explanation():

@@ -90,23 +90,6 @@ def test_what_an_environment_is_registered_with_is_known(changed):
         del gym.registry["Own/Truck-v0"]
 
 
-def test_a_plant_in_a_file_counts_with_what_the_file_holds(tmp_path):
-    try:
-        truck_trailer().save(tmp_path / "plant.json")
-        register_plant("Own/File-v0", tmp_path / "plant.json")
-        before = registration_of("Own/File-v0")
-        truck_trailer(mass=900.0).save(tmp_path / "plant.json")
-        assert registration_of("Own/File-v0") != before
-    finally:
-        del gym.registry["Own/File-v0"]
-
-
-def test_a_folder_without_results_is_taken_whatever_was_asked_for_before(tmp_path):
-    claim_folder("compare", CompareSettings(out=tmp_path))
-    claim_folder("train", TrainSettings(out=tmp_path, seed=1))
-    assert json.loads((tmp_path / "settings.json").read_bytes())["command"] == "train"
-
-
 def test_results_of_another_command_are_refused(tmp_path):
     finished("compare", CompareSettings(out=tmp_path))
     with pytest.raises(OtherResultsError, match="holds results of ncs compare: give another --out"):

@@ -77,11 +77,6 @@ def test_result_of_another_certificate_or_version_is_not_taken(folder, run, cert
     assert load(folder, run) is None
 
 
-def test_grid_point_is_no_part_of_the_settings(run):
-    assert replace(run, grid_point="loss0.3").key == run.key
-    assert replace(run, grid_point="loss0.3").name == "loss0.3-shielded-switch+penalty-1"
-
-
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"3", b"\xff", b"[" * 10_000, None])
 def test_damaged_result_is_said_and_done_again(folder, run, content, capsys):
     path = folder / "runs" / f"{run.name}.json"
@@ -97,19 +92,6 @@ def test_result_without_its_agent_is_done_again(folder, run):
     assert load(folder, run) is None
 
 
-def test_half_stored_result_of_other_settings_leaves_nothing_behind(folder, run, result, monkeypatch):
-    # Killed between the agent's files and the run's.
-    def killed(path, content):
-        if path.suffix == ".json" and path.parent.name == "runs":
-            raise KeyboardInterrupt
-        path.write_bytes(content)
-
-    monkeypatch.setattr("experiments.runs.run_store.write_atomically", killed)
-    with pytest.raises(KeyboardInterrupt):
-        save(folder, replace(run, steps=257), replace(result, files={"model.zip": b"new", "agent.json": b"new"}))
-    assert load(folder, run) is None
-
-
 def test_changed_source_is_another_key(run, monkeypatch):
     before, changed = run.key, versions() | {"source": "changed"}
     assert changed != versions()
@@ -122,10 +104,6 @@ def test_runs_of_one_name_are_refused(run, tmp_path):
     for runs in ((run, run), alike):
         with pytest.raises(ValueError, match="same name"):
             results_of(runs, tmp_path, BackendSettings(jobs=1))
-
-
-def test_nothing_stored_is_nothing_loaded(run, tmp_path):
-    assert load(tmp_path, run) is None
 
 
 def test_finished_runs_are_not_run_again(folder, run, result, tmp_path, monkeypatch, capsys):

@@ -1,6 +1,5 @@
 import json
 import warnings
-from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -9,9 +8,8 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import ncs_gym
-from ncs_gym import Channel, Ellipsoid, GilbertElliott, NCSEnv, Regulation
+from ncs_gym import Channel, Ellipsoid, GilbertElliott, Regulation
 from tests.plants import random_plant
-from tests.product import library_plant
 
 IDS = ["ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"]
 
@@ -28,14 +26,6 @@ def test_gymnasium_and_sb3_checkers_pass_without_a_warning(env_id):
         warnings.simplefilter("error")
         check_env(make(env_id).unwrapped)
         check_env_sb3(make(env_id).unwrapped)
-
-
-def test_module_prefix_registers(tmp_path):
-    assert gym.make("ncs_gym:ncs_gym/TruckTrailer-v0").spec.id == "ncs_gym/TruckTrailer-v0"
-
-
-def test_factories_carry_metadata():
-    assert ncs_gym.registration.TRUCK_TRAILER.metadata == NCSEnv.metadata
 
 
 def test_environments_of_an_id_share_its_plant_which_is_made_once():
@@ -113,17 +103,6 @@ def test_actions_are_clipped_and_taken_in_float64():
     assert env.step(np.array([0.1]))[4]["input"][0] == 4.0 * 0.1
 
 
-def test_start_state_can_be_chosen():
-    env = make(IDS[0])
-    np.testing.assert_array_equal(env.reset(options={"state": [0.5, -1.0]})[1]["state"], [0.5, -1.0])
-
-
-def test_observation_box_leaves_room_for_the_disturbance():
-    plant = library_plant(ncs_gym.truck_trailer, gamma=0.0, process_noise_cov=np.zeros((2, 2)))
-    quiet = make(IDS[0], plant=plant, disturbance="ball")
-    assert (make(IDS[0]).observation_space.high > quiet.observation_space.high + 0.05).all()
-
-
 def test_starts_fill_the_disc_of_radius_1_9():
     env = make(IDS[0])
     radii = np.array([np.linalg.norm(env.reset(seed=i)[1]["state"]) for i in range(400)])
@@ -155,12 +134,6 @@ def test_violation_terminates_only_if_asked_to():
         assert ended is asked
 
 
-def test_time_limit_is_left_to_the_wrapper():
-    env = make(IDS[0])
-    env.reset(seed=0)
-    assert [env.step(np.zeros(1, np.float32))[3] for _ in range(200)] == [False] * 199 + [True]
-
-
 def test_full_throttle_under_the_worst_disturbance_stays_in_the_observation_space():
     env = make(IDS[1], disturbance="adversarial")
     for sign in (1.0, -1.0):
@@ -188,32 +161,6 @@ def test_a_step_that_failed_half_way_needs_a_reset():
         env.step(np.zeros(1, np.float32))
     env.reset()
     env.step(np.zeros(1, np.float32))
-
-
-class Moody(Regulation):
-    """A task that fails in its second episode."""
-
-    calls: ClassVar = [0]
-
-    def begin(self, rng, plant):
-        self.calls[0] += 1
-        if self.calls[0] == 2:
-            raise RuntimeError("moody")
-
-
-def test_a_reset_that_failed_half_way_needs_another():
-    env = make(IDS[0], task=Moody()).unwrapped
-    env.reset(seed=0)
-    with pytest.raises(RuntimeError, match="moody"):
-        env.reset(options={"state": [1.9, 1.9]})
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(np.zeros(1, np.float32))
-
-
-def test_a_plant_of_another_size_gets_defaults_that_fit():
-    env = make(IDS[0], plant=random_plant(0, 3, 2))
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
 
 
 def test_a_variant_of_the_truck_keeps_the_case_studys_disturbance_and_starts():

@@ -184,37 +184,6 @@ def test_shielded_and_randomized_environment_is_made_again_from_its_spec(registe
     assert_moves_alike(made, again)
 
 
-def test_relative_path_of_a_plant_and_a_path_object_are_json(register, tmp_path, monkeypatch):
-    own_plant().save(tmp_path / "plant.json")
-    monkeypatch.chdir(tmp_path)
-    register("Plants/Own-v0", "plant.json")
-    register("Plants/Path-v0", tmp_path / "plant.json", channel=Channel(loss=BURSTS), contract=ChannelContract(9))
-    path = gym.make(LINEAR, plant=tmp_path / "plant.json").spec
-    for spec in (path, gym.spec("Plants/Own-v0"), gym.spec("Plants/Path-v0")):
-        made = gym.make(EnvSpec.from_json(spec.to_json())).unwrapped
-        assert made.plant.fingerprint == own_plant().fingerprint
-    assert (made.channel, made.contract) == (Channel(loss=BURSTS), ChannelContract(9))
-
-
-@pytest.mark.parametrize(
-    "document",
-    [{}, {"format": "ncs-gym plant 1"}, {"format": "ncs-gym plant 1", "plant": {"A": [[1.0]]}}, {"plant": {1, 2}}],
-    ids=str,
-)
-def test_document_of_no_plant_is_one_sentence(document):
-    with pytest.raises(ValueError, match="plant") as caught:
-        gym.make(LINEAR, plant=document)
-    assert "\n" not in str(caught.value)
-
-
-def test_what_holds_functions_stays_what_it_is():
-    """Gymnasium says then that the spec is no JSON; nothing is lost without a word."""
-    made = gym.make(LINEAR, plant=own_plant(), disturbance=lambda rng, plant, nominal: np.zeros(2))
-    with pytest.raises(TypeError, match="not JSON serializable"):
-        made.spec.to_json()
-    assert_moves_alike(made, gym.make(made.spec))
-
-
 @pytest.mark.parametrize("limits", [{"box": [5.0, np.inf]}, {"box": [[0.2, 0.0], [0.4, 0.0]]}, {"box": [[1.0, -1.0]]}])
 def test_states_without_a_limit_start_at_the_operating_point(limits):
     plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=1.0, gamma=1e-4, **limits)
@@ -237,17 +206,3 @@ def test_past_inputs_cost_nothing_but_what_inputs_do():
         returns.append(total)
     assert returns[0] < -0.01
     assert returns[1] == pytest.approx(returns[0], rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"input_delay": 2}, "delays act later than the task's speed moves: give it as a downlink"),
-        ({"operating_input": [1.0]}, "the operating point must count from zero, got 1"),
-    ],
-)
-def test_speeds_are_those_of_inputs_that_act_at_once_from_zero(changes, words):
-    settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "box": 1.0, "u_max": 4.0, "gamma": 1e-4}
-    gym.make(LINEAR, plant=linear_plant(**settings, du_max=1.0), task=SpeedTracking())
-    with pytest.raises(ValueError, match=words):
-        gym.make(LINEAR, plant=linear_plant(**settings, **changes), task=SpeedTracking())

@@ -1,7 +1,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from ncs_gym import BallDisturbance, Ellipsoid, SetpointTracking, SpeedTracking, truck_trailer
 from tests.product import library_plant, vector_env
@@ -101,17 +101,6 @@ def test_disabled_autoreset_wants_the_finished_environments_reset():
     env.step(np.zeros((3, 1), np.float32))
 
 
-def test_actions_of_any_precision_mean_the_same():
-    states = []
-    for kind in (np.float32, np.float64, np.float16, int):
-        env = make("TruckTrailer", 3)
-        env.reset(seed=0)
-        states.append(env.step(np.array([[0.5], [1.0], [-2.0]]).astype(kind) * (kind is not int))[4]["input"])
-    np.testing.assert_array_equal(states[0], states[1])
-    np.testing.assert_array_equal(states[0], [[2.0], [4.0], [-4.0]])
-    np.testing.assert_array_equal(states[3], 0.0)
-
-
 def test_what_a_users_subclass_changes_counts():
     class Fixed(SpeedTracking):
         def reward(self, plant, task_state, state, u):
@@ -137,11 +126,6 @@ def test_what_a_users_subclass_changes_counts():
     env = vector_env(3, plant=plant, task=Odd(output=(1.0, 0.0), reach=0.8, width=2.0, change_probability=0.0))
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(observation[:, -1], 0.25)
-
-
-def test_gymnasiums_sync_vector_env_of_scalar_ones_is_still_available():
-    env = make("TruckTrailer", 2, vectorization_mode="sync")
-    assert isinstance(env.unwrapped, SyncVectorEnv)
 
 
 def test_an_episode_that_begins_outside_the_box_does_not_end_before_its_first_step():

@@ -189,15 +189,6 @@ def test_entries_are_what_infos_say_and_actions_are_those_decided():
         over = any(ends)
 
 
-def test_entries_of_other_observations_have_names():
-    space = Networked(Counter("image"), LATE, observe=("age", "pending_actions"), pending=2).observation_space
-    assert list(space) == ["age", "observation", "pending_actions"]
-    assert space["pending_actions"].shape == (2, 1)
-    assert "arrived" in Networked(Counter("dict"), LATE, observe=("arrived",)).observation_space.spaces
-    with pytest.raises(ValueError, match="have an entry 'age' of their own"):
-        Networked(Networked(Counter("dict"), LATE, observe=("age",)), observe=("age",))
-
-
 @pytest.mark.parametrize(
     ("actions", "size"),
     [
@@ -298,16 +289,6 @@ def test_quantized_floats_stay_in_their_space():
         assert np.isclose(seen / 0.3, np.rint(seen / 0.3), atol=1e-5)[np.abs(seen) < env.observation_space.high].all()
 
 
-@pytest.mark.parametrize(("dtype", "step"), [(np.float16, 1e-3), (np.float32, 1e-46)])
-def test_coarse_types_are_rounded_to_small_steps(dtype, step):
-    constant = Sampled(gym.spaces.Box(-1000.0, 1000.0, (3,), dtype), np.array([100.0, -70.0, 0.0], dtype))
-    env = Networked(constant, Channel(quantization_step=step))
-    env.reset(seed=0)
-    seen = env.step(0)[0]
-    assert seen.dtype == dtype
-    np.testing.assert_array_equal(seen, [100.0, -70.0, 0.0])
-
-
 def test_network_does_not_depend_on_what_the_environment_draws():
     ages = [
         [each[-1]["measurement_age"] for each in run(Networked(Counter(extra_draws=draws), LATE), 50, seed=4)]
@@ -324,24 +305,6 @@ def test_rewards_travel_with_samples_if_asked_to_and_nothing_is_lost():
     for k, each in enumerate(later[1:-1], 1):
         newest = k - each[-1]["measurement_age"]
         assert sum(other[1] for other in later[1 : k + 1]) == sum(range(1, newest + 1))
-
-
-def test_rewards_may_be_arrays_of_one_number():
-    class Paying(Counter):
-        def step(self, action):
-            seen, reward, *rest = super().step(action)
-            return seen, np.array([reward], np.float32), *rest
-
-    def paid(make, settings):
-        return [each[1] for each in run(Networked(make(), Channel(delay=1), **settings), 6)[1:]]
-
-    assert (
-        paid(Paying, {"delay_reward": True}) == paid(Counter, {"delay_reward": True}) == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    )
-    assert paid(Paying, {}) == paid(Counter, {})  # passed on as they are
-    asked = RequestActions(Networked(Paying(), Channel(on_request=True)), cost=0.5)
-    asked.reset(seed=0)
-    assert [asked.step(np.ones(2))[1] for _ in range(2)] == [0.5, 1.5]
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -387,18 +350,6 @@ def test_actions_on_their_way_stay_as_they_are(kind):
     assert [float(np.ravel(each["a"] if kind == "dict" else each[0])[0]) for each in told] == acted
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, "3"])
-def test_what_is_no_seed_is_refused(seed):
-    for env in (Networked(Counter()), VectorNetworked(SyncVectorEnv([Counter]))):
-        with pytest.raises(ValueError, match="seed must be a whole number >= 0"):
-            env.reset(seed=seed)
-
-
-def test_random_channels_of_vector_environments_are_another_wrapper_s():
-    with pytest.raises(ValueError, match="RandomChannel takes an environment"):
-        RandomChannel(VectorNetworked(SyncVectorEnv([Counter])), [Channel()])
-
-
 class Echo(gym.Env):
     """Shows the action that acts, which is the number of its step."""
 
@@ -432,44 +383,6 @@ def test_actions_that_act_are_among_those_pending(late, downlink):
         assert action in {-1.0, k, *pending.tolist()}
         oldest = max(oldest, info["action_age"])
     assert oldest == env.pending
-
-
-def test_actions_of_several_parts_need_not_be_told():
-    class Hybrid(Echo):
-        action_space = spaces.Tuple([spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))])
-
-        def step(self, action):
-            return np.array([action[1][0]], np.float32), 0.0, False, False, {}
-
-    given = []
-
-    def predictor(last, age, actions):
-        given.append(actions)
-        return last
-
-    neutral = 0, np.zeros(2, np.float32)
-    for options in ({"observe": ("age", "arrived")}, {"fill": predictor, "pending": 2}):
-        env = Networked(Hybrid(), Channel(delay=1), Channel(delay=1), neutral=neutral, **options)
-        env.reset(seed=0)
-        for _ in range(3):
-            action = env.action_space.sample()
-            env.step(action)
-    assert [len(each) for each in given] == [2] * 3
-    assert given[-1][-1][0] == action[0]
-    np.testing.assert_array_equal(given[-1][-1][1], action[1])
-
-
-@pytest.mark.parametrize("key", ["packets", "channel_loss"])
-def test_infos_of_the_environment_that_are_the_network_s_are_refused_also_in_steps(key):
-    class Telling(Echo):
-        def step(self, action):
-            return (*super().step(action)[:-1], {key: 0.9})
-
-    one, many = Networked(Telling()), VectorNetworked(SyncVectorEnv([Telling]))
-    for env, action in ((one, np.ones(1)), (many, np.ones((1, 1)))):
-        env.reset(seed=0)
-        with pytest.raises(ValueError, match=f"the key '{key}', which is the network's"):
-            env.step(action)
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "Taxi-v4", "Blackjack-v1"])
@@ -584,25 +497,6 @@ def test_agent_that_sees_nothing_because_nobody_asks_is_told_once_in_an_episode(
         assert caught[0].filename == __file__
 
 
-@pytest.mark.parametrize("asks", [True, False])
-def test_agent_that_may_ask_is_told_nothing_whether_it_does_or_not(asks):
-    env = RequestActions(Networked(gym.make("Pendulum-v1"), Channel(on_request=True)))
-    env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for _ in range(30):
-            env.step(np.array([0.5, 1.0 if asks else -1.0], np.float32))
-        env = Networked(Counter(), Channel())
-        env.reset()
-        for _ in range(30):
-            env.step(env.action_space.sample())
-
-
-def test_time_limits_stand_inside_and_outside():
-    for env in (TimeLimit(Networked(Counter(), LATE), 7), Networked(TimeLimit(Counter(), 7), LATE)):
-        assert [each[3] for each in run(env, 7)[1:]] == [False] * 6 + [True]
-
-
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
@@ -661,21 +555,6 @@ def test_networks_that_do_not_fit_are_one_sentence():
 
 
 @pytest.mark.parametrize(
-    "actions",
-    [
-        gym.spaces.MultiDiscrete([3, 3]),
-        gym.spaces.Tuple([gym.spaces.Box(-1.0, 1.0), gym.spaces.Discrete(2)]),
-        gym.spaces.Dict({"gear": gym.spaces.Discrete(5)}),
-    ],
-)
-def test_number_zero_of_a_list_is_no_neutral_action(actions):
-    env = gym.wrappers.TransformAction(Counter(), None, actions)
-    with pytest.raises(ValueError, match="has no zero: give neutral="):
-        Networked(env, downlink=Channel(delay=1))
-    assert Networked(env, downlink=Channel(delay=1), neutral=actions.sample()).neutral is not None
-
-
-@pytest.mark.parametrize(
     "channel",
     [
         Channel(loss=0.3),
@@ -693,17 +572,6 @@ def test_pending_actions_are_all_that_the_newest_sample_usually_lacks(channel):
     assert np.mean(ages > envs.pending / 2) > 0.05  # no more of them than that takes
 
 
-def test_records_of_long_outages_say_what_is_usual():
-    trace = (0,) * 24_000 + (-1,) * 1_100 + (0, -1, -1, -1) * 2_500  # 7 % of the ages are 3, and 3 % more
-    assert Networked(Counter(), TraceChannel(trace=trace)).pending == 3
-
-
-def test_where_hardly_anything_arrives_the_delays_say_how_many_actions_are_pending():
-    staying = GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=0.9999)
-    for loss in (1.0, staying):
-        assert Networked(Counter(), Channel(loss=loss, delay=3, send_period=2)).pending == 4
-
-
 def test_predictor_that_lacks_actions_is_told_of_once():
     def steps(env):
         env.reset(seed=0)
@@ -717,14 +585,6 @@ def test_predictor_that_lacks_actions_is_told_of_once():
             steps(env)
         assert len(told) == 1
     steps(Networked(Counter(), channel, **settings | {"pending": 30}))
-
-
-def test_pending_actions_are_told_within_their_limits():
-    env = Networked(gym.make("Pendulum-v1"), Channel(delay=1), observe="pending_actions")
-    env.reset(seed=0)
-    seen, *_, info = env.step(np.array([9.0], np.float32))
-    assert (seen[-1], info["action_applied"]) == (2.0, 9.0)
-    assert env.observation_space.contains(seen)
 
 
 @pytest.mark.parametrize(

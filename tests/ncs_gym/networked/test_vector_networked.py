@@ -142,15 +142,6 @@ def test_last_observations_are_those_of_the_single_network(make, settings):
     assert ended > 1
 
 
-def test_of_dictionaries_and_tuples_only_those_that_ended_have_a_last_observation():
-    makes = [lambda length=length: Counter("dict", length=length) for length in (2, 3)]
-    many = VectorNetworked(SyncVectorEnv(makes, autoreset_mode=AutoresetMode.SAME_STEP), Channel(delay=1))
-    many.reset(seed=0)
-    many.step(np.zeros((2, 1)))
-    first, last = many.step(np.zeros((2, 1)))[-1]["final_obs"]
-    assert (first["count"], last) == (1.0, None)
-
-
 def marked(last, age, actions):
     return np.full(np.shape(last), -1)
 
@@ -175,30 +166,6 @@ def test_predictions_change_no_fresh_observation(fill):
         if ages[-1] == 0:
             np.testing.assert_array_equal(seen, np.float32(one.unwrapped.state))
     assert {0, 1} <= set(ages)
-
-
-def test_a_prediction_for_one_environment_is_none_for_all():
-    pendulums = SyncVectorEnv([lambda: gym.make("Pendulum-v1")] * 3)
-    envs = VectorNetworked(pendulums, Channel(delay=1), fill=lambda last, age, actions: last[0])
-    with pytest.raises(ValueError, match=r"whose first axis is the environment: expected \(3, 3\), got \(3,\)"):
-        envs.reset(seed=0)
-
-
-def test_last_infos_are_told_beside_environments_that_have_none():
-    class Bare(SyncVectorEnv):
-        def step(self, actions):
-            *rest, info = super().step(actions)
-            return (*rest, {key: each for key, each in info.items() if "final_info" not in key})
-
-    envs = VectorNetworked(Bare([lambda: TimeLimit(Counter(), 5)] * 2, autoreset_mode="SameStep"), Channel(delay=2))
-    envs.reset(seed=0)
-    for _ in range(5):
-        *_, truncated, info = envs.step(np.ones((2, 1)))
-    assert truncated.all()
-    assert info["final_info"]["packets"].tolist() == [5, 5]
-    assert info["final_info"]["measurement_age"].tolist() == [2, 2]
-    assert info["_final_info"].tolist() == [True, True]
-    assert info["packets"].tolist() == [0, 0]
 
 
 def test_records_are_replayed_beside_each_other_and_beside_chance():
@@ -241,19 +208,6 @@ def test_channels_of_episodes_are_drawn_also_where_they_begin_by_themselves():
     env.reset(seed=0)
     ages = np.array([env.step(np.zeros((3, 1)))[-1]["measurement_age"] for _ in range(200)])
     assert set(ages[3::5].ravel()) == {0, 1, 2, 3}  # of last steps: the delays drawn
-
-
-def test_channels_given_to_some_stay_for_their_episodes():
-    env = VectorNetworked(SyncVectorEnv([lambda length=length: Counter(length=length) for length in (3, 9)]), Channel())
-    env.reset(seed=0)
-    for _ in range(3):
-        _, _, over, _, _ = env.step(np.zeros((2, 1)))
-    *_, info = env.reset(options={"reset_mask": over, "channel": Channel(delay=7)})
-    assert (env.episode_channels, env.episode_downlinks) == ((Channel(delay=7), Channel()), (None, None))
-    for _ in range(3):
-        np.testing.assert_array_equal(info["channel_delay"], [7, 0])
-        *_, info = env.step(np.zeros((2, 1)))
-    np.testing.assert_array_equal(info["measurement_age"], [3, 0])
 
 
 def test_what_vector_environments_cannot_have_is_one_sentence():

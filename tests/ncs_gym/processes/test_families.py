@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from scipy.linalg import expm
 
 from ncs_gym import Channel, FamilyProcess, LinearProcess, RandomChannel
@@ -88,27 +87,6 @@ def test_options_fix_some_parameters_or_all():
     assert outer.reset(options={"parameters": {"member": 2}})[1]["parameters"] == [2.0]
 
 
-REFUSED = {
-    "a name": ({"mas": 4000.0}, r"dictionary of \['mass', 'stiffness'\]"),
-    "no dictionary": ([4000.0], "must be a dictionary"),
-    "no number": ({"mass": "heavy"}, "mass of options"),
-    "not finite": ({"mass": np.nan}, "mass of options"),
-    "several": ({"mass": [4000.0, 4100.0]}, "mass of options"),
-    "beyond": ({"mass": 4201.0}, "between 3800 and 4200"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_options_that_name_no_member_are_refused_before_anything_moves(name):
-    given, sentence = REFUSED[name]
-    env, envs = loop_env(FAMILY), vector_env(3, plant=FAMILY)
-    for each in (env, envs):
-        each.reset(seed=0)
-        with pytest.raises(ValueError, match=sentence):
-            each.reset(options={"parameters": given})
-        each.step(np.zeros(each.action_space.shape, np.float32))  # goes on
-
-
 def test_other_plants_have_no_parameters():
     for given in ({"plant": truck()}, {"plant": FAMILY, "process": LinearProcess()}):
         env = loop_env(**given)
@@ -119,11 +97,6 @@ def test_other_plants_have_no_parameters():
         loop_env(truck(), process=FamilyProcess())
     assert isinstance(own_process(truck()), LinearProcess)
     assert isinstance(loop_env(FAMILY).process, FamilyProcess)
-
-
-def test_a_member_that_is_not_listed_is_refused():
-    with pytest.raises(ValueError, match=r"no member of the family has \{'member': 3.0\}"):
-        loop_env(TRUCKS).reset(options={"parameters": {"member": 3}})
 
 
 def test_a_parameter_beyond_its_range_is_seen_where_the_step_leaves_the_bound():
@@ -162,19 +135,6 @@ def test_environments_of_a_vector_have_members_of_their_own(mode):
         *_, infos = envs.step(np.ones((4, 1), np.float32))
     if mode != "Disabled":
         assert len({*infos["parameters"][:, 0], *first[:, 0]}) == 8
-
-
-def test_same_seed_draws_the_same_members():
-    for plant in (FAMILY, TRUCKS):
-        envs = [vector_env(5, plant=plant) for _ in range(2)]
-        drawn = [each.reset(seed=7)[1]["parameters"] for each in envs]
-        np.testing.assert_array_equal(*drawn)
-        assert len(np.unique(drawn[0][:, 0])) > 1
-
-
-@pytest.mark.parametrize("plant", [NOISY, TRUCKS])
-def test_environment_passes_the_checker(plant):
-    check_env(gym.make(CRUISE, plant=plant).unwrapped, skip_render_check=True)
 
 
 def test_specs_hold_plants_that_are_listed_as_json_and_functions_as_they_are():

@@ -9,7 +9,6 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from ncs_gym import (
-    AdversarialDisturbance,
     Channel,
     Ellipsoid,
     FunctionProcess,
@@ -112,17 +111,6 @@ def test_inner_environment_is_started_where_the_loop_says():
     np.testing.assert_allclose(info["state"], linear(np.array([0.25, -0.5]), np.ones(1)))
     env.close()
     assert inner.closed
-
-
-def test_inner_seeds_come_from_the_seed_of_the_loop():
-    def seeds(seed):
-        env = loop_env(plant(), process=INNER)
-        env.reset(seed=seed)
-        env.reset()
-        return Inner.made[-1].seeds
-
-    assert seeds(3) == seeds(3) != seeds(4)
-    assert len(set(seeds(3))) == 2
 
 
 def test_without_write_state_episodes_start_where_the_inner_reset_leaves_it():
@@ -294,12 +282,3 @@ def test_process_of_others_cannot_write_into_the_state():
     one.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
         one.step(np.ones(1, np.float32))
-
-
-def test_what_a_disturbance_declares_is_never_inherited():
-    class Mine(AdversarialDisturbance):
-        def draw(self, rng, plant, nominal_next, step, memory):
-            return np.zeros(plant.n)
-
-    assert (Mine.vectorized, Mine.memoryless, Mine.replaces_process_noise) == (False, False, False)
-    assert AdversarialDisturbance.replaces_process_noise

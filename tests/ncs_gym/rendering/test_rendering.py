@@ -1,7 +1,6 @@
 """Pictures: what they show is looked for in their pixels, drawn from the data of a frame."""
 
 import copy
-import itertools
 import pickle
 import subprocess
 import sys
@@ -20,15 +19,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from agents import SB3VecEnv
-from ncs_gym import Annotation, Channel, ChannelContract, Ellipsoid, SetpointTracking
+from ncs_gym import Annotation, Channel, Ellipsoid
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
-from ncs_gym.rendering.canvas import Canvas
-from ncs_gym.rendering.episode_record import RECENT_STEPS
-from ncs_gym.rendering.phase_plane import PhasePlane, ends_of
+from ncs_gym.rendering.phase_plane import PhasePlane
 from tests.certificates import certificate_of
 from tests.plants import random_plant
-from tests.product import linear_plant, safety_shield, vector_shield
+from tests.product import safety_shield, vector_shield
 
 CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 DRAWN = [env_id for env_id in ENVIRONMENTS if env_id not in needing_extras()]
@@ -127,144 +124,6 @@ def test_plants_of_any_size_are_drawn(n, m):
     assert count(env.render(), theme.SAFE_FILL, theme.PLANE) > 1000
 
 
-@pytest.fixture
-def words_drawn(monkeypatch):
-    """Every text that is drawn."""
-    drawn, draw = [], Canvas.text
-
-    def text(canvas, words, *place, **style):
-        drawn.append(words)
-        return draw(canvas, words, *place, **style)
-
-    monkeypatch.setattr(Canvas, "text", text)
-    return drawn
-
-
-def test_numbers_around_an_operating_point_are_absolute(words_drawn):
-    common = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "gamma": 1e-4}
-    limits = {"state_limits": ([0.2, -3.0], [2.0, 1.0]), "operating_state": [1.1587, -0.5]}
-    limits |= {"input_limits": (0.0, 1.0), "operating_input": [0.25]}
-    names = {"state_names": ("level", "heat"), "state_units": ("m", ""), "input_names": ("pump",)}
-    env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(**common, **limits, **names))
-    env.reset(seed=0, options={"state": [0.1, 0.25]})
-    env.render()
-    assert {"level", "+1.259 m", "heat", "\N{MINUS SIGN}0.25", "pump", "+0.250"} <= set(words_drawn)
-    assert {"level [m]", "0.2", "1.1", "2", "heat", "\N{MINUS SIGN}3", "\N{MINUS SIGN}1", "1"} <= set(words_drawn)
-
-
-@pytest.mark.parametrize(("factor", "named"), [(1.0, ("level", "m")), (100.0, ("output", "")), (-0.5, ("output", ""))])
-def test_target_of_a_state_has_its_name_and_unit_and_is_absolute(factor, named):
-    limits = {"state_limits": (0.2, 2.0), "operating_state": [1.0], "input_limits": (0.0, 1.0), "operating_input": 0.5}
-    names = {"state_names": ("level",), "state_units": ("m",)}
-    plant = linear_plant(A=[[0.8]], B=[[0.4]], dt=1.0, gamma=1e-4, **limits, **names)
-    own = SetpointTracking(output=[factor], reach=0.5 * abs(factor), width=0.1 * abs(factor))
-    env = make("ncs_gym/LinearNCS-v0", plant=plant, task=own)
-    observation, _ = env.reset(seed=0, options={"state": [0.26]})
-    tracked = env.unwrapped.renderer.episode.tracked
-    assert (tracked.name, tracked.unit) == named
-    ends = factor - own.reach, factor + own.reach
-    assert tracked[2:] == pytest.approx((1.26 * factor, factor + observation[-1], *ends))
-
-
-def test_axis_of_a_state_without_a_limit_reaches_as_far_as_inputs_do():
-    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=2.0, gamma=1e-4, box=[5.0, np.inf])
-    np.testing.assert_allclose(ends_of(plant, 1), [-1.0, 1.0], rtol=1e-3)  # 2 * 0.1 / (1 - 0.8)
-    np.testing.assert_array_equal(ends_of(plant, 0), [-5.0, 5.0])
-
-
-@pytest.mark.parametrize("states", [1, 2])
-def test_past_inputs_are_not_drawn(words_drawn, states):
-    limits = {"state_limits": (0.2, 2.0), "operating_state": np.ones(states), "input_limits": (0.0, 1.0)}
-    own = {"A": 0.8 * np.eye(states), "B": np.full((states, 1), 0.4), "dt": 20.0, "gamma": 1e-4, "operating_input": 0.5}
-    plant = linear_plant(**own, **limits, input_delay=1, du_max=0.6, input_names=("valve",))
-    env = safety_shield(make("ncs_gym/LinearNCS-v0", plant=plant), certificate_of(plant, None, "polytope"))
-    env.reset(seed=0)
-    env.step(np.ones(1, np.float32))
-    env.render()
-    assert not [words for words in words_drawn if "ago" in words or "more state" in words]
-    assert {"x1", "step 1", "20 s"} <= set(words_drawn)
-    assert ("time [steps]" in words_drawn) == (states == 1)
-    assert words_drawn.count("x2") == 2 * (states == 2)  # a bar and an axis
-
-
-@pytest.mark.parametrize(
-    ("value", "half", "text"),
-    [
-        *((-1.1547, 0.95, "-1.155"), (-0.0587, 0.9, "-0.059"), (12.5, 12.5, "12.5"), (350, 350, "350")),
-        *((1e6, 1e6, "1e+06"), (5e-6, 5e-6, "5e-06"), (-1e-5, 0.3, "0"), (-20, 40, "-20"), (1e-17, 2, "0")),
-    ],
-)
-def test_numbers_of_an_axis_have_the_digits_of_its_longest_one(value, half, text):
-    assert theme.tick_label(value, half) == text.replace("-", "\N{MINUS SIGN}")
-
-
-def test_long_names_keep_the_ends_that_tell_them_apart():
-    common = {"A": 0.5 * np.eye(8), "B": np.eye(8)[:, :5], "dt": 1.0, "box": np.ones(8), "u_max": 1.0, "gamma": 1e-4}
-    names = [f"temperature of the room with the number {zone}" for zone in range(8)]
-    env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(**common, state_names=names))
-    env.reset(seed=0)
-    pixels = env.render()
-    places = itertools.product((theme.PACKET_LINE + 33, theme.PACKET_LINE + 75), (16, 330))
-    rows = [part_of(pixels, theme.Rect(x, y, 235, 14)) for y, x in places]
-    assert all((one != other).any() for one, other in itertools.combinations(rows, 2))
-
-
-def test_truck_stretches_its_coupling_which_turns_red_near_its_limit_and_its_estimate_is_outlined():
-    def front(stretch):
-        row = picture((stretch, 0.0))[150].astype(int)
-        return np.flatnonzero(np.abs(row - np.array(theme.BODYWORK)).max(axis=-1) < 24).max()
-
-    assert [front(1.0) - front(0.0), front(0.0) - front(-1.0)] == pytest.approx([31, 31], abs=1)
-    band, mark = theme.Rect(195, 150, 60, 35), 20  # pixels of the limit's dashed mark at most
-    red = [count(picture((stretch, 0.0)), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
-    assert max(red[:2]) < mark
-    assert min(red[2:]) > mark + 100
-    beyond = theme.Rect(485, 100, 60, 85)
-    assert count(picture(), theme.ESTIMATE, beyond) == 0
-    assert count(picture(estimate=np.array([1.0, 0.0])), theme.ESTIMATE, beyond) > 50
-
-
-def test_numbers_above_bars_are_red_only_beyond_their_limit():
-    limit, number = resting(REACTOR).plant.half_widths[0], theme.Rect(250, theme.PACKET_LINE + 33, 60, 14)
-
-    def red_of(fraction):
-        return count(picture((fraction * limit, 0.0, 0.0, 0.0), REACTOR, violated=False), theme.DANGER, number)
-
-    near, beyond, far = map(red_of, (0.97, 1.02, 3.0))
-    assert near == 0
-    assert min(beyond, far) > 20
-
-
-@pytest.mark.parametrize("far", [5.0, 1e6])
-def test_path_outside_the_axes_is_not_drawn_along_their_border(far):
-    plane = theme.PLANE
-    top = theme.Rect(plane.x + 2, plane.y + 1, plane.w - 4, 20)
-    there = np.array([(-1.5, 0.0), (-1.0, far), (1.0, far), (1.5, 0.0)])
-    empty, gone = picture((1.5, 0.0)), picture((1.5, 0.0), path=there, interventions=np.zeros(4, np.bool_))
-    columns = np.flatnonzero((empty != gone).any(axis=2)[round(top.y) : round(top.y + top.h)].any(axis=0))
-    between = plane.x + plane.w * np.array([0.45, 0.55])
-    assert columns.size  # the ways out and back
-    assert not ((between[0] < columns) & (columns < between[1])).any()
-
-
-def test_packets_are_on_time_late_or_lost_and_travel():
-    line = theme.Rect(250, theme.PACKET_LINE - 26, 280, 50)
-    at, seen = {"step": 4}, {}
-    empty = picture(**at)
-    for name, packet in (("new", PacketRecord(4, 4)), ("late", PacketRecord(3, 5)), ("lost", PacketRecord(4, None))):
-        frame = picture(**at, packets=(packet,))
-        seen[name] = [count(frame, color, line) > 80 for color in (theme.ESTIMATE, theme.LATE, theme.DANGER)]
-        assert changed(empty, frame, line) > 100
-    assert seen["new"] == [True, False, False]
-    assert seen["late"][1:] == [True, False]
-    assert seen["lost"][1:] == [False, True]
-    line, places = theme.Rect(0, theme.PACKET_LINE - 3, theme.WIDTH, 6), []
-    for step in (10, 11, 12):
-        part = part_of(picture(step=step, packets=(PacketRecord(9, 13),)), line)
-        places.append(np.nonzero(np.abs(part - np.array(theme.LATE)).max(axis=-1) < 24)[1].mean())
-    assert places[0] + 20 < places[1] < places[2] - 20
-
-
 def test_plane_shows_safe_set_error_plan_path_and_interventions_in_their_sizes_and_places(loaded):
     pixels_per_unit = theme.PLANE.w * theme.PLANE.h / 6.0**2
     for size in (0.5, 1.0):
@@ -328,53 +187,6 @@ def test_header_and_panel_show_interventions_and_violations():
     assert count(over, theme.DANGER_FILL, theme.PLANT_VIEW, off=4) > 10_000
 
 
-def test_picture_says_that_the_downlink_broke_and_which_input_was_decided(written):
-    env = make("ncs_gym/TruckTrailerCruiseTwoWay-v0", downlink=Channel(loss=0.5), downlink_contract=ChannelContract(1))
-    env.reset(seed=0)
-    seen = set()
-    for _ in range(30):
-        (info,) = steps_of(env, 1, 0.5)
-        frame = env.unwrapped.renderer.episode
-        np.testing.assert_array_equal(frame.info["input_committed"], info["input_committed"])
-        np.testing.assert_array_equal(frame.info["input"], info["input"])
-        written.clear()
-        env.render()
-        seen.add((info["downlink_broken"], "downlink broken: zero input" in {text for text, *_ in written}))
-    assert seen == {(True, True), (False, False)}
-
-
-@pytest.fixture
-def written(monkeypatch):
-    """The texts that pictures get from now on, each with its place."""
-    texts, write = [], Canvas.text
-
-    def noted(canvas, text, place, *arguments, **options):
-        texts.append((text, *place))
-        return write(canvas, text, place, *arguments, **options)
-
-    monkeypatch.setattr(Canvas, "text", noted)
-    return texts
-
-
-def test_age_of_the_sample_in_use_stands_at_the_controller(written):
-    env = make(channel=Channel(delay=2, loss=0.5)).unwrapped
-    env.reset(seed=0)
-    for _ in range(10):
-        written.clear()
-        *_, info = env.step(np.zeros(1, np.float32))
-        env.render()
-        assert [text for text, *_ in written if text.startswith("age")] == [f"age {info['measurement_age']}"]
-    assert info["measurement_age"] > 1
-
-
-def test_plant_whose_limits_are_on_sums_alone_is_drawn_without_bars():
-    common = {"A": 0.5 * np.eye(2), "B": np.ones((2, 1)), "u_max": 1.0, "dt": 0.1, "gamma": 1e-4}
-    env = make("ncs_gym/LinearNCS-v0", plant=linear_plant(box=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)).unwrapped
-    env.reset(seed=0)
-    assert count(env.render(), theme.PAPER, theme.PLANT_VIEW, off=0) < 1000
-    assert count(env.render(), theme.PAPER, theme.PLANE, off=0) > 30_000
-
-
 def test_packets_are_lost_and_late_as_the_channel_says():
     def packets(channel, steps=12):
         env = make(channel=channel).unwrapped
@@ -391,31 +203,6 @@ def test_packets_are_lost_and_late_as_the_channel_says():
     assert len({each.arrival - each.stamp for each in mixed if each.arrival is not None}) > 1
 
 
-def test_arrivals_are_those_of_the_infos():
-    env = make(channel=Channel(loss=0.4, delay=1, jitter=2))
-    env.reset(seed=3)
-    arrived = [k for k in range(1, 31) if env.step(np.zeros(1, np.float32))[4]["packet_arrived"]]
-    packets = env.unwrapped.renderer.episode.packets
-    assert sorted({each.arrival for each in packets if each.arrival is not None and each.arrival <= 30}) == arrived
-
-
-def test_shield_tells_the_picture_what_it_has_in_store(loaded):
-    certificate = certificate_of(loaded)  # in a polytope hardly a plan is needed
-    env = safety_shield(make(), certificate, mode="lookahead", horizon=3)
-    env.reset(seed=0)
-    assert env.unwrapped.renderer.episode.annotation.plan.shape[0] == 0
-    lengths = set()
-    for _ in range(30):
-        *_, info = env.step(np.ones(1, np.float32))
-        record = env.unwrapped.renderer.episode
-        assert len(record.annotation.plan) == info["shield_plan_length"]
-        lengths.add(info["shield_plan_length"])
-    assert max(lengths) > 0
-    other = safety_shield(make())
-    other.reset(seed=0)
-    assert other.unwrapped.renderer.episode.annotation.plan is None
-
-
 def test_annotation_lasts_one_step():
     env = make().unwrapped
     env.annotate(QUIET)
@@ -428,16 +215,6 @@ def test_annotation_lasts_one_step():
     for expected in (QUIET, None):
         env.step(np.zeros(1, np.float32))
         assert env.renderer.episode.annotation is expected
-
-
-def test_frame_shows_the_recent_steps_of_this_episode_only():
-    env = make()
-    env.reset(seed=0)
-    steps_of(env, 2 * RECENT_STEPS)
-    assert len(env.unwrapped.renderer.episode.path) == RECENT_STEPS
-    env.reset()
-    assert len(env.unwrapped.renderer.episode.path) == 1
-    assert not env.unwrapped.renderer.episode.packets
 
 
 def test_drawing_does_not_change_the_episode_nor_writing_into_an_info_the_picture():
@@ -534,11 +311,6 @@ def test_missing_pygame_is_one_sentence_and_only_for_who_draws(monkeypatch):
     env.step(np.zeros(1, np.float32))
     with pytest.raises(gym.error.DependencyNotInstalled, match=r"needs pygame-ce: in .* -e '\.\[render\]'$"):
         env.render()
-
-
-def test_rendering_without_a_mode_warns():
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert make(render_mode=None).unwrapped.render() is None
 
 
 def test_drawn_environments_can_be_copied_and_pickled():

@@ -7,17 +7,12 @@ import pytest
 
 from ncs_gym import Channel, Disturbance, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
 from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
-from tests.product import gym_vector_env, linear_plant
+from tests.product import linear_plant
 
 
 def test_regulation_costs_about_one_at_the_edge_of_the_box(plant):
     assert Regulation().reward(plant, None, np.array([2.0, 0.0]), np.zeros(1)) == pytest.approx(-1.0)
     assert Regulation().reward(plant, None, np.zeros(2), np.array([4.0])) == pytest.approx(-0.01)
-
-
-def test_regulation_takes_the_users_costs(plant):
-    task = Regulation(state_cost=np.diag([1.0, 2.0]), input_cost=np.array([[0.5]]))
-    assert task.reward(plant, None, np.array([1.0, 3.0]), np.array([2.0])) == pytest.approx(-(1 + 18 + 2))
 
 
 def test_speed_integrates_the_acceleration(plant):
@@ -163,16 +158,6 @@ def test_reward_is_a_number_and_moves_nothing(kind, pays, words):
         many.step(np.ones((3, 1), np.float32))
 
 
-def test_whole_numbers_are_rewards_and_the_array_stays_the_tasks_own():
-    paid = np.ones(3, np.int64)
-    task = PayingMany(lambda state, u: paid)
-    envs = gym_vector_env(3, plant=truck_trailer(mass=4000.0), task=task)
-    envs.reset(seed=0)
-    rewards = envs.step(np.ones((3, 1), np.float32))[1]
-    assert (rewards.dtype, rewards.tolist()) == (np.float64, [1.0, 1.0, 1.0])
-    assert rewards is not paid
-
-
 class Counting(Task):
     """Counts steps in a list or an array, and what `predict` writes there."""
 
@@ -210,42 +195,6 @@ def test_what_is_predicted_does_not_move_the_state_of_a_task():
         assert [float(np.squeeze(step[0][..., -1])) for step in steps] == [3.0, 4.0, 5.0]
         with pytest.raises(ValueError, match="read-only"):
             make("ncs_gym/LinearNCS-v0", task=Counting(np.zeros(1)), **settings).reset(seed=0)
-
-
-class Table(PayingMany):
-    """Takes the states of episodes out of a table, or draws them, and keeps whole numbers of them."""
-
-    vectorized = True
-    table = np.array([[-0.5, 0.0, 0.5, 1.0]])
-
-    def begin(self, rng, plant, size=None):
-        return rng.uniform(0.2, 0.8, (1, size or 1)) if self.pays is None else self.table[:, : size or 1]
-
-    def advance(self, rng, plant, task_state, u):
-        return np.round(task_state).astype(int) if self.pays is None else task_state
-
-    def reward(self, plant, task_state, state, u):
-        return 0.0 * state[0]
-
-    def observe(self, task_state):
-        return task_state
-
-    def observation_bound(self, plant, horizon):
-        return np.array([1.0])
-
-
-@pytest.mark.parametrize("pays", [None, "table"])
-def test_what_a_task_begins_with_stays_its_own_and_as_it_was_drawn(pays):
-    envs = gym_vector_env(4, plant=truck_trailer(mass=4000.0), task=Table(pays))
-    envs.reset(seed=0)
-    envs.step(np.zeros((4, 1), np.float32))
-    seen = envs.reset(options={"reset_mask": np.array([False, False, True, True])})[0][:, -1]
-    np.testing.assert_array_equal(Table.table, [[-0.5, 0.0, 0.5, 1.0]])
-    if pays is None:
-        assert set(seen[:2]) <= {0.0, 1.0}
-        assert ((seen[2:] >= 0.2) & (seen[2:] <= 0.8)).all()
-    else:
-        np.testing.assert_array_equal(seen, [-0.5, 0.0, -0.5, 0.0])
 
 
 class Smooth(Paying):
@@ -287,23 +236,11 @@ def count(task, u):
     task.count += 1
 
 
-def replace_last(task, u):
-    task.last = u.copy()
-
-
 def write_last(task, u):
     task.last[:] = u[:1]
 
 
-def add(task, u):
-    task.seen.append(u)
-
-
-def name_anew(task, u):
-    task.previous = u
-
-
-REMEMBERED = {count: "count", replace_last: "last", write_last: "last", add: "seen", name_anew: "previous"}
+REMEMBERED = {count: "count", write_last: "last"}
 
 
 @pytest.mark.parametrize("how", REMEMBERED)
@@ -322,13 +259,6 @@ def test_what_a_task_stores_in_itself_is_refused_where_environments_share_it(kin
         env = gym.make("ncs_gym/LinearNCS-v0", **settings)
         env.reset(seed=0)
         env.step(np.ones(1, np.float32))
-
-
-@pytest.mark.parametrize("kind", [Smooth, SmoothMany])
-def test_what_a_task_computes_once_is_not_refused(kind):
-    envs = gym_vector_env(3, plant=truck_trailer(mass=4000.0), task=kind(count, "never"))
-    envs.reset(seed=0)
-    envs.step(np.ones((3, 1), np.float32))
 
 
 class Drifting(Disturbance):

@@ -131,6 +131,7 @@ def test_an_input_that_passes_todays_test_starts_no_search_and_clears_the_store(
     assert len(decision.plan) == 0
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_certified_means_the_next_stored_input_and_without_any_the_gain(name):
     shield, rng = shield_of(name), np.random.default_rng(2)
@@ -239,6 +240,7 @@ def test_what_is_no_plan_counts_as_none_stored():
         assert decision.reason == "fallback"
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_decisions_one_by_one_equal_those_of_a_batch(name):
     shield, rng, count = shield_of(name), np.random.default_rng(5), 60
@@ -253,6 +255,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
     assert {"planned", "stored"} <= set(many.reason)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, monkeypatch):
     shield, rng = shield_of(name), np.random.default_rng(7)
@@ -272,6 +275,7 @@ def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, m
     assert decided > 0.6 * len(kept) > 0
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_loop_in_one_product_is_the_loop_step_by_step(name):
     shield, rng = shield_of(name), np.random.default_rng(8)
@@ -355,7 +359,7 @@ def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monke
     assert sum(one.reason == "planned" for one in working) > sum(one.reason == "planned" for one in failing)
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning")
 @pytest.mark.parametrize("how", FAILURES)
 def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):

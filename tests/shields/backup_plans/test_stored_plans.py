@@ -207,9 +207,3 @@ def test_what_is_no_plan_counts_as_none_of_many_loops_too(wrong):
     assert [*decided.reason] == [each.reason for each in alone] == ["invalid", "fallback"]
     np.testing.assert_array_equal(decided.input, [each.input for each in alone])
     assert np.isnan(decided.plan).all()
-
-
-def test_horizon_of_numpy_is_that_of_a_spec():
-    env = safety_shield(gym.make("ncs_gym/TruckTrailerCruise-v0"), mode="lookahead", horizon=np.int64(6))
-    made = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert made.get_wrapper_attr("horizon") == 6

@@ -3,15 +3,12 @@
 import warnings
 from dataclasses import replace
 
-import gymnasium as gym
-import numpy as np
 import pytest
 
 from ncs_gym import BrokenContractWarning, Channel, ChannelContract, RandomChannel, VectorRandomChannel, cart_pole
 from shields import GuaranteeLostWarning
 from tests import product
 from tests.certificates import certificate_of
-from tests.plants import small
 from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT, CONTRACT = cart_pole(), ChannelContract(4)
@@ -84,11 +81,6 @@ def test_channel_that_may_keep_the_contract_is_taken_without_a_warning(make, cha
         make(channel, downlink)
 
 
-def test_channel_that_no_contract_covers_is_pointed_out_too():
-    with pytest.warns(BrokenContractWarning, match="become 998 steps old"):
-        shield(Channel(delay=998), Channel(delay=4))
-
-
 def test_real_loop_behind_a_downlink_counts_what_its_uplink_promises():
     uplink = Channel(loss=0.5, delay=1, max_consecutive_losses=2)  # samples up to 3 steps old, which c is added to
     with pytest.warns(BrokenContractWarning, match="become 3 steps old"):
@@ -109,12 +101,6 @@ def test_real_loop_points_out_losses_that_break_the_contract(channel, words):
     with pytest.warns(BrokenContractWarning, match=words) as caught:
         loop(channel, None)
     assert [each.filename for each in caught] == [product.__file__]
-
-
-def test_certificate_of_the_registered_contract_is_compared_with_the_channel_asked_for():
-    env = gym.make("ncs_gym/CartPole-v0", channel=Channel(delay=9))
-    with pytest.warns(BrokenContractWarning, match="become 9 steps old"):
-        safety_shield(env, certificate_of(env.unwrapped.plant, env.unwrapped.contract))
 
 
 @pytest.mark.parametrize("make", [shield, many_shields])
@@ -152,18 +138,3 @@ def test_shield_keeps_its_guarantee_over_drawn_channels_and_says_where_it_is_los
     one.reset(seed=0, options={"channel": Channel(loss=1.0)})
     with pytest.warns(GuaranteeLostWarning, match="older than the contract"):
         [one.step(one.action_space.sample()) for _ in range(10)]
-
-
-def test_environment_of_a_stable_plant_without_the_contract_of_the_certificate_is_named():
-    plant, channel = small(0.5 * np.eye(2)), Channel(delay=1)
-    certificate = certificate_of(plant, ChannelContract(max_age=1), "polytope")
-    for make in (gym.make, gym.make_vec):
-        shield = safety_shield if make is gym.make else vector_shield
-        env = make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel)
-        with pytest.warns(BrokenContractWarning, match=r"made without one.*contract=ChannelContract\(max_age=1"):
-            shield(env, certificate)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", BrokenContractWarning)
-            shield(
-                make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, contract=certificate.contract), certificate
-            )

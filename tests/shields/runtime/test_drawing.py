@@ -2,9 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-import pygame
-import pytest
-from gymnasium.wrappers import RecordVideo
 
 from ncs_gym.rendering import theme
 from tests.product import safety_shield
@@ -47,57 +44,11 @@ def test_an_intervention_shows_in_its_frame_and_in_no_other(certificate):
     assert seen == {True, False}
 
 
-def test_a_shield_that_watches_does_not_look_as_if_it_acted(certificate):
-    env = shielded(certificate, mode="monitor")
-    for _ in range(6):
-        info = env.step(FULL_THROTTLE)[4]
-        assert count(env.render(), theme.SHIELD_FILL, theme.PLANT_VIEW) == 0
-    assert info["episode_interventions"] > 0
-
-
-def test_the_picture_shows_the_inputs_and_the_count_of_the_info(certificate):
-    env = shielded(certificate)
-    for _ in range(5):
-        info = env.step(FULL_THROTTLE)[4]
-        frame = env.unwrapped.renderer.episode
-        note = frame.annotation
-        np.testing.assert_array_equal(note.proposed, info["input_proposed"])
-        np.testing.assert_array_equal(frame.info["input"], info["input"])
-        assert note.intervened == info["shield_intervened"]
-        assert note.interventions == info["episode_interventions"]
-
-
 def test_stepping_the_environment_below_the_shield_draws_no_shield(certificate):
     env = shielded(certificate)
     env.step(FULL_THROTTLE)
     env.unwrapped.step(FULL_THROTTLE)
     assert count(env.render(), theme.SAFE_FILL, theme.PLANE) == 0
-
-
-def test_human_mode_shows_the_shield_in_the_very_step(certificate, monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = shielded(certificate, render_mode="human")
-    for _ in range(4):
-        info = env.step(FULL_THROTTLE)[4]
-    assert info["shield_intervened"]
-    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-    assert count(shown, theme.SHIELD_FILL, theme.PLANT_VIEW) > 10_000
-    env.close()
-
-
-@pytest.mark.parametrize("outside", [True, False])
-def test_record_video_works_on_either_side_of_the_shield(certificate, tmp_path, outside):
-    folder = str(tmp_path / "videos")
-    env = gym.make(CRUISE, render_mode="rgb_array")
-    if outside:
-        env = RecordVideo(safety_shield(env, certificate), folder, video_length=4)
-    else:
-        env = safety_shield(RecordVideo(env, folder, video_length=4), certificate)
-    env.reset(seed=0)
-    for _ in range(5):
-        env.step(FULL_THROTTLE)
-    env.close()
-    assert [file.stat().st_size > 1000 for file in (tmp_path / "videos").glob("*.mp4")] == [True]
 
 
 def test_a_shield_that_is_not_drawn_tells_nothing(certificate, monkeypatch):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
-from agents import LoopConfig, ShieldSettings
 from ncs_gym import Channel, truck_trailer
 from shields import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
@@ -143,12 +142,3 @@ def test_loop_takes_nothing_back_when_a_lost_guarantee_is_raised(kind):
         assert real.estimate @ real.estimate > 0.0  # it has followed what was applied
         real.decide(np.zeros(PLANT.m))
         real.step(np.zeros(PLANT.m))
-
-
-def test_loop_of_an_agent_hands_the_choice_to_its_shield():
-    settings = ShieldSettings(certificate_of(PLANT), on_unproved="raise")
-    config = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=settings)
-    with pytest.raises(GuaranteeLostError):
-        config.single().reset(options={"state": OUTSIDE})
-    with pytest.raises(GuaranteeLostError):
-        config.vector(2).reset(options={"state": OUTSIDE})

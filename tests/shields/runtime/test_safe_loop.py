@@ -1,7 +1,6 @@
 """The loop without Gymnasium: the same decisions and proofs as the wrapper's."""
 
 import re
-import sys
 from contextlib import nullcontext
 
 import numpy as np
@@ -16,12 +15,10 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
-from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from tests.certificates import certificate_of
 from tests.product import safe_loop
-from tests.shields.attacks.cases import TRUCKS
 
 # Plant, contract, channel.
 LOOPS = {
@@ -121,17 +118,6 @@ def test_what_the_caller_keeps_is_its_own():
     assert loop.guaranteed
 
 
-def test_measurement_of_one_output_may_be_a_number():
-    plant = TRUCKS["4000 kg, position only"]
-    loops = [safe_loop(certificate_of(plant), plant, Channel()) for _ in range(2)]
-    for loop, measurement in zip(loops, (0.03, [0.03]), strict=True):
-        loop.start([0.0, 0.0])
-        loop.step(0.0)
-        loop.receive([Packet(1, measurement)])
-    np.testing.assert_array_equal(loops[0].estimate, loops[1].estimate)
-    assert loops[0].measurement_age == 0
-
-
 @pytest.mark.parametrize("value", [0.25, np.nan])
 @pytest.mark.parametrize("order", [(0, 1), (1, 0), (0, None, 1)])
 def test_another_value_of_a_sample_ends_the_guarantee_whatever_comes_first(order, value):
@@ -210,23 +196,6 @@ def test_start_is_in_the_safe_set_only_if_estimate_or_set_say_so():
     assert loop.reason == NOT_KNOWN_INSIDE
 
 
-@pytest.mark.parametrize("name", ["truck", pytest.param("cart-pole", marks=pytest.mark.slow)])
-def test_memory_does_not_grow(name):
-    # What is kept of arrival histories depends only on which were met: the same steps once more meet no new one.
-    plant, _, channel = LOOPS[name]
-    loop, before = loop_of(name), 0
-    for _ in range(2):
-        before = sys.getallocatedblocks()
-        rng = np.random.default_rng(0)
-        state, x = ChannelState(channel, rng), np.zeros(plant.n)
-        loop.start(x)
-        for step in range(1, 1_501):
-            x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
-            loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
-        assert loop.guaranteed
-    assert sys.getallocatedblocks() - before < 100
-
-
 @pytest.mark.parametrize(("delay", "late"), [(0, 20), (1, 0)])
 def test_sample_that_is_sent_after_a_decision_and_received_at_the_next_step_is_one_step_late(delay, late):
     loop = started(channel=Channel(delay=delay))
@@ -266,28 +235,3 @@ def test_printed_loop_says_whether_the_state_is_proved_to_be_safe_and_why_not():
     text = text_of(loop)
     assert text["step"] == "2 of episode 0, the newest sample is 1 step old"
     assert text["guaranteed"] == f"no: {OTHER_INPUT}" == f"no: {loop.reason}"
-
-
-def test_printed_loop_names_horizon_and_downlink():
-    plant, _, channel = LOOPS["truck"]
-    loop = safe_loop(certificate_of(plant), plant, channel, "lookahead", 1)
-    loop.start(np.zeros(2))
-    assert text_of(loop)["mode"] == "lookahead, horizon 1 step"
-    assert text_of(loop)["contract"] == "none: any packets may be lost or late"
-    assert text_of(loop)["guaranteed"].startswith("yes: the state stays in the box, if everything")
-    certificate = certificate_of(cart_pole(), ChannelContract(4))
-    loop = safe_loop(certificate, cart_pole(), Channel(), downlink=Channel(delay=2))
-    assert text_of(loop)["downlink"] == "inputs take effect 2 steps after the decision"
-    assert "never older than 2 steps (4 less the downlink's 2)" in text_of(loop)["contract"]
-
-
-@pytest.mark.parametrize("downlink", [None, Channel(delay=2)])
-def test_printed_loop_says_that_the_contract_is_broken_now(downlink):
-    plant, allowed = cart_pole(), 4 if downlink is None else 2
-    loop = safe_loop(certificate_of(plant, ChannelContract(4)), plant, Channel(), downlink=downlink)
-    loop.start(np.zeros(4))
-    for age in range(1, 7):
-        loop.decide(0.0)
-        loop.receive()
-        old = f"{age} of episode 0, the newest sample is {age} step{'' if age == 1 else 's'} old"
-        assert text_of(loop)["step"] == old + (", older than the contract allows" if age > allowed else "")

@@ -4,11 +4,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
-from tests.product import altered, linear_plant, safety_filter
+from tests.product import altered, safety_filter
 from tests.shields.attacks.cases import RANDOM
 from tests.shields.edges import edge_of
 from tests.shields.runtime.batches import decided_alike
@@ -143,23 +142,6 @@ def test_huge_estimates_never_give_a_nan_input(size, plant):
         decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(plant.n), np.zeros(plant.m))
         assert np.isfinite(decision.input).all()
         assert not decision.proved
-
-
-def test_decide_takes_numbers_where_there_is_one_state_or_one_input():
-    plant = linear_plant(A=[[0.9]], B=[[0.5]], dt=0.1, box=[1.0], u_max=1.0, disturbance_bound=0.05, initial_bound=0.1)
-    shield = safety_filter(certificate_of(plant), plant)
-    for u in (0.3, 1.0):
-        one = shield.decide(0.2, 1e-4 * np.eye(1), u)
-        assert one.input == shield.decide(np.array([0.2]), 1e-4 * np.eye(1), np.array([u])).input
-        assert one.reason != "invalid"
-    for estimate in (0.2, np.array([0.2])):
-        for bad in (None, np.zeros(2)):
-            decision = shield.decide(estimate, 1e-4 * np.eye(1), bad)
-            assert decision.fallback
-            assert np.isclose(decision.input, shield.certificate.K @ [0.2])
-        assert shield.decide(estimate, 1e-4 * np.eye(1), np.nan).fallback
-    for bad in (np.zeros(2), np.zeros((1, 2))):
-        assert not shield.decide(bad, 1e-4 * np.eye(1), 1.0).input.any()
 
 
 class Contrary:
@@ -361,20 +343,6 @@ def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mo
     assert same.sum() > 50
 
 
-def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
-    plant = TWO_STATES
-    shield, Sigma = safety_filter(certificate_of(plant), plant), certificate_of(plant).Sigma
-    monkeypatch.setattr("shields.runtime.safety_filter.MOST_REMEMBERED", 5)
-    first = shield.errors_of(0.05 * Sigma)
-    for size in np.linspace(0.1, 1.0, 4):
-        errors = shield.errors_of(size * Sigma)
-        assert shield.errors_of((size * Sigma).copy()) is errors
-        np.testing.assert_allclose(errors.half_widths, np.sqrt(size * np.diag(Sigma)))
-    assert shield.errors_of(0.05 * Sigma) is first
-    shield.errors_of(2.0 * Sigma)  # one too many
-    assert shield.errors_of(0.05 * Sigma) is not first
-
-
 def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
     shield, sizes = safety_filter(certificate, loaded), np.array([0.1, 0.5, 0.3])
     known, shapes = NumberedErrors(shield), sizes[:, None, None] * certificate.Sigma
@@ -387,16 +355,3 @@ def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
             np.testing.assert_array_equal(
                 known.many(table, numbers).radius, shield.errors_of_many(growing[::-1]).radius
             )
-
-
-def test_mask_of_proposals_is_what_is_not_intervened():
-    plant = truck_trailer(mass=4000.0)
-    certificate = certificate_of(plant)
-    shield, switched = safety_filter(certificate, plant), safety_filter(certificate, plant, mode="switch")
-    x_hat, shape, candidates = np.array([1.6, 0.5]), 1e-4 * np.eye(2), np.linspace(-4.0, 4.0, 9)[:, None]
-    decided = shield.decide_many(np.tile(x_hat, (9, 1)), shape, candidates)
-    mask = ~decided.intervened
-    np.testing.assert_array_equal(mask, (decided.input == candidates).all(axis=1))
-    assert mask.tolist() == [switched.decide(x_hat, shape, each).reason == "safe" for each in candidates]
-    assert 0 < mask.sum() < 9
-    assert decided.proved.all()  # which is about the inputs to apply

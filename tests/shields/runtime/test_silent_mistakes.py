@@ -1,22 +1,16 @@
 """Mistakes that used to pass in silence: each is refused with a sentence, or heard."""
 
 import copy
-import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers.vector import DictInfoToList
-from stable_baselines3 import PPO
-from stable_baselines3.common.monitor import Monitor
 
-from agents import SafetyCallback, SB3VecEnv
-from agents.loop import CostPenalty
+from agents import SB3VecEnv
 from ncs_gym import (
-    Actuator,
     Channel,
-    Command,
     Packet,
     RequestActions,
     UnusedPacketsWarning,
@@ -106,16 +100,6 @@ def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certifi
     assert outside.reset()[1][1]["shield_guaranteed"]
 
 
-def test_infos_without_cost_are_named():
-    env = gym.make_vec("CartPole-v1", num_envs=2)
-    penalized = CostPenalty(env, 1.0)
-    penalized.reset(seed=0)
-    with pytest.raises(ValueError, match='needs environments with "cost" in their infos'):
-        penalized.step(env.action_space.sample())
-    with pytest.raises(ValueError, match='SafetyCallback counts "cost"'):
-        PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=8, batch_size=8).learn(8, callback=SafetyCallback())
-
-
 @pytest.mark.parametrize("step", [0.2, 0.5, 9.0])
 def test_rounding_too_coarse_for_any_update_is_named_once(step):
     with pytest.warns(
@@ -134,42 +118,11 @@ def test_channels_whose_packets_are_used_are_not_named():
         loop_env(cart_pole(full_state=False), Channel(loss=0.2, max_consecutive_losses=2))
 
 
-def test_packets_without_the_number_of_a_later_episode_are_named_once(certificate):
-    loop = safe_loop(certificate, PLANT, Channel(delay=1))
-    for _ in range(2):
-        loop.start([0.0, 0.0])
-        loop.step(0.0)
-        loop.step(0.0, [Packet(1, np.zeros(2))])  # in the second episode this could be a straggler of the first
-    with pytest.warns(UnusedPacketsWarning, match="its episode is not that of the loop, 1"):
-        loop.step(0.0, [Packet(2, np.zeros(2))])
-    loop.step(0.0, [Packet(3, np.zeros(2))])
-    assert loop.discarded.other_episode == 3
-
-
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_bounds_of_zero_are_certified_without_a_word():
     none = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
     plant = linear_plant(A=[[1.0, 0.1], [-0.3, 0.85]], B=[[0.0], [0.1]], box=[1.0, 2.0], u_max=5.0, dt=0.1, **none)
     assert synthesize(plant).provenance["share_of_box"] > 0.7
-
-
-class Alarming(gym.Wrapper):
-    """Raises the alarm of the environment after some steps."""
-
-    def step(self, action):
-        result = self.env.step(action)
-        if self.unwrapped.steps == 7:
-            self.unwrapped.estimator.alarm = True
-        return result
-
-
-def test_monitor_has_the_share_of_guaranteed_states(certificate):
-    env = Alarming(gym.make("ncs_gym/TruckTrailerCruise-v0", max_episode_steps=19))
-    shield = Monitor(safety_shield(env, certificate, on_unproved="ignore"), info_keywords=("episode_guaranteed",))
-    shield.reset(seed=0)
-    while not (result := shield.step([0.1]))[3]:
-        pass
-    assert result[4]["episode"]["episode_guaranteed"] == 8 / 20
 
 
 def test_copy_of_a_loop_shares_nothing_with_it(certificate):
@@ -188,20 +141,3 @@ def test_copy_of_a_loop_shares_nothing_with_it(certificate):
         own.receive()
         np.testing.assert_array_equal(loop.decide([4.0]).input, own.decide([4.0]).input)
         assert loop.guaranteed == own.guaranteed
-
-
-def test_commands_of_an_episode_that_an_actuator_has_not_begun_are_named_once():
-    actuator = Actuator(1, 1)
-    actuator.receive([Command(0, [[0.0], [1.0]])])
-    actuator.apply(0)
-    with pytest.warns(UserWarning, match=r"episode 2 was refused in episode 0.*start\(2\) begins it"):
-        actuator.receive([Command(0, [[0.0], [1.0]], episode=2)])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        actuator.receive([Command(1, [[0.0], [1.0]], episode=2)])
-    assert actuator.refused == 2
-    actuator.start(2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        actuator.receive([Command(5, [[0.0], [1.0]], episode=0)])  # late ones of an earlier episode are usual
-    assert actuator.refused == 0

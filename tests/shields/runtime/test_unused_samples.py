@@ -7,10 +7,10 @@ import warnings
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, Packet, UnusedPacketsWarning, truck_trailer
+from ncs_gym import Actuator, Channel, Packet, truck_trailer
 from ncs_gym.processes.plant_step import PlantSimulation
 from shields import GuaranteeLostWarning
-from shields.runtime.guarantee import ALARM, NOT_FINITE, UNKNOWN_START
+from shields.runtime.guarantee import NOT_FINITE, UNKNOWN_START
 from tests.certificates import certificate_of
 from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
@@ -21,37 +21,6 @@ def started(**settings):
     loop = safe_loop(certificate_of(PLANT), PLANT, **{"channel": Channel(delay=1)} | settings)
     loop.start(np.zeros(2))
     return loop
-
-
-@pytest.mark.parametrize("ahead", [1, 7])
-@pytest.mark.parametrize("call", ["step", "receive"])
-def test_samples_ahead_of_the_loop_are_named_once_to_who_hands_them_over(ahead, call):
-    loop = started()
-    loop.step(0.0)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        for step in range(1, 300):
-            packets = [Packet(step + ahead, np.zeros(2), loop.episode)]
-            if call == "step":
-                loop.step(0.0, packets)
-            else:
-                loop.receive(packets)
-                loop.decide(0.0)
-    assert loop.discarded == (0, 299, 0)
-    (warning,) = caught
-    assert warning.category is UnusedPacketsWarning
-    assert "its stamp is ahead of the loop, which is at step 1" in str(warning.message)
-    assert warning.filename == __file__
-
-
-def test_samples_of_a_clock_that_agrees_are_not_named():
-    loop = started()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        loop.step(0.0)
-        for step in range(1, 20):
-            loop.step(0.0, [Packet(step, np.zeros(2)), Packet(step, np.zeros(2)), Packet(step - 1, np.zeros(2))])
-    assert loop.discarded == (0, 0, 0)
 
 
 def test_every_reason_is_counted_and_named_once_and_apart():
@@ -88,22 +57,6 @@ def test_echoes_for_a_loop_that_compares_none_are_refused():
         loop.receive(echoes=[actuator.echo])
     loop.receive(echoes=[])
     assert loop.guaranteed
-
-
-def test_one_sensor_of_two_without_a_reading_is_named_as_that():
-    loop = started()
-    loop.step(0.0)
-    with pytest.warns(GuaranteeLostWarning, match="a sample held NaN or infinity"):
-        loop.step(0.0, [Packet(1, [0.0, np.nan])])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # it was said
-        loop.step(0.0, [Packet(2, [0.0, np.nan])])
-    assert loop.reason == NOT_FINITE
-    loop.start(np.zeros(2))
-    loop.step(0.0)
-    with pytest.warns(GuaranteeLostWarning, match="contradicts the assumed bounds"):
-        loop.step(0.0, [Packet(1, [0.0, 9.0], loop.episode)])
-    assert loop.reason == ALARM
 
 
 def test_sample_without_a_reading_is_named_while_the_state_is_sought_and_the_others_tell_where_it_is():

@@ -84,24 +84,6 @@ def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(lo
     assert told in " ".join(str(certificate).split())
 
 
-def test_time_that_ends_before_anything_is_found_is_named(loaded):
-    with pytest.raises(Infeasible, match="the time_limit of 1e-09 s was over at error set, before a cert") as caught:
-        synthesize(loaded, time_limit=1e-9)
-    assert caught.value.binding == "T"
-
-
-def test_refusal_that_is_known_when_the_time_is_over_is_said(monkeypatch):
-    processor = Processor(0.0)
-    monkeypatch.setattr(search.time, "thread_time", processor)
-
-    def progress(line):
-        processor.now = 10.0 * line.startswith("search for a max_age")
-
-    with pytest.raises(Infeasible, match=r"promise less age.* \(the time_limit of 5 s was over at search") as caught:
-        synthesize(AGED, contract=ChannelContract(400), time_limit=5.0, progress=progress)
-    assert caught.value.binding == "E1"
-
-
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, "long"])
 def test_time_limit_that_is_none_is_refused(loaded, limit):
     with pytest.raises(ValueError, match="time_limit must be"):

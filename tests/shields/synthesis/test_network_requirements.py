@@ -139,6 +139,7 @@ def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
         assert 0.5 < share_of(certificate)[1] <= 1.0
 
 
+@pytest.mark.slow
 def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps():
     plant = plants.servo(1.0, box=None, state_limits=([-0.1, -4.0], [0.3, 4.0]))
     found = requirements(plant, ages=[0, 4])

@@ -44,36 +44,12 @@ def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, sta
     assert isinstance(caught.value, KeyboardInterrupt)
 
 
-def test_synthesis_interrupted_before_it_has_a_set_has_no_certificate(loaded, monkeypatch):
-    solved = "shields.synthesis.invariant_set_program.InvariantSetProgram.solve"
-    monkeypatch.setattr(solved, lambda *arguments: None)
-    with pytest.raises(SynthesisInterrupted, match="had no certificate yet") as caught:
-        synthesize(loaded, progress=interrupting_at("initial design 3"))
-    assert caught.value.certificate is None
-
-
 def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
     finished = "shields.synthesis.ellipsoid_certificates.with_best_gain"
     monkeypatch.setattr(finished, lambda problem, design: replace(design, L=3.0 * design.L))
     with pytest.raises(SynthesisInterrupted, match="had no certificate yet") as caught:
         synthesize(loaded, progress=interrupting_at("alternation 1"))
     assert caught.value.certificate is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "n", "m", "volume"),
-    [
-        (2, 4, 2, 0.922852),
-        *(
-            pytest.param(*row, marks=pytest.mark.slow)
-            for row in [(0, 4, 2, 0.979989), (1, 6, 2, 0.810750), (2, 6, 2, 0.958635)]
-        ),
-    ],
-)
-def test_volumes_of_random_plants_stay_what_they_are(seed, n, m, volume):
-    found = synthesize(random_plant(seed, n, m), safe_set="ellipsoid").provenance["volume_of_box_ellipsoid"]
-    assert found == pytest.approx(volume, abs=1e-3)
 
 
 def test_solution_of_the_program_meets_the_conditions():

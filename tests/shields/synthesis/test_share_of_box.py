@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.report.text_tables import certificate_line
-from ncs_gym import cart_pole, truck_trailer
+from ncs_gym import truck_trailer
 from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
@@ -39,13 +38,6 @@ def test_share_of_a_box_with_more_rows_than_states_agrees_with_counts(n, rows):
     assert share == pytest.approx(counted(C, L, 1.0), abs=5e-3)
 
 
-def test_rows_that_say_nothing_new_change_nothing():
-    plant = truck_trailer()
-    again = altered(plant, box=np.concatenate([plant.box_rows, 0.9 * plant.box_rows]))
-    L = np.diag([3.0, 1.0])
-    assert share_of_box(again, L)["share_of_box"] == pytest.approx(share_of_box(plant, L)["share_of_box"], rel=1e-9)
-
-
 def test_too_many_corners_are_a_reason_not_a_number(certificate):
     plant = random_plant(0, 6, 1)
     box = np.concatenate([np.eye(6), np.full((1, 6), 0.1)])
@@ -67,11 +59,6 @@ def test_parallel_rows_bound_nothing_in_the_other_direction(rows):
     assert verify(certificate, plant).valid
     assert "an unknown share of the safe box (the box is unbounded)" in " ".join(str(certificate).split())
     assert "polytope_share_of_box" not in certificate.provenance
-
-
-def test_unbounded_box_is_the_reason():
-    plant = altered(truck_trailer(), box=np.array([[0.5, 0.0]]))
-    assert share_of_box(plant, np.diag([1.0, 5.0])) == {"share_of_box_unknown": "the box is unbounded"}
 
 
 def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
@@ -114,20 +101,3 @@ def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way
     assert certificate.provenance["share_of_box_at_rest"] == pytest.approx(share, abs=6e-3)
     assert "share_of_box" not in certificate.provenance
     assert "of the safe box of the states, with no input under way" in " ".join(str(certificate).split())
-
-
-def test_plants_without_delay_have_no_input_under_way():
-    assert [plant.past for plant in (truck_trailer(), cart_pole(), random_plant(0, 3, 2))] == [0, 0, 0]
-    assert random_plant(0, 1, 2).past == 0
-
-
-def test_operating_point_shifts_nothing(certificate, loaded):
-    moved = altered(loaded, operating_state=[0.5, 0.1], operating_input=[0.2])
-    assert share_of_box(moved, certificate.L) == share_of_box(loaded, certificate.L)
-
-
-def test_first_line_of_an_experiment_says_both_shares(certificate, loaded):
-    line = certificate_line(certificate, verify(certificate, loaded))
-    share = np.sqrt(np.linalg.det(certificate.L)) * np.pi / 16.0  # the box is 4 by 4
-    assert f"({100 * share:.4g} % of the safe box's volume, 99.97 % of the largest" in line
-    assert line.startswith("certificate: 17 conditions hold")
