@@ -409,6 +409,7 @@ def test_offset_and_a_disturbance_with_two_ends_may_both_be_given():
         assert plant.disturbance.shape_matrix[0, 0] >= (0.5 * (0.1 - low)) ** 2
 
 
+@pytest.mark.slow
 def test_share_of_the_largest_ellipsoid_is_said_of_boxes_with_a_center_alone():
     quiet = {"u_max": 1.0, "dt": 1.0, "disturbance_bound": 0.001, "sensor_bound": 0.002, "initial_bound": 0.005}
     one, two = {"A": [[0.9]], "B": [[0.1]]} | quiet, {"A": np.diag([0.9, 0.8]), "B": 0.2 * np.eye(2)} | quiet
@@ -432,6 +433,7 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
         synthesize(ANGLE, contract=CONTRACT)
 
 
+@pytest.mark.slow
 def test_state_that_only_follows_needs_no_limit():
     """It decays by itself: whatever a regulator does, it may be as large as it likes."""
     plant = linear_plant(
@@ -447,6 +449,7 @@ def test_state_that_only_follows_needs_no_limit():
     assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("disturbance", "count"), [(1.0, 1), (1.7, 0)])
 def test_of_gains_that_bear_just_too_little_a_search_finds_one_that_bears_more(disturbance, count):
     crane = plant_of("port_crane")

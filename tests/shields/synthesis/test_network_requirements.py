@@ -127,6 +127,7 @@ def test_certificate_of_a_looser_problem_is_not_carried_over_to_a_tighter_one():
     assert carried_over(loose, plants.with_radii(plant, 50.0), ChannelContract(0)) is None
 
 
+@pytest.mark.slow
 def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
     model = {"A": [[1.0, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 0.1, "input_limits": (-1.0, 2.0)}
     model |= {"disturbance_bound": [0.02, 0.04], "sensor_bound": 0.01, "initial_bound": 0.01}
