@@ -31,7 +31,6 @@ from ncs_gym import (
 from shields import SafetyShield
 
 MOTOR = [[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]]
-STATES = {"angle": "rad", "rate": "rad/s"}
 A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.5]])
 MODEL, ABOUT = Model(A, B, None, dt=0.1), Model(A, B, None, dt=0.1, at=([1.0, 2.0], 0.5))
 LIMITS, BOUNDS = Limits(state=[1.0, 2.0], input=1.0), Bounds([0.01, 0.02], 0.01, 0.02)

@@ -18,7 +18,7 @@ from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector
 
 PLANT = truck_trailer(mass=4000.0)
 MODES = ["project", "lookahead"]
-RAISED = [ValueError, type("PanicException", (BaseException,), {})]
+RAISED = [ValueError, KeyboardInterrupt, type("PanicException", (BaseException,), {})]
 
 
 class Raising:
