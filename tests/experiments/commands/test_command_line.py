@@ -364,8 +364,12 @@ def test_synthesize_then_verify(tmp_path):
     other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
     assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
     assert "Beyond the contract" not in made.stdout + checked.stdout  # it has none
+    held = " ".join(checked.stdout.partition("What can be held:")[2].split())
+    assert held.startswith("reach 100 % of |coupling stretch| <= 2 m, ")
+    assert "set points coupling stretch from -0.8" in held
     exceeded = ncs("verify", Path(shields.__file__).parent / "packaged_certificates" / "Pendulum-v0.json").stdout
     assert "until the newest is 3 steps (150 ms) old" in " ".join(exceeded.partition("Beyond")[2].split())
+    assert "with samples 0 steps old, from -0.2243 to 0.2243 rad with samples 2 steps old" in " ".join(exceeded.split())
 
 
 @pytest.mark.cases(1)
