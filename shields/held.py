@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from ncs_gym import LinearPlant
@@ -19,7 +18,7 @@ from shields.reach import reach_of
 from shields.runtime import SafetyFilter
 from shields.runtime.safety_filter import MARGIN
 from shields.synthesis.resting_point import equilibria
-from shields.synthesis.semidefinite_programs import is_solved, value_of
+from shields.synthesis.semidefinite_programs import extreme_points
 
 # Set points keep this much from what the filter lets pass, in units of its rows: more than a solver is off.
 _KEPT = 1e-6
@@ -74,23 +73,19 @@ def setpoint_range(certificate: Certificate, plant: LinearPlant, output: Any, ag
     row, shapes = _row_of(output, plant), certificate.error_shapes
     age = as_count(age, "age", low=0, high=len(shapes) - 1)
     errors, test = shield.errors_of(shapes[age]), shield.test
-    directions, kept = equilibria(plant), shield.projection_margin + _KEPT
-    along, (x, u) = cp.Variable(directions.shape[1]), np.split(directions, [plant.n])
-    rows, half = np.hstack([test.state_rows, test.input_rows]) @ directions, plant.input_half
-    constraints: list[cp.Constraint] = [cp.abs((u @ along - plant.input_middle) / half) <= 1.0 - _KEPT]
-    if len(test.middle):
-        constraints += [cp.abs(rows[test.cone :] @ along - test.middle) <= errors.row_limits - kept]
-    if test.cone:
-        constraints += [cp.norm((errors.weighting @ rows[: test.cone]) @ along) <= errors.radius - kept]
-    objective = row @ x / max(float(np.abs(row) @ np.abs(x).max(axis=1)), 1e-300)
-    ends = np.empty((2, plant.n + plant.m))
-    for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-        if not is_solved(cp.Problem(cp.Maximize(sign * objective @ along), constraints)):
-            return None
-        end[:] = directions @ value_of(along)
-        if not test.margins_alone(end[: plant.n], errors, end[plant.n :])[0] >= MARGIN:
-            return None
-    states, inputs = np.split(ends, [plant.n], axis=1)
+    directions, kept, n = equilibria(plant), shield.projection_margin + _KEPT, plant.n
+    moved, half = np.hstack([test.state_rows, test.input_rows]) @ directions, plant.input_half
+    rows = np.concatenate([moved[test.cone :], directions[n:] / half[:, None]])
+    middle = np.concatenate([test.middle, plant.input_middle / half])
+    ends = np.concatenate([errors.row_limits - kept, np.full(plant.m, 1.0 - _KEPT)])
+    ball = errors.weighting @ moved[: test.cone], errors.radius - kept
+    found = extreme_points(row @ directions[:n], rows, middle - ends, middle + ends, *ball)
+    if found is None:
+        return None
+    points = found @ directions.T
+    if not all(test.margins_alone(point[:n], errors, point[n:])[0] >= MARGIN for point in points):
+        return None
+    states, inputs = np.split(points, [n], axis=1)
     low, high = (states @ row + row @ plant.operating_state).tolist()
     return SetPoints(age=age, low=low, high=high, deviations=states @ row, states=states, inputs=inputs)
 
