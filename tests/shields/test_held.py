@@ -23,7 +23,7 @@ TWO_ENDS = "two ends"
 KINDS = [
     *((name, kind) for name in ("TruckTrailerCruise", "CartPole", "BatchReactor", "CSTR", "Convoy", "Pendulum")
       for kind in ("polytope", "ellipsoid")),
-    *(("LaneKeeping", "polytope"), ("delayed", "polytope"), ("servo", "polytope"), (TWO_ENDS, "polytope")),
+    *(("TruckTrailer", "polytope"), ("LaneKeeping", "polytope"), ("delayed", "polytope"), ("servo", "polytope"), (TWO_ENDS, "polytope")),
     *(("oscillator", "polytope"), ("oscillator", "ellipsoid")),
 ]  # fmt: skip
 
