@@ -22,7 +22,7 @@ from experiments.commands.attack import attacked, channels_of, worst_case
 from ncs_gym import Bounds, Box, Channel, ChannelContract, Limits, LinearPlant, Model, NCSVectorEnv, Through
 from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
-from shields import Certificate, Infeasible, VectorSafetyShield, synthesize, verify
+from shields import Certificate, Infeasible, VectorSafetyShield, reach_of, synthesize, verify
 from shields.synthesis.invariant_polytope import points_of_box
 
 # From so many points, a power of two, inputs are sought that keep the limits for so many steps.
@@ -87,6 +87,7 @@ def channel_of(name: str) -> Channel:
 def shares(names: Names = ()) -> None:
     """What share of the published box a certificate keeps, and how long its synthesis takes with two verifications.
 
+    Where that is not known, "to 90 %" is how far every limited quantity gets at least on the way to its limits.
     The last line says how many of the plants have a certificate.
     """
     show = table("plant", "n, m", "age", "limits", "share", "at most", "rows", "time [s]", first=18, width=11)
@@ -103,7 +104,11 @@ def shares(names: Names = ()) -> None:
             continue
         took, found = f"{time.perf_counter() - began:.1f}", found + 1
         share, at_most = certificate.provenance.get("polytope_share_of_box"), largest_share(plant)
-        kept = ("no box", "") if share is None or at_most is None else (f"{share:.3f}", f"{at_most:.2f}")
+        if share is None or at_most is None:
+            reached = [end for each in reach_of(certificate, plant) for end in (each.low, each.high) if end is not None]
+            kept = f"to {min(reached):.1f} %", ""
+        else:
+            kept = f"{share:.3f}", f"{at_most:.2f}"
         show(name, *known, *kept, "" if certificate.polytope is None else len(certificate.polytope.rows), took)
     print(f"{found} of {len(names or published())} have a certificate")
 

@@ -12,10 +12,12 @@ from shields.certificate import Certificate, Multipliers, Proof, Updates
 from shields.errors import CertificateError, GuaranteeLostError, GuaranteeLostWarning, Infeasible
 from shields.packaged_certificates import certificate_for
 from shields.polytope import Polytope
+from shields.reach import Reach, reach_of
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
+    from shields.held import SetPoints, setpoint_range
     from shields.silence import Silence, silence_of
     from shields.synthesis import (
         Requirements,
@@ -37,17 +39,21 @@ __all__ = [
     "Multipliers",
     "Polytope",
     "Proof",
+    "Reach",
     "Report",
     "Requirements",
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
+    "SetPoints",
     "Silence",
     "Updates",
     "VectorSafetyShield",
     "certificate_for",
     "certify",
+    "reach_of",
     "requirements",
+    "setpoint_range",
     "silence_of",
     "synthesize",
     "verify",
@@ -57,6 +63,7 @@ __all__ = [
 # Imported at first use: these need the solver.
 _NAMES = {
     "synthesis": ("Requirements", "certify", "requirements", "synthesize"),
+    "held": ("SetPoints", "setpoint_range"),
     "silence": ("Silence", "silence_of"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}

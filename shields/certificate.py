@@ -376,7 +376,7 @@ class Certificate(ReadOnlyArrays):
         Raises:
             CertificateError: If it does not keep the ellipsoid.
         """
-        of_polytopes = ("polytope_share_of_box", "share_of_last_input", "no_polytope")
+        of_polytopes = ("polytope_share_of_box", "share_of_last_input", "no_polytope", "reach")
         kept = {name: value for name, value in self.provenance.items() if name not in of_polytopes}
         return replace(self, polytope=None, provenance=kept)
 

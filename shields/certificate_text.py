@@ -15,28 +15,30 @@ _WIDTH, _INDENT = 80, 14
 
 
 def size_of(certificate: Certificate) -> str:
-    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it, as far as known."""
+    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it.
+
+    Where the share of the box is not known, how far limited quantities get inside the set, as far as that was recorded.
+    """
     recorded = certificate.provenance
-    unknown, polytope_share = recorded.get("share_of_box_unknown"), recorded.get("polytope_share_of_box")
+    polytope_share, reach = recorded.get("polytope_share_of_box"), recorded.get("reach")
     past = _text(
         recorded.get("share_of_last_input"),
         " where past inputs are the operating one, while in the set the last input has {:.3g} % of its range",
         100.0,
     )
-    polytope = "{:.3g} % of the safe box's volume" + past + "; the ellipsoid "
     of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
     at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
-    if certificate.polytope is not None and not polytope_share:
-        not_known = "a share of the safe box that is not computed; the ellipsoid "
-        of_box, at_rest = not_known + of_box, not_known + at_rest
-    shares = (
-        _text(polytope_share, polytope, 100.0)
-        + _text(recorded.get("share_of_box"), of_box, 100.0)
-        + _text(recorded.get("share_of_box_at_rest"), at_rest, 100.0)
-        + (f"an unknown share of the safe box ({unknown})" if isinstance(unknown, str) else ""),
+    ellipsoid = (
+        _text(recorded.get("share_of_box"), of_box, 100.0),
+        _text(recorded.get("share_of_box_at_rest"), at_rest, 100.0),
         _text(recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the largest ellipsoid in the box", 100.0),
     )
-    return ", ".join(filter(None, shares))
+    size = ", ".join(filter(None, ellipsoid))
+    reached = ", ".join(each for each in reach if isinstance(each, str)) if isinstance(reach, list) else ""
+    kept = _text(polytope_share, "{:.3g} % of the safe box's volume" + past, 100.0) or (reached and f"up to {reached}")
+    if certificate.polytope is not None and size:
+        size = f"the ellipsoid {size}"
+    return "; ".join(filter(None, [kept, size]))
 
 
 def table(title: str, rows: list[tuple[str, str]]) -> str:

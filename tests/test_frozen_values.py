@@ -51,6 +51,7 @@ from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
 from ncs_gym.uncertainty.disturbances import as_disturbance
 from ncs_gym.validation import ReadOnlyArrays
+from shields import setpoint_range
 from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
 from tests.plants import varying_truck
@@ -100,6 +101,7 @@ VALUES = [
     CERTIFICATE.updates,
     PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),
     safety_filter(CERTIFICATE, batch_reactor()),
+    setpoint_range(CERTIFICATE, batch_reactor(), 1),
     Model(np.eye(2), np.ones((2, 1)), None, 0.1, at=(np.ones(2), np.ones(1))),
     Limits((-np.ones(2), np.ones(2)), np.ones(1), [(np.ones(2), np.ones(1), -1.0, 1.0)], np.ones(1)),
     Bounds(Box(np.zeros(2), np.ones(2)), 0.1, np.ones(2)),

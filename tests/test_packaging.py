@@ -40,10 +40,10 @@ LAYERS = {
         {"errors", "atomic_write", "certificate_text"},
         {"json_documents", "polytope"},
         {"certificate"},
-        {"verification", "paper", "synthesis"},
+        {"verification", "paper", "synthesis", "reach"},
         {"packaged_certificates"},
         {"runtime"},
-        {"silence"},
+        {"silence", "held"},
     ),
     "agents": (
         {"hyperparams"},

@@ -13,6 +13,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.registration import registered_ids
 from shields import Certificate, CertificateError
 from shields.atomic_write import write_atomically
+from shields.held import held_text
 
 
 def verify(settings: VerifySettings) -> None:
@@ -45,6 +46,11 @@ def verify(settings: VerifySettings) -> None:
             f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
         )
     print(certificate)
+    try:
+        held = held_text(certificate, plant, input_delay)
+    except ValueError as error:  # a certificate that no shield can use verifies, too
+        held = f"  not known: {error}"
+    print(f"What can be held:\n{held}")
     if (silence := shields.silence_of(certificate, plant, input_delay)) is not None:
         print(f"Beyond the contract:\n{silence}")
     print(f"{settings.file} verifies")

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from ncs_gym import ErrorSet, LinearPlant, exact
+from ncs_gym import Ellipsoid, ErrorSet, LinearPlant, exact
 from ncs_gym.estimation.error_sets import ErrorSetsByAge
 from ncs_gym.plants.hard_bounds import inflated
 from shields.certificate import Certificate, Proof, Updates
+from shields.polytope import Polytope
+from shields.reach import reach_in
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
@@ -98,10 +101,19 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
         name: float(exact.rounded(size, _SHOWN_DIGITS)) if isinstance(size, float) else size
         for name, size in sizes.items()
     }
+    if not {"share_of_box", "share_of_box_at_rest"} & sizes.keys():
+        description |= reach_recorded(Ellipsoid(L), plant)
     assumptions = getattr(plant, "assumptions", ())
     if assumptions:
         description["assumptions"] = [assumptions] if isinstance(assumptions, str) else list(assumptions)
     return description
+
+
+def reach_recorded(safe_set: Ellipsoid | Polytope, plant: LinearPlant) -> dict[str, Any]:
+    """Returns the record of how far limited quantities get inside a set, for a certificate; none if a solver fails."""
+    with suppress(ValueError):
+        return {"reach": [str(each) for each in reach_in(safe_set, plant)]}
+    return {}
 
 
 def volume_of(plant: LinearPlant, L: np.ndarray) -> float:

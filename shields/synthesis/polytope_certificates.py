@@ -21,6 +21,7 @@ from shields.synthesis.certificate_fields import (
     gain_in_digits,
     proofs_of,
     provenance_of,
+    reach_recorded,
     shape_in_digits,
     volume_of,
 )
@@ -323,7 +324,9 @@ def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: P
         "share_of_last_input": share_of_last_input(certificate.polytope, plant),
     }
     sizes = {name: float(exact.rounded(share, 3)) for name, share in shares.items() if share is not None}
-    return replace(certificate, provenance=certificate.provenance | sizes)
+    reach = {} if "polytope_share_of_box" in sizes else reach_recorded(certificate.polytope, plant)
+    others = {name: value for name, value in certificate.provenance.items() if name != "reach"}
+    return replace(certificate, provenance=others | sizes | reach)
 
 
 def polytope_share(certificate: Certificate) -> float:

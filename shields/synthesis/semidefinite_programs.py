@@ -1,4 +1,4 @@
-"""Solving semidefinite programs, and the largest ellipsoid in a box."""
+"""Solving semidefinite programs, the largest ellipsoid in a box, and the extreme points of rows and a cone."""
 
 from __future__ import annotations
 
@@ -53,3 +53,28 @@ def largest_box_ellipsoid(C: np.ndarray) -> np.ndarray:
     if not is_solved(program):
         raise Infeasible("the solver did not find the largest ellipsoid in the safe box", "S", float("nan"))
     return scale @ value_of(L) @ scale.T
+
+
+def extreme_points(
+    row: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray, cone: np.ndarray, radius: float
+) -> np.ndarray | None:
+    """Returns the points z with the least and the largest row z, shape (2, q); None where a solver finds none.
+
+    Args:
+        row: Shape (q,).
+        rows: With low <= rows z <= high, shape (r, q).
+        low: Their low ends, shape (r,).
+        high: Their high ends, shape (r,).
+        cone: With |cone z| <= radius, shape (k, q); of no rows for none.
+        radius: The radius.
+    """
+    z, ends = cp.Variable(len(row)), []
+    constraints: list[cp.Constraint] = [rows @ z >= low, rows @ z <= high]
+    if len(cone):
+        constraints += [cp.norm(cone @ z) <= radius]
+    size = float(np.abs(row).max()) or 1.0
+    for sign in (-1.0, 1.0):
+        if not is_solved(cp.Problem(cp.Maximize(sign / size * row @ z), constraints)):
+            return None
+        ends.append(value_of(z))
+    return np.array(ends)

@@ -26,28 +26,26 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
         L: Shape of a set in the box, (n, n), positive definite.
 
     Returns:
-        One entry: `share_of_box` or `share_of_box_at_rest`, a number in (0, 1], or `share_of_box_unknown`, the reason.
+        One entry, `share_of_box` or `share_of_box_at_rest`, a number in (0, 1]; none where it is not known: of flat
+        sets, open boxes, limits with two ends that are no box, and boxes with too many corners.
     """
     try:
         np.linalg.cholesky(L)
     except np.linalg.LinAlgError:
-        return {"share_of_box_unknown": "the set is flat in float64"}
-    if not plant.is_symmetric and (len(plant.box) != plant.n or not np.isfinite(plant.box_ends).all()):
-        return {"share_of_box_unknown": "the volume of limits with two ends that are no box is not computed"}
-    if exact.rank(plant.box) < plant.n:
-        return {"share_of_box_unknown": "the box is unbounded"}
+        return {}
+    is_box = plant.is_symmetric or (len(plant.box) == plant.n and np.isfinite(plant.box_ends).all())
+    if not is_box or exact.rank(plant.box) < plant.n:
+        return {}
     stored = plant.past
     if not stored:
         share = _share(plant.box, L)
-        return {"share_of_box_unknown": _reason(plant.box)} if share is None else {"share_of_box": share}
+        return {} if share is None else {"share_of_box": share}
     kept = plant.n - stored
     rows = plant.box[plant.box[:, :kept].any(axis=1)]
     if rows[:, kept:].any() or exact.rank(rows[:, :kept]) < kept:
-        return {"share_of_box_unknown": "the box of the states depends on inputs under way, or is unbounded"}
+        return {}
     share = _share(rows[:, :kept], np.linalg.inv(np.linalg.inv(L)[:kept, :kept]))
-    if share is None:
-        return {"share_of_box_unknown": _reason(rows[:, :kept])}
-    return {"share_of_box_at_rest": share}
+    return {} if share is None else {"share_of_box_at_rest": share}
 
 
 def _share(C: np.ndarray, L: np.ndarray) -> float | None:
@@ -73,8 +71,3 @@ def _volume(C: np.ndarray) -> float | None:
         return float(ConvexHull(HalfspaceIntersection(halfspaces, np.zeros(n)).intersections).volume)
     except QhullError:
         return None
-
-
-def _reason(C: np.ndarray) -> str:
-    """Returns why there is no share."""
-    return f"a box of {C.shape[0]} rows in {C.shape[1]} dimensions has too many corners to compute its volume"

@@ -65,11 +65,15 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     Raises:
         ValueError: If an argument is of another kind.
     """
+    _require_kinds(certificate, plant)
+    belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
+    return Report((belongs, *certified_conditions(certificate, plant)))
+
+
+def _require_kinds(certificate: Certificate, plant: LinearPlant) -> None:
     if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
         kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
-    belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
-    return Report((belongs, *certified_conditions(certificate, plant)))
 
 
 # Digests of the certificates and plants, as they were then, that have been verified in this process.
@@ -83,7 +87,9 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
 
     Raises:
         CertificateError: Naming the first condition that does not hold.
+        ValueError: If an argument is of another kind.
     """
+    _require_kinds(certificate, plant)
     rows = b"".join(each.tobytes() for each in plant.grid_rows or ())  # computed, and verified with the rest
     key = certificate.document["sha256"], plant.digest(), rows
     if key not in _valid:

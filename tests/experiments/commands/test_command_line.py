@@ -1,5 +1,6 @@
 """The command as a user meets it: in a process of its own where that matters, else in this one."""
 
+import importlib
 import json
 import re
 import shutil
@@ -13,7 +14,7 @@ import shields
 from agents.agent import Agent
 from experiments.runs.policies import certificate_file
 from ncs_gym import truck_trailer
-from shields import Certificate
+from shields import Certificate, CertificateError
 from tests.certificates import feasible_age_not_sought
 from tests.command import SMOKE, assert_one_sentence, killed, ncs, ncs_process, succeeded, without_pictures
 from tests.product import library_plant
@@ -275,8 +276,22 @@ def test_synthesize_then_verify(tmp_path):
     other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
     assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
     assert "Beyond the contract" not in made.stdout + checked.stdout  # it has none
+    held = " ".join(checked.stdout.partition("What can be held:")[2].split())
+    assert held.startswith("reach 100 % of |coupling stretch| <= 2 m, ")
+    assert "set points coupling stretch from -0.8" in held
     exceeded = ncs("verify", Path(shields.__file__).parent / "packaged_certificates" / "Pendulum-v0.json").stdout
     assert "until the newest is 3 steps (150 ms) old" in " ".join(exceeded.partition("Beyond")[2].split())
+    assert "with samples 0 steps old, from -0.2243 to 0.2243 rad with samples 2 steps old" in " ".join(exceeded.split())
+
+
+def test_certificate_that_float64_is_too_coarse_for_verifies_all_the_same(monkeypatch):
+    def refuse(*given):
+        raise CertificateError("the gain is too large to compute K x_hat")
+
+    monkeypatch.setattr(importlib.import_module("experiments.commands.verify"), "held_text", refuse)
+    said = succeeded("verify", Path(shields.__file__).parent / "packaged_certificates" / "CSTR-v0.json").stdout
+    assert "What can be held:\n  not known: the gain is too large" in said
+    assert said.endswith("CSTR-v0.json verifies\n")
 
 
 @pytest.mark.cases(1)

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
+from ncs_gym import Ellipsoid, truck_trailer
 from shields import verify
 from shields.certificate_text import size_of
+from shields.synthesis.certificate_fields import reach_recorded
 from shields.synthesis.share_of_box import share_of_box
 from tests.certificates import certificate_of
 from tests.plants import delayed, random_plant
@@ -38,14 +39,24 @@ def test_share_of_a_box_with_more_rows_than_states_agrees_with_counts(n, rows):
     assert share == pytest.approx(counted(C, L, 1.0), abs=5e-3)
 
 
-def test_too_many_corners_are_a_reason_not_a_number(certificate):
+def test_rows_that_say_nothing_new_change_nothing():
+    plant = truck_trailer()
+    again = altered(plant, box=np.concatenate([plant.box_rows, 0.9 * plant.box_rows]))
+    L = np.diag([3.0, 1.0])
+    assert share_of_box(again, L)["share_of_box"] == pytest.approx(share_of_box(plant, L)["share_of_box"], rel=1e-9)
+
+
+def test_too_many_corners_are_no_number_and_the_reach_is_said_instead(certificate):
     plant = random_plant(0, 6, 1)
     box = np.concatenate([np.eye(6), np.full((1, 6), 0.1)])
-    record = share_of_box(altered(plant, box=box), 0.5 * np.eye(6))
-    assert set(record) == {"share_of_box_unknown"}
-    text = size_of(replace(certificate, provenance=record))
-    assert "unknown share of the safe box (a box of 7 rows in 6 dimensions" in text
-    assert "%" not in text
+    plant, L = altered(plant, box=box), 0.25 * np.eye(6)
+    assert share_of_box(plant, L) == {}
+    record = reach_recorded(Ellipsoid(L), plant)
+    assert record["reach"] == [*(f"50 % of |x{i}| <= 1" for i in range(1, 7)), record["reach"][6]]
+    assert record["reach"][6].startswith("12.25 % of |0.1 x1")
+    text = size_of(replace(certificate.without_polytope(), provenance=record))
+    assert text == f"up to {', '.join(record['reach'])}"
+    assert size_of(replace(certificate, provenance={"reach": ["1 %", 2.0], "share_of_box": "none"})) == "up to 1 %"
 
 
 @pytest.mark.cases(1)
@@ -57,8 +68,14 @@ def test_parallel_rows_bound_nothing_in_the_other_direction(rows):
     plant = linear_plant(**settings, box=rows, disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001)
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
-    assert "an unknown share of the safe box (the box is unbounded)" in " ".join(str(certificate).split())
+    assert "size up to " in " ".join(str(certificate).split())
+    assert " % of |" in size_of(certificate)
     assert "polytope_share_of_box" not in certificate.provenance
+
+
+def test_unbounded_box_has_no_share():
+    plant = altered(truck_trailer(), box=np.array([[0.5, 0.0]]))
+    assert share_of_box(plant, np.diag([1.0, 5.0])) == {}
 
 
 def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
@@ -69,8 +86,7 @@ def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
     )  # fmt: skip
     certificate = synthesize(plant)
     share = 100.0 * certificate.provenance["share_of_box"]
-    size = f"a share of the safe box that is not computed; the ellipsoid {share:.4g} % of the safe box's volume"
-    assert size in " ".join(str(certificate).split())
+    assert f"% of |-0.5 x1 +1 x2| <= 1; the ellipsoid {share:.4g} % of the safe box's volume" in size_of(certificate)
 
 
 @pytest.mark.parametrize("limit", [([1.0, 1.0], -2.5, 2.5), ([1.0, 1.0], -1.1, 1.0)])
@@ -87,7 +103,7 @@ def test_share_of_a_polytope_is_of_what_further_limits_leave_of_the_box(limit):
     assert certificate.provenance["polytope_share_of_box"] == pytest.approx(share, abs=4e-3)
     said = " ".join(str(certificate).split())
     assert f"size {100.0 * certificate.provenance['polytope_share_of_box']:.3g} % of the safe box's volume" in said
-    assert "the ellipsoid an unknown share of the safe box" in said
+    assert "up to" not in said
 
 
 @pytest.mark.parametrize("steps", [1, pytest.param(2, marks=pytest.mark.slow)])
