@@ -46,7 +46,7 @@ LAYERS = {
         {"verification", "paper", "synthesis"},
         {"packaged_certificates"},
         {"runtime"},
-        {"silence"},
+        {"silence", "export"},
     ),
     "agents": (
         {"hyperparams"},
