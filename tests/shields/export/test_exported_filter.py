@@ -5,18 +5,22 @@ from __future__ import annotations
 import shutil
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ncs_gym import Channel
-from shields import CertificateError, SafetyFilter
+from shields import Certificate, CertificateError, SafetyFilter
 from shields.export import BoardFilter, BoardTable, board_filter, c_files, export_c
+from tests.certificates import CHECKED_IN
 from tests.command import ncs, succeeded
-from tests.shields.attacks.adversary import Adversary, Traffic, boundary, gauges, region_of
-from tests.shields.export.board import NAMES, Boards, altered, compiled, compiler, example
+from tests.plants import oscillator
+from tests.shields.attacks.adversary import Adversary, Faces, Traffic, boundary, gauges
+from tests.shields.export.board import NAMES, TWO_ENDS, Boards, altered, compiled, compiler, example
 
 EPISODE = 250
+DOUBLE = [(name, False) for name in (*NAMES, *TWO_ENDS)]
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +40,30 @@ def exported(tmp_path_factory):
     return folder_of
 
 
+class Ends(Faces):
+    """The polytope {x : low <= row x <= high for all rows}, around 0."""
+
+    @classmethod
+    def of(cls, rows, low, high):
+        return cls(np.vstack([rows / high[:, None], rows / low[:, None]]))
+
+    def gauges(self, points):
+        return (self.rows @ points).max(axis=0)
+
+    def outward(self, points, reach=0.0):
+        return self.rows[(self.rows @ points + np.reshape(reach, (-1, 1))).argmax(axis=0)].T
+
+
+def set_of(certificate):
+    P = certificate.polytope
+    return Ends.of(P.rows, P.low, P.high)
+
+
 def copied(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy")
 
 
-@pytest.mark.parametrize(("name", "single"), [*((name, False) for name in NAMES), ("CartPole", True), ("CSTR", True)])
+@pytest.mark.parametrize(("name", "single"), [*DOUBLE, ("CartPole", True), ("CSTR", True)])
 def test_c_does_what_its_python_reading_does(exported, name, single):
     """Random samples, stamps, episodes, proposals and applied inputs, also wrong ones: equal to the last bit."""
     (folder, table), (plant, certificate) = exported(name, single), example(name)
@@ -74,20 +97,20 @@ def test_c_does_what_its_python_reading_does(exported, name, single):
             assert np.array_equal(estimate[0], reading.estimate, equal_nan=True)
             assert age == reading.age
             seen |= {("decision", decision), ("reason", reading.reason)}
-    kinds = {("decision", code) for code in range(4)} - ({("decision", 1)} if plant.m > 1 else set())
+    kinds = {("decision", code) for code in range(4) if code != board_filter.PROJECTED or name in ("CartPole", "CSTR")}
     assert kinds | {("reason", code) for code in (0, 1, 2, 3, 4, 5, 7, 8)} <= seen
 
 
-@pytest.mark.parametrize(("name", "single"), [*((name, False) for name in NAMES), ("CartPole", True)])
+@pytest.mark.parametrize(("name", "single"), [*DOUBLE, ("CartPole", True), ("tanks", True)])
 def test_what_passes_on_a_board_passes_the_filter_with_the_error_set_of_its_age(exported, name, single):
     (_, table), (plant, certificate) = exported(name, single), example(name)
     shield, rng = SafetyFilter(certificate, plant, "switch"), np.random.default_rng(2)
     passed = np.zeros(len(table.limit), np.int64)
     for _ in range(1500):
-        direction = boundary(region_of(certificate.safe_set), plant.half_widths, rng, 1)[:, 0]
+        direction = boundary(set_of(certificate), plant.half_widths, rng, 1)[:, 0]
         board = BoardFilter(table, 0, rng.uniform(0.5, 1.0) * direction)
         board.age = age = int(rng.integers(len(table.limit)))
-        estimate, wanted = board.estimate, rng.uniform(-1.0, 1.0, plant.m) * plant.input_high
+        estimate, wanted = board.estimate, rng.uniform(plant.input_low, plant.input_high)
         decision, u = board.decide(wanted)
         if decision in (board_filter.SAFE, board_filter.PROJECTED):
             passed[age] += 1
@@ -96,18 +119,27 @@ def test_what_passes_on_a_board_passes_the_filter_with_the_error_set_of_its_age(
     assert passed.min() > 20
 
 
-def attacked(folder, name, steps, seed=0, count=50):
-    """Attacks N filters for so many steps: guaranteed steps, those outside the set, and errors outside their sets."""
+def attacked(folder, name, steps, seed=0, count=50, outages=False):
+    """Attacks N filters for so many steps: guaranteed steps, those outside the set, and errors outside their sets.
+
+    With outages packets break the contract now and then, and what was held up arrives together.
+    """
     plant, certificate = example(name)
     rng, h = np.random.default_rng(seed), certificate.contract.max_age
     boards = Boards(folder, count, plant.n, plant.m)
     channel = Channel(quantization_step=certificate.contract.quantization_step)
-    shapes, rows = np.array([*certificate.error_shapes, certificate.updates.last]), certificate.polytope.rows
+    shapes = np.array([*certificate.error_shapes, certificate.updates.last])
     D, N = plant.nominal_disturbance.shape_matrix, plant.nominal_sensor_error.shape_matrix
     guaranteed = outside = wrong = 0
-    worst = 0.0
+    worst, seen_reasons = 0.0, set()
     for episode in range(steps // (EPISODE * count)):
-        adversary, traffic = Adversary(plant, certificate, rng, count), Traffic(h, h, count)
+        seen = {each: getattr(plant, each) for each in ("A", "B", "H", "n", "m", "half_widths")}
+        seen = SimpleNamespace(**seen, box_rows=plant.box, u_max=plant.largest_input)
+        adversary, traffic = (
+            Adversary(seen, certificate, rng, count),
+            Traffic(*((3 * h, None) if outages else (h, h)), count),
+        )
+        adversary.safe, adversary.box = set_of(certificate), Ends.of(plant.box, plant.box_low, plant.box_high)
         x = boundary(adversary.safe, plant.half_widths, rng, count) * rng.uniform(0.5, 1.0, count)
         boards.start(episode, (x + plant.nominal_initial_error.sample_boundary(rng, count).T).T)
         taken = []
@@ -121,22 +153,34 @@ def attacked(folder, name, steps, seed=0, count=50):
             u, _, reason = boards.decide(adversary.proposals(estimate.T).T)
             is_guaranteed = reason == board_filter.GUARANTEED
             guaranteed += int(is_guaranteed.sum())
-            values = np.abs(rows @ x).max(axis=0)
+            values = adversary.safe.gauges(x)
             worst = max(worst, values[is_guaranteed].max(initial=0.0))
             outside += int((values > 1.0 + 1e-12)[is_guaranteed].sum())
-            wrong += int((gauges(of_age, estimate.T - x) > 1.0 + 1e-9).sum())
-            assert set(reason.tolist()) <= {board_filter.GUARANTEED, board_filter.NOT_KNOWN_INSIDE}
+            known = (age <= h) & (reason != board_filter.LOST_CONTRACT)
+            wrong += int((gauges(of_age, estimate.T - x) > 1.0 + 1e-9)[known].sum())
+            seen_reasons |= set(reason.tolist())
             nominal = plant.A @ x + plant.B @ u.T
             x = nominal + adversary.disturbances(nominal, D)
+    expected = {board_filter.GUARANTEED, board_filter.NOT_KNOWN_INSIDE}
+    expected |= {board_filter.OLD_SAMPLE, board_filter.LOST_CONTRACT} if outages else set()
+    assert seen_reasons <= expected
+    assert not outages or seen_reasons == expected
     return guaranteed, outside, wrong, worst
 
 
-@pytest.mark.parametrize(("name", "single"), [*((name, False) for name in NAMES), ("CartPole", True)])
+@pytest.mark.parametrize(("name", "single"), [*DOUBLE, ("CartPole", True), ("tanks", True)])
 def test_no_guaranteed_state_leaves_the_set_under_attack(exported, name, single):
     guaranteed, outside, wrong, worst = attacked(exported(name, single)[0], name, 50_000)
     assert (outside, wrong) == (0, 0)
     assert guaranteed > 45_000
     assert worst > 0.95  # the attack goes up to the boundary
+
+
+@pytest.mark.parametrize("name", ["CartPole", "CSTR", "BatchReactor"])
+def test_a_broken_contract_ends_the_guarantee_and_nothing_else(exported, name):
+    guaranteed, outside, wrong, _ = attacked(exported(name)[0], name, 25_000, outages=True)
+    assert (outside, wrong) == (0, 0)
+    assert 500 < guaranteed < 24_000
 
 
 def test_the_attack_finds_a_table_that_forgets_errors(exported, tmp_path):
@@ -238,5 +282,12 @@ def test_what_is_not_exported_is_refused_in_a_sentence(file, plant, words, tmp_p
 
 def test_ellipsoids_and_limits_within_a_step_are_refused():
     plant, certificate = example("CSTR")
-    with pytest.raises(CertificateError, match="it has no polytope"):
-        BoardTable.of(certificate.without_polytope(), plant)
+    within, between = example("coupled"), oscillator()
+    given = {
+        "it has no polytope": (certificate.without_polytope(), plant),
+        "its plant limits states and inputs together": within[::-1],
+        "its box counts between samples": (Certificate.load(CHECKED_IN / "oscillator.json"), between),
+    }
+    for words, refused in given.items():
+        with pytest.raises(CertificateError, match=words):
+            BoardTable.of(*refused)
