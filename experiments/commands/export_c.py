@@ -25,11 +25,12 @@ def export_c_files(settings: ExportCSettings) -> None:
             does = "takes samples on request" if env.channel.on_request else "commits inputs ahead"
             raise CertificateError(f"the filter is not exported, since {settings.plant} {does}: give the plant's file")
     table = export_c(certificate, plant, settings.out, single=settings.single)
-    print(wrapped(f"{settings.out}: {table.cost}."))
     age = counted(table.sizes["H"], "step")
+    print(wrapped(f"The filter takes {table.cost}."))
     print(
         wrapped(
-            f"It assumes that inputs act at the step at which they are decided, and that the newest sample is at most "
-            f"{age} old at every step. `make -C {settings.out}` checks it with a compiler."
+            "It assumes that inputs act at the step at which they are decided, and that the newest sample is at most "
+            f"{age} old at every step. Where there is a compiler, `make` checks it."
         )
     )
+    print(f"saved to {settings.out}")

@@ -77,6 +77,10 @@ class Shown:
         shown = [printed("verify", folder / f"{name}-v0.json") for name in ("CSTR", "CartPoleTwoWay")]
         return "\n".join(line for text in shown for line in text.splitlines() if " verifies" not in line)
 
+    def export_c(self):
+        certificate = ROOT / "shields" / "packaged_certificates" / "CartPole-v0.json"
+        return printed("export-c", certificate, "--plant", "ncs_gym/CartPole-v0", "--out", self.folder / "c")
+
     def channel(self):
         record = self.request.getfixturevalue("record")
         return printed("channel", record(0.02 * np.arange(500), delay=0.01, loss=0.2), "--env", "ncs_gym/CartPole-v0")
@@ -114,7 +118,7 @@ def shown(tmp_path, request, without_workers):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_everything_that_a_command_prints_fits_into_80_columns(command, shown):
-    lines = getattr(shown, command)().splitlines()
+    lines = getattr(shown, command.replace("-", "_"))().splitlines()
     assert len(lines) > 1
     assert [line for line in lines if len(line) > WIDTH] == []
 

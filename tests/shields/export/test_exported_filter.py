@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel
-from shields import Certificate, CertificateError, SafetyFilter
+from shields import Certificate, CertificateError
 from shields.export import BoardFilter, BoardTable, board_filter, c_files, export_c
 from tests.certificates import CHECKED_IN
 from tests.command import ncs, succeeded
 from tests.plants import oscillator
+from tests.product import safety_filter
 from tests.shields.attacks.adversary import Adversary, Faces, Traffic, boundary, gauges
 from tests.shields.export.board import NAMES, TWO_ENDS, Boards, altered, compiled, compiler, example
 
@@ -104,7 +105,7 @@ def test_c_does_what_its_python_reading_does(exported, name, single):
 @pytest.mark.parametrize(("name", "single"), [*DOUBLE, ("CartPole", True), ("tanks", True)])
 def test_what_passes_on_a_board_passes_the_filter_with_the_error_set_of_its_age(exported, name, single):
     (_, table), (plant, certificate) = exported(name, single), example(name)
-    shield, rng = SafetyFilter(certificate, plant, "switch"), np.random.default_rng(2)
+    shield, rng = safety_filter(certificate, plant, "switch"), np.random.default_rng(2)
     passed = np.zeros(len(table.limit), np.int64)
     for _ in range(1500):
         direction = boundary(set_of(certificate), plant.half_widths, rng, 1)[:, 0]
