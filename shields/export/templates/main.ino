@@ -12,6 +12,7 @@ void apply_input(const double u[NCS_M]);
 static ncs_filter filter;
 static const uint32_t EPISODE = 1;  // the sensor stamps with the same number, and with the number of the step
 static uint32_t next_step_us;
+static double held[NCS_M];  // what the actuator applies
 
 void setup() {
   double first[NCS_N] = {0};  // where the plant stands, known within the plant's first_error
@@ -24,15 +25,21 @@ void setup() {
 
 void loop() {
   uint32_t episode, stamp;
-  double y[NCS_P], wanted[NCS_M], u[NCS_M];
+  double y[NCS_P], wanted[NCS_M];
   while ((int32_t)(micros() - next_step_us) < 0) {
+  }
+  while ((int32_t)(micros() - next_step_us) >= (int32_t)NCS_PERIOD_US) {  // a step was missed
+    double u[NCS_M];
+    ncs_decide(&filter, held, u);
+    ncs_applied(&filter, held);
+    next_step_us += NCS_PERIOD_US;
   }
   next_step_us += NCS_PERIOD_US;
   while (next_sample(&episode, &stamp, y)) {
     ncs_receive(&filter, episode, stamp, y);
   }
   propose(filter.estimate, wanted);
-  ncs_decide(&filter, wanted, u);
-  apply_input(u);
+  ncs_decide(&filter, wanted, held);
+  apply_input(held);
   digitalWrite(LED_BUILTIN, filter.reason == NCS_GUARANTEED ? LOW : HIGH);
 }

@@ -177,6 +177,12 @@ def test_no_guaranteed_state_leaves_the_set_under_attack(exported, name, single)
     assert worst > 0.95  # the attack goes up to the boundary
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_nor_does_one_in_a_million_steps(exported, name):
+    assert attacked(exported(name)[0], name, 250_000, seed=1)[1:3] == (0, 0)
+
+
 @pytest.mark.parametrize("name", ["CartPole", "CSTR", "BatchReactor"])
 def test_a_broken_contract_ends_the_guarantee_and_nothing_else(exported, name):
     guaranteed, outside, wrong, _ = attacked(exported(name)[0], name, 25_000, outages=True)
