@@ -63,10 +63,11 @@ def sources(*folders: str) -> list[Path]:
 
 
 def templates_and_data() -> list[Path]:
-    """Returns the templates of the report, and the JSON files of the packages but certificates and trained agents."""
+    """Returns templates, and the JSON files of the packages but certificates and trained agents."""
     data = [path for folder in PACKAGES for path in (ROOT / folder).rglob("*.json")]
     return [
         *(ROOT / "experiments" / "report" / "templates").iterdir(),
+        *(ROOT / "shields" / "export" / "templates").iterdir(),
         *(path for path in data if not {"packaged_certificates", "trained"} & set(path.parts)),
     ]
 

@@ -1,6 +1,6 @@
 """What a shield costs, and where its proof ends: `python -m benchmarks.shield COMMAND`.
 
-Commands: cost, decision, loop, memory, containment, mismatch.
+Commands: cost, decision, loop, board, memory, containment, mismatch.
 """
 
 from __future__ import annotations
@@ -41,9 +41,13 @@ from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.registration import EPISODE_STEPS
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, certificate_for, synthesize
+from shields.export import BoardFilter, BoardTable
+from shields.export.board_filter import GUARANTEED
 from shields.runtime.safety_filter import MARGIN
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+# Steps for which proposals to a board push the same way.
+HELD = 10
 
 
 def cost(seconds: float = 1.0) -> None:
@@ -217,6 +221,51 @@ def _steps(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple
     return 1e6 * taken, resident() - began
 
 
+def board(names: tuple[str, ...] = ("LaneKeeping", "CSTR", "BatchReactor", "CartPole"), steps: int = 4_000) -> None:
+    """Which share of proposals a filter on a board overrides, and a `SafeLoop`, on the channel of an environment.
+
+    Proposals are the fallback's inputs plus noise of a share of the limits, held for ten steps.
+    """
+    show = table("overridden [%]", "noise", "SafeLoop", "double", "float", first=14)
+    for name in names:
+        env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
+        certificate = certificate_for(env.plant, env.certificate_contract)
+        tables = [BoardTable.of(certificate, env.plant, single=single) for single in (False, True)]
+        for noise in (0.3, 1.0):
+            shares = [_overridden(certificate, env, noise, steps, each) for each in (None, *tables)]
+            show(name, noise, *(f"{100.0 * share:.1f}" for share in shares))
+
+
+def _overridden(certificate: Any, env: NCSEnv, noise: float, steps: int, numbers: BoardTable | None) -> float:
+    """Returns the share of proposals that a `SafeLoop`, or a board with such numbers, overrides."""
+    plant, rng = env.plant, np.random.default_rng(0)
+    on_air = ChannelState(replace(env.channel, delay=env.channel.delay - 1), rng)  # received at the next step
+    state, packets, count, push = certificate.resting_state, [], 0, np.zeros(plant.m)
+    if numbers is None:
+        loop = SafeLoop(certificate, plant, env.channel, on_unproved="ignore")
+        loop.start(state)
+    else:
+        filtered = BoardFilter(numbers, 0, state)
+    for step in range(steps):
+        if step % HELD == 0:
+            push = noise * rng.uniform(plant.input_low, plant.input_high)
+        if numbers is None:
+            wanted = np.clip(push + certificate.K @ loop.receive(packets), plant.input_low, plant.input_high)
+            u = loop.decide(wanted).input
+            assert loop.guaranteed, loop.reason
+        else:
+            for packet in sorted(packets, key=lambda each: each.stamp):
+                filtered.receive(packet.episode, packet.stamp, packet.measurement)
+            wanted = np.clip(push + certificate.K @ filtered.estimate, plant.input_low, plant.input_high)
+            u = filtered.decide(wanted)[1]
+            assert filtered.reason == GUARANTEED
+        count += bool((u != wanted).any())
+        y = plant.H @ state + plant.nominal_sensor_error.sample_boundary(rng)
+        packets = on_air.carry(rng, step, Packet(step, env.channel.quantize(y)))
+        state = plant.A @ state + plant.B @ u + plant.nominal_disturbance.sample_boundary(rng)
+    return count / steps
+
+
 def memory(steps: int = 100_000) -> None:
     """By how much the memory of a `SafeLoop` has grown after a tenth and after all steps of an episode.
 
@@ -366,7 +415,7 @@ def _attacked(env: NCSEnv, process: Any, certificate: Any, episodes: int, seed: 
     return first
 
 
-COMMANDS = (cost, decision, loop, memory, containment, mismatch)
+COMMANDS = (cost, decision, loop, board, memory, containment, mismatch)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

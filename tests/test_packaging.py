@@ -43,7 +43,7 @@ LAYERS = {
         {"verification", "paper", "synthesis", "reach"},
         {"packaged_certificates"},
         {"runtime"},
-        {"silence", "held"},
+        {"silence", "held", "export"},
     ),
     "agents": (
         {"hyperparams"},

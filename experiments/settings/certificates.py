@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -70,6 +70,26 @@ class VerifySettings:
 
     def __post_init__(self) -> None:
         _refuse_both(self.env, self.plant)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportCSettings:
+    """Writes a safety filter in C99 for a board, with test vectors that check it (docs/deployment.md).
+
+    Attributes:
+        file: File of the certificate (JSON): with a polytope, under a channel contract.
+        plant: File of the plant that `LinearPlant.save` wrote, or id of an environment with a plant of its own.
+        out: Output folder.
+        single: Write the rows of the safe set as float, which needs less memory and is faster on a board that computes
+            in single precision; the estimate stays double.
+        seed: Not used, since what is written is always the same; every command takes it.
+    """
+
+    file: tyro.conf.Positional[Path]
+    plant: str
+    out: Path = Path("filter")
+    single: Annotated[bool, tyro.conf.arg(name="float")] = False
+    seed: int = 0
 
 
 def changed_contract(

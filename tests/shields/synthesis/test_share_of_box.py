@@ -53,7 +53,7 @@ def test_too_many_corners_are_no_number_and_the_reach_is_said_instead(certificat
     assert share_of_box(plant, L) == {}
     record = reach_recorded(Ellipsoid(L), plant)
     assert record["reach"] == [*(f"50 % of |x{i}| <= 1" for i in range(1, 7)), record["reach"][6]]
-    assert record["reach"][6].startswith("12.25 % of |0.1 x1")
+    assert record["reach"][6].startswith("12.25 % of |x1 + x2 + ")
     text = size_of(replace(certificate.without_polytope(), provenance=record))
     assert text == f"up to {', '.join(record['reach'])}"
     assert size_of(replace(certificate, provenance={"reach": ["1 %", 2.0], "share_of_box": "none"})) == "up to 1 %"
@@ -86,7 +86,7 @@ def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
     )  # fmt: skip
     certificate = synthesize(plant)
     share = 100.0 * certificate.provenance["share_of_box"]
-    assert f"% of |-0.5 x1 +1 x2| <= 1; the ellipsoid {share:.4g} % of the safe box's volume" in size_of(certificate)
+    assert f"% of |-0.5 x1 + x2| <= 1; the ellipsoid {share:.4g} % of the safe box's volume" in size_of(certificate)
 
 
 @pytest.mark.parametrize("limit", [([1.0, 1.0], -2.5, 2.5), ([1.0, 1.0], -1.1, 1.0)])
