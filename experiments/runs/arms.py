@@ -31,7 +31,7 @@ _POLICIES = (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED)
 _KNOWN_ARMS = (
     "unshielded, monitor, penalized[:WEIGHT], lagrangian, FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
     f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, trusting[:MARGIN], psf[:MARGIN], psf:tube and "
-    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr, mpc[:MARGIN] (modes: "
+    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr[:observer], mpc[:observer], mpc[:MARGIN] (modes: "
     f"{', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
 )
 
