@@ -306,13 +306,15 @@ def linear(
 
     Of every regulator `grid` has twelve weights; those with the highest mean return of --tuning-episodes behind the
     shield (mode project) play --episodes on another seed, as the agents do: alone and behind both modes of the shield,
-    as trained and attacked. Returns are as trained, with Student's interval over episodes; beside them is the share of
-    overridden steps. The last column counts violating episodes behind the shield, in both modes and scenarios. What
-    was measured is kept in OUT.
+    as trained and attacked. "alone" and "shielded" have violating episodes of both scenarios, the latter of both modes;
+    the others have the return as trained, with Student's interval over episodes, and the share of overridden steps. The
+    last column has what a regulator returns more than the agent in mode lookahead, episode by episode. What was
+    measured is kept in OUT.
     """
     results, (_, seed) = Results(out), seeds_of(TABLE_SEED, 0)
-    print("| environment | policy | violating alone, attacked | `project` | `lookahead` | violating |")
-    print("|---|---|---|---|---|---|")
+    print("| task | policy | alone | `project` | `lookahead` | shielded | less the agent's |")
+    print("|---|---|---|---|---|---|---|")
+    of_agent = np.zeros(episodes)
     for env_id in env:
         bare, shielded = LoopConfig(env=env_id), shielded_loop(env_id)
         assert shielded.shield is not None
@@ -336,10 +338,14 @@ def linear(
                 share = 100.0 * found[:, 2].sum() / found[:, 3].sum()
                 cells.append(f"{with_interval(found[:, 0].tolist(), digits=1)} ({share:.1f} %)")
             every = [played(mode, each)[:, 1] for mode in ("project", "lookahead") for each in (AS_TRAINED, ATTACKED)]
-            print(
-                f"| `{env_id}` | {name} | {' | '.join(cells)} | {np.count_nonzero(every)} of {np.size(every)} |",
-                flush=True,
-            )
+            cells.append(f"{np.count_nonzero(every)} of {np.size(every)}")
+            if name == "agent":
+                of_agent = played("lookahead", AS_TRAINED)[:, 0]
+                cells.append("")
+            else:
+                gain = played("lookahead", AS_TRAINED)[:, 0] - of_agent
+                cells.append(with_interval(gain.tolist(), "+", digits=1))
+            print(f"| {env_id.rpartition('/')[2]} | {name} | {' | '.join(cells)} |", flush=True)
 
 
 def _packaged(env_id: str) -> Policy:

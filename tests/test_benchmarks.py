@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import hashes, project
+from benchmarks import hashes, learning, project
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -96,3 +96,19 @@ def test_hashes_come_out_again_and_one_that_does_not_is_named(tmp_path, monkeypa
     assert asked("compare") == (1, f"{other}\n1 of {len(found)} hashes differ\n")
     monkeypatch.setattr(hashes, "STEPS", 15)
     assert f"\n{len(found)} of {len(found)} hashes differ" in asked("compare")[1]
+
+
+def test_table_of_regulators_pairs_them_with_the_packaged_agent(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(learning, "grid", lambda arm: [{"effort": 0.03, "state": 0.003}])
+    given = {"env": ("ncs_gym/CSTR-v0",), "regulators": ("lqr", "lqr:observer"), "tuning_episodes": 1}
+    learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
+    first = capsys.readouterr().out
+    agent, lqr, observer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in first.splitlines()[2:])
+    assert [agent[1], lqr[1], observer[1]] == ["agent", "lqr", "lqr:observer"]
+    assert agent[5] == lqr[5] == observer[5] == "0 of 16"
+    gain, returns = float(observer[6].split()[0]), [float(row[4].split()[0]) for row in (agent, observer)]
+    assert gain == pytest.approx(returns[1] - returns[0], abs=0.11)
+    assert gain > 2.0
+    monkeypatch.setattr(learning, "evaluate", None)  # what was measured is not measured again
+    learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
+    assert capsys.readouterr().out == first

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from benchmarks.learning import OBSERVED, OBSERVING
 from benchmarks.study import ENVS, REGULATED
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
@@ -217,6 +218,7 @@ def test_every_arm_of_the_study_has_weights_of_its_own():
     for env_id in ENVS:
         weights = {arm: tuned_weights(env_id, arm) for arm in REGULATED}
         assert len(set(weights.values())) > 2
+        assert all(tuned_weights(env_id, arm) in [RegulatorWeights(**each) for each in OBSERVED] for arm in OBSERVING)
     assert tuned_weights("ncs_gym/CartPole-v0", "lqr") == RegulatorWeights()
 
 
