@@ -92,8 +92,8 @@ class Results:
         lines = file.read_text("utf-8").splitlines() if file.exists() else []
         self._file, self._known = file, {json.dumps(each["key"]): each["return"] for each in map(json.loads, lines)}
 
-    def of(self, key: list[Any], measure: Callable[[], float]) -> float:
-        """The number of a key, measured unless it was before."""
+    def of(self, key: list[Any], measure: Callable[[], Any]) -> Any:
+        """What belongs to a key, a number or another JSON value, measured unless it was before."""
         if (text := json.dumps(key)) not in self._known:
             self._known[text] = measure()
             with self._file.open("a", encoding="utf-8") as file:
