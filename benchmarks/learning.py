@@ -1,19 +1,17 @@
 """How good agents are, and the searches for their settings: `python -m benchmarks.learning COMMAND`.
 
-Commands: tune, tuned, pretrained, tune-arms.
+Commands: tune, tuned, pretrained, linear, tune-arms.
 
-Behind the same shield (mode project), agents are compared with what needs no training: the best linear controller of a
-grid, action = clip((gain x_hat + task_gain y) / u_max), where y is the task's entry of the observation. Seeds are those
-of `ncs compare` with `--seed 1000000` for searches, 2000000 for the table and 3000000 for the agents of the package, so
-that neither a study (`--seed 0`) nor a table has what was searched on.
+Behind the same shield, agents are compared with what needs no training: regulators, with and without an estimate of the
+disturbance. Seeds are those of `ncs compare` with `--seed 1000000` for searches, 2000000 for tables and 3000000 for the
+agents of the package, so that neither a study (`--seed 0`) nor a table has what was searched on.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +21,6 @@ import gymnasium as gym
 import numpy as np
 
 from agents import (
-    Agent,
     LoopConfig,
     ShieldSettings,
     evaluate,
@@ -31,27 +28,34 @@ from agents import (
     tuned_hyperparams,
     tuned_steps,
 )
+from agents import pretrained as packaged_agent
 from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
 from benchmarks.commands import run, some_of
 from benchmarks.study import ENVS, REGULATED, TRAINED
+from benchmarks.study_figures import ATTACKED
 from benchmarks.timing import timed
 from experiments.analysis.statistics import mean_interval
 from experiments.baselines import RegulatorWeights, controller
-from experiments.baselines.controllers import equilibrium
+from experiments.baselines.controllers import OBSERVER
 from experiments.runs.arms import Arm
+from experiments.runs.loops import AS_TRAINED, under
 from experiments.settings import CompareSettings
-from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.registration import registered_ids
-from ncs_gym.tasks.base_task import Task
 from shields import Certificate, certificate_for
+from shields.certificate import Fallback
 
 ROOT = Path(__file__).resolve().parent.parent
 SEARCH_SEED, TABLE_SEED, PACKAGE_SEED = 1_000_000, 2_000_000, 3_000_000
 EPISODES = 200
+# Few that regulators are tuned on.
+TUNING_EPISODES = 12
+# Three in which the network decides and a disturbance persists, and two in which neither is so.
+LINEAR_ENVS = (*ENVS, "ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
+# Arms beyond the study's.
+OBSERVING = tuple(f"lqr{OBSERVER}+{each}" for each in ("shielded", "lookahead"))
 # Steps of a training; where more were seen to help, four times as many.
 STEPS, MORE_STEPS = 150_000, 600_000
 LONGER = ("ncs_gym/CartPole-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/CartPoleNonlinear-v0")
@@ -88,8 +92,8 @@ class Results:
         lines = file.read_text("utf-8").splitlines() if file.exists() else []
         self._file, self._known = file, {json.dumps(each["key"]): each["return"] for each in map(json.loads, lines)}
 
-    def of(self, key: list[Any], measure: Callable[[], float]) -> float:
-        """The number of a key, measured unless it was before."""
+    def of(self, key: list[Any], measure: Callable[[], Any]) -> Any:
+        """What belongs to a key, a number or another JSON value, measured unless it was before."""
         if (text := json.dumps(key)) not in self._known:
             self._known[text] = measure()
             with self._file.open("a", encoding="utf-8") as file:
@@ -97,105 +101,34 @@ class Results:
         return self._known[text]
 
 
-EFFORTS = tuple(10.0**power for power in (-4, -3, -2, -1, 0))
-# Weights of the safe box beside that of the task's own error.
-BOX_WEIGHTS = (1e-2, 1e-1, 1.0)
-# The target that a controller follows is the present one, or one of those that the task shows ahead.
-TARGETS_AHEAD = (0, 1, 2, 4, 8)
-PROPORTIONAL_GAINS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)
+REGULATORS = ("lqr", f"lqr{OBSERVER}", "mpc", f"mpc{OBSERVER}")
+# Twelve weights are tried of every regulator.
+GRID = [{"effort": effort, "state": state} for effort, state in product((0.003, 0.03, 0.3, 3.0), (0.003, 0.03, 0.3))]
+OBSERVED = [
+    {"effort": effort, "state": state, "disturbance": alpha}
+    for effort, state, alpha in product((0.003, 0.03, 0.3), (0.003, 0.3), (0.2, 0.4))
+]
 
 
-@dataclass(frozen=True, eq=False)
-class LinearController:
-    """A linear controller.
-
-    Attributes:
-        name: Kind and weights.
-        gain: Shape (m, n).
-        task_gain: Shape (m, entries), for the entries that the task adds to the observation.
-    """
-
-    name: str
-    gain: np.ndarray
-    task_gain: np.ndarray
-
-    def policy(self, plant: LinearPlant) -> Callable[..., np.ndarray]:
-        """The policy that `agents.evaluate` takes."""
-
-        def act(observations: np.ndarray, infos: dict[str, np.ndarray]) -> np.ndarray:
-            inputs = infos["estimate"] @ self.gain.T + observations[:, plant.n :] @ self.task_gain.T
-            return np.clip(inputs / plant.u_max, -1.0, 1.0)
-
-        return act
+def grid(arm: str) -> list[dict[str, Any]]:
+    """The weights that are tried of a regulator, alone or behind a filter."""
+    return OBSERVED if OBSERVER in arm else GRID
 
 
-def linear_controllers(plant: LinearPlant, task: Task) -> list[LinearController]:
-    """The candidates among which the best linear controller of a task is chosen."""
-    if isinstance(task, SpeedTracking):
-        return _proportional(plant, task) + _speed_regulators(plant, task)
-    if isinstance(task, SetpointTracking):
-        return _setpoint_regulators(plant, task)
-    assert isinstance(task, Regulation)
-    weights = plant.box_rows.T @ plant.box_rows
-    nothing = np.zeros((plant.m, 0))
-    return [LinearController(f"LQR, effort {each:g}", _regulator(plant, weights, each), nothing) for each in EFFORTS]
+def regulated(loop: LoopConfig, name: str, weights: dict[str, Any]) -> Policy:
+    """A regulator with some weights."""
+    env = ncs_env(loop.single())
+    return controller(name, env, Fallback.of_gain(np.zeros((env.plant.m, env.plant.n))), 0, RegulatorWeights(**weights))
 
 
-def _regulator(plant: LinearPlant, Q: np.ndarray, effort: float) -> np.ndarray:
-    """K, shape (m, n), of u = K x that minimizes the sum of x'Qx + effort |u|^2, u in units of its limits."""
-    return _gain(plant.A, plant.B, Q, effort * np.diag(1.0 / plant.u_max**2))
+def best_weights(results: Results, loop: LoopConfig, name: str, episodes: int) -> dict[str, Any]:
+    """The weights of a regulator with the highest mean return on the seed of the searches."""
 
+    def tried(weights: dict[str, Any]) -> float:
+        return mean_return(loop, regulated(loop, name, weights), SEARCH_SEED, episodes)
 
-def _gain(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    gain = lqr_gain(A, B, Q, R)
-    assert gain is not None
-    return gain
-
-
-def _setpoint_regulators(plant: LinearPlant, task: SetpointTracking) -> list[LinearController]:
-    state, held = equilibrium(plant, task.output)
-    found, entries = [], len(task.observation_bound(plant, 1))
-    for effort in EFFORTS:
-        for weight in BOX_WEIGHTS:
-            Q = np.outer(task.output, task.output) / task.width**2 + weight * plant.box_rows.T @ plant.box_rows
-            gain = _regulator(plant, Q, effort)
-            for ahead in [each for each in TARGETS_AHEAD if each <= task.preview]:
-                feed = np.zeros((plant.m, entries))
-                feed[:, ahead] = held - gain @ state
-                name = f"LQR, effort {effort:g}, box {weight:g}, target {ahead} steps ahead"
-                found.append(LinearController(name, gain, feed))
-    return found
-
-
-def _proportional(plant: LinearPlant, task: SpeedTracking) -> list[LinearController]:
-    direction = np.eye(plant.m)[:, task.input_index : task.input_index + 1]
-    return [
-        LinearController(f"proportional, {gain:g} / s", np.zeros((plant.m, plant.n)), gain * direction)
-        for gain in PROPORTIONAL_GAINS
-    ]
-
-
-def _speed_regulators(plant: LinearPlant, task: SpeedTracking) -> list[LinearController]:
-    """LQRs of the plant and the speed error e, e+ = e - dt u."""
-    n, found = plant.n, []
-    A = np.eye(n + 1)
-    A[:n, :n] = plant.A
-    row = -plant.dt * np.eye(plant.m)[task.input_index]
-    B = np.vstack([plant.B, row])
-    for effort in EFFORTS:
-        for weight in (0.0, *BOX_WEIGHTS):
-            Q = np.zeros((n + 1, n + 1))
-            Q[:n, :n], Q[n, n] = weight * plant.box_rows.T @ plant.box_rows, 1.0 / 25.0
-            gain = _gain(A, B, Q, effort * np.diag(1.0 / plant.u_max**2))
-            found.append(LinearController(f"LQR, effort {effort:g}, box {weight:g}", gain[:, :n], gain[:, n:]))
-    return found
-
-
-def best_linear(loop: LoopConfig) -> LinearController:
-    """The linear controller with the highest return on the first evaluation seed of the searches."""
-    env, seed = ncs_env(gym.make(loop.env)), seeds_of(SEARCH_SEED, 0)[1]
-    candidates = linear_controllers(env.plant, env.task)
-    return max(candidates, key=lambda each: mean_return(loop, each.policy(env.plant), seed))
+    tries = grid(name)
+    return max(tries, key=lambda each: results.of([loop.env, name, episodes, each], lambda: tried(each)))
 
 
 TUNED_PPO = ROOT / "agents" / "tuned" / "ppo.json"
@@ -306,7 +239,7 @@ def tuned(
 
         returns = {
             name: [measured(name, make, index) for index in range(seeds)]
-            for name, make in _policies(loop, defaults).items()
+            for name, make in _policies(loop, defaults, results).items()
         }
         lines = [f"| `{env_id}` | {name} | {with_interval(values)} |" for name, values in returns.items()]
         means = {name: float(np.mean(values)) for name, values in returns.items() if "agent" not in name}
@@ -315,48 +248,36 @@ def tuned(
         print("\n".join([*lines, f"| `{env_id}` | {agent} - {best} | {with_interval(gain, '+')} |"]), flush=True)
 
 
-def _policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int], Policy]]:
+def _policies(loop: LoopConfig, with_defaults: bool, results: Results) -> dict[str, Callable[[int], Policy]]:
     """What makes the policy of a seed, by name."""
-    env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
+    env, hyperparams, regulator = ncs_env(loop.single()), tuned_hyperparams(loop.env), f"lqr{OBSERVER}"
     assert loop.shield is not None
-    certified, hyperparams = loop.shield.certificate.fallback, tuned_hyperparams(loop.env)
-    steps = tuned_steps(loop.env) or STEPS
+    certified, steps = loop.shield.certificate.fallback, tuned_steps(loop.env) or STEPS
+    weights = best_weights(results, loop, regulator, TUNING_EPISODES)
     found: dict[str, Callable[[int], Policy]] = {"tuned agent": lambda seed: trained(loop, hyperparams, steps, seed)}
     if with_defaults:
         found["agent, default settings"] = lambda seed: trained(loop, {}, STEPS, seed)
     for name in ("random", "K x_hat"):
         found[name] = lambda seed, name=name: controller(name, env, certified, seed)
-    return found | {linear.name: lambda seed: linear.policy(env.plant)}
+    return found | {regulator: lambda seed: regulated(loop, regulator, weights)}
 
 
-def with_interval(values: Sequence[float], sign: str = "") -> str:
+def with_interval(values: Sequence[float], sign: str = "", digits: int = 2) -> str:
     """The mean of some values with Student's interval."""
     low, high = mean_interval(values) or (float("nan"),) * 2
-    return f"{np.mean(values):{sign}.2f} [{low:{sign}.2f}, {high:{sign}.2f}]"
+    return "{:{}} [{:{}}, {:{}}]".format(*(x for v in (np.mean(values), low, high) for x in (v, f"{sign}.{digits}f")))
 
 
-def pretrained(
-    env: Sequence[str] = (),
-    out: Path = ROOT / "agents" / "trained",
-    table: bool = False,
-) -> None:
+def pretrained(env: Sequence[str] = (), out: Path = ROOT / "agents" / "trained") -> None:
     """Trains the small agents that come with the package, one per registered id, behind the shield (mode project).
 
     PPO with the hyperparameters and steps of agents/tuned, or the defaults and 150,000 steps, and networks of two
     layers of 32. Each agent is saved and evaluated on 200 episodes; a line says how long that took. Its certificate is
-    the one in shields/packaged_certificates. --table prints those that are there beside the best linear controller
-    behind the same shield, on the same episodes, without those whose packages are missing.
+    the one in shields/packaged_certificates.
     """
-    if table:
-        print("| environment | agent (overridden) | best linear controller | difference, paired |\n|---|---|---|---|")
     for env_id in env or [each for each in registered_ids() if each.startswith("ncs_gym/")]:
-        folder = out / env_id.rpartition("/")[2]
-        if table:
-            with suppress(ModuleNotFoundError):
-                print(_row(env_id, folder), flush=True)
-        else:
-            line, seconds = timed(_train_and_save, env_id, folder)
-            print(f"{line}, {seconds:.0f} s of CPU", flush=True)
+        line, seconds = timed(_train_and_save, env_id, out / env_id.rpartition("/")[2])
+        print(f"{line}, {seconds:.0f} s of CPU", flush=True)
 
 
 def _train_and_save(env_id: str, folder: Path) -> str:
@@ -374,24 +295,65 @@ def _train_and_save(env_id: str, folder: Path) -> str:
     return f"{env_id}: return {mean:.2f}, {violations} violating steps, {size / 1e3:.0f} kB"
 
 
-def _row(env_id: str, folder: Path) -> str:
-    """The line of a Markdown table about an agent and the best linear controller."""
-    loop, (_, seed) = shielded_loop(env_id), seeds_of(PACKAGE_SEED, 0)
-    agent, plant = Agent.load(folder), ncs_env(gym.make(env_id)).plant
-    both = [
-        evaluate(loop, policy, EPISODES, seed).episodes
-        for policy in (lambda observations, infos: agent.act(observations), best_linear(loop).policy(plant))
-    ]
-    returns = np.array([[each.episode_return for each in episodes] for episodes in both])
-    overridden = [sum(e.interventions for e in episodes) / sum(e.steps for e in episodes) for episodes in both]
-    cells = [
-        f"{mean:.2f} ({100.0 * share:.1f} %)" for mean, share in zip(returns.mean(axis=1), overridden, strict=True)
-    ]
-    return f"| `{env_id}` | {' | '.join(cells)} | {with_interval((returns[0] - returns[1]).tolist(), '+')} |"
+def linear(
+    env: Sequence[str] = LINEAR_ENVS,
+    regulators: Annotated[Sequence[str], some_of(REGULATORS)] = REGULATORS,
+    tuning_episodes: int = TUNING_EPISODES,
+    episodes: int = 100,
+    out: Path = Path("runs/linear.jsonl"),
+) -> None:
+    """The agents of the package beside regulators, behind the same shield, on the same episodes.
+
+    Of every regulator `grid` has twelve weights; those with the highest mean return of --tuning-episodes behind the
+    shield (mode project) play --episodes on another seed, as the agents do: alone and behind both modes of the shield,
+    as trained and attacked. "alone" and "shielded" have violating episodes of both scenarios, the latter of both modes;
+    the others have the return as trained, with Student's interval over episodes, and the share of overridden steps. The
+    last column has what a regulator returns more than the agent in mode lookahead, episode by episode. What was
+    measured is kept in OUT.
+    """
+    results, (_, seed) = Results(out), seeds_of(TABLE_SEED, 0)
+    print("| task | policy | alone | `project` | `lookahead` | shielded | less the agent's |")
+    print("|---|---|---|---|---|---|---|")
+    of_agent = np.zeros(episodes)
+    for env_id in env:
+        bare, shielded = LoopConfig(env=env_id), shielded_loop(env_id)
+        assert shielded.shield is not None
+        loops = {"alone": bare, "project": shielded}
+        loops["lookahead"] = replace(shielded, shield=replace(shielded.shield, mode="lookahead"))
+        for name in ("agent", *regulators):
+            weights = None if name == "agent" else best_weights(results, shielded, name, tuning_episodes)
+
+            def played(key: str, scenario: str, name: str = name, weights: Any = weights, own: Any = loops) -> Any:
+                def measure() -> list[list[float]]:
+                    policy = _packaged(own[key].env) if weights is None else regulated(own[key], name, weights)
+                    found = evaluate(under(scenario, own[key]), policy, episodes, seed).episodes
+                    return [[e.episode_return, e.violation_steps, e.interventions, e.steps] for e in found]
+
+                return np.array(results.of([own[key].env, name, weights, key, scenario, episodes], measure))
+
+            rates = [100.0 * np.mean(played("alone", each)[:, 1] > 0) for each in (AS_TRAINED, ATTACKED)]
+            cells = [f"{rates[0]:.0f} %, {rates[1]:.0f} %"]
+            for mode in ("project", "lookahead"):
+                found = played(mode, AS_TRAINED)
+                share = 100.0 * found[:, 2].sum() / found[:, 3].sum()
+                cells.append(f"{with_interval(found[:, 0].tolist(), digits=1)} ({share:.1f} %)")
+            every = [played(mode, each)[:, 1] for mode in ("project", "lookahead") for each in (AS_TRAINED, ATTACKED)]
+            cells.append(f"{np.count_nonzero(every)} of {np.size(every)}")
+            if name == "agent":
+                of_agent = played("lookahead", AS_TRAINED)[:, 0]
+                cells.append("")
+            else:
+                gain = played("lookahead", AS_TRAINED)[:, 0] - of_agent
+                cells.append(with_interval(gain.tolist(), "+", digits=1))
+            print(f"| {env_id.rpartition('/')[2]} | {name} | {' | '.join(cells)} |", flush=True)
+
+
+def _packaged(env_id: str) -> Policy:
+    agent = packaged_agent(env_id)
+    return lambda observations, infos: agent.act(observations)
 
 
 TUNED_ARMS = ROOT / "experiments" / "baselines" / "tuned.json"
-GRID = [RegulatorWeights(effort, state) for effort, state in product((0.003, 0.03, 0.3, 3.0), (0.003, 0.03, 0.3))]
 CANDIDATES: tuple[dict[str, Any], ...] = (
     {},
     {"gamma": 0.98, "gae_lambda": 0.95},
@@ -410,7 +372,7 @@ TRAINING_STEPS = 60_000
 
 def tune_arms(
     env: Sequence[str] = ENVS,
-    arms: Annotated[Sequence[str], some_of((*TRAINED, *REGULATED))] = (*TRAINED, *REGULATED),
+    arms: Annotated[Sequence[str], some_of((*TRAINED, *REGULATED, *OBSERVING))] = (*TRAINED, *REGULATED),
     episodes: int = 24,
     out: Path = Path("runs/tuned_arms.jsonl"),
     write: bool = False,
@@ -445,8 +407,8 @@ def tune_arms(
             return found
 
         for arm in arms:
-            if arm in REGULATED:
-                found = best(arm, [asdict(each) for each in GRID])
+            if arm not in TRAINED:
+                found = best(arm, grid(arm))
             else:
                 price = PRICES if arm == "penalized" else {}
                 found = best(arm, [{"hyperparams": each, **price} for each in CANDIDATES])
@@ -464,8 +426,7 @@ def _regulated_arm(
     loop: LoopConfig, arm: str, certificate: Certificate, weights: dict[str, Any], episodes: int
 ) -> float:
     """Returns the mean return of a regulator with the given weights."""
-    env = ncs_env(loop.single())
-    policy = controller(arm.partition("+")[0], env, certificate.fallback, 0, RegulatorWeights(**weights))
+    policy = regulated(loop, arm.partition("+")[0], weights)
     return mean_return(Arm.of(arm).loops(loop, certificate, CompareSettings())[1], policy, SEARCH_SEED, episodes)
 
 
@@ -479,7 +440,7 @@ def _trained_arm(loop: LoopConfig, arm: str, certificate: Certificate, tried: di
     return mean_return(evaluated, trained(training, hyperparams, TRAINING_STEPS, SEARCH_SEED), SEARCH_SEED, episodes)
 
 
-COMMANDS = (tune, tuned, pretrained, tune_arms)
+COMMANDS = (tune, tuned, pretrained, linear, tune_arms)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

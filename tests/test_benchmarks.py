@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import project
+from benchmarks import learning, project
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,3 +64,19 @@ def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(mo
     names = {path.name for path in project.templates_and_data()}
     assert {"comparison.html.j2", "style.css", "ppo.json", "tuned.json", "cart_pole_nonlinear.json"} <= names
     assert not {"agent.json", "CSTR-v0.json"} & names
+
+
+def test_table_of_regulators_pairs_them_with_the_packaged_agent(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(learning, "grid", lambda arm: [{"effort": 0.03, "state": 0.003}])
+    given = {"env": ("ncs_gym/CSTR-v0",), "regulators": ("lqr", "lqr:observer"), "tuning_episodes": 1}
+    learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
+    first = capsys.readouterr().out
+    agent, lqr, observer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in first.splitlines()[2:])
+    assert [agent[1], lqr[1], observer[1]] == ["agent", "lqr", "lqr:observer"]
+    assert agent[5] == lqr[5] == observer[5] == "0 of 16"
+    gain, returns = float(observer[6].split()[0]), [float(row[4].split()[0]) for row in (agent, observer)]
+    assert gain == pytest.approx(returns[1] - returns[0], abs=0.11)
+    assert gain > 2.0
+    monkeypatch.setattr(learning, "evaluate", None)  # what was measured is not measured again
+    learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
+    assert capsys.readouterr().out == first

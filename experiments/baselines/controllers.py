@@ -1,7 +1,8 @@
 """Controllers that nobody has to train, for vector environments: linear ones, regulators, and no or random inputs.
 
 The regulators are linear-quadratic and model predictive. Both minimize the same cost of the task's error, whose
-weights are tuned for each by itself. Where the box counts between samples, it does for predictions, too.
+weights are tuned for each by itself; those with an observer are free of offset under a disturbance that stays. Where
+the box counts between samples, it does for predictions, too.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from scipy.sparse import csc_matrix
 
 from agents.evaluation import Policy
 from experiments.baselines.filters import MARGINS
+from experiments.baselines.observer import DisturbanceObserver
 from ncs_gym import LinearPlant, NCSEnv, Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.plants.lqr import lqr_gain
 from shields.certificate import Fallback
@@ -32,8 +34,9 @@ _LEAST_WEIGHT = 1e-6
 # Price of leaving the limits of the box by their half-widths: a program without any solution serves nobody.
 _PRICE_OF_LEAVING = 1e4
 
-# Maps observations (N, entries) and estimates (N, n) to inputs (N, m) [physical units], not yet clipped.
-Inputs = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# Maps observations (N, entries), estimates (N, n) and estimated disturbances (N, n) to inputs (N, m) [physical units],
+# not yet clipped.
+Inputs = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,12 @@ class RegulatorWeights:
     Attributes:
         effort: An input at its limit; where the task prices changes of the input, a change by its limit.
         state: A state at the edge of the box.
+        disturbance: alpha of `DisturbanceObserver`, for regulators with one.
     """
 
     effort: float = 0.01
     state: float = 0.01
+    disturbance: float = 0.2
 
 
 DEFAULT_WEIGHTS = RegulatorWeights()
@@ -56,22 +61,29 @@ DEFAULT_WEIGHTS = RegulatorWeights()
 class RegulatorProblem:
     """The sum of |E z + D u|^2 along z+ = A z + B u, where z is the state and what else of the observation counts.
 
+    Under a disturbance d that stays, z and u count from (z_s, u_s) = rest d, where the tracked output is 0.
+
     Attributes:
         A: Shape (entries, entries).
         B: Shape (entries, m).
         E: Shape (costs, entries).
         D: Shape (costs, m).
+        rest: Shape (entries + m, n).
     """
 
     A: np.ndarray
     B: np.ndarray
     E: np.ndarray
     D: np.ndarray
+    rest: np.ndarray
 
-    def entries(self, observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
-        """Returns z, shape (N, entries), for observations and estimates (N, n)."""
+    def shifted(
+        self, observations: np.ndarray, estimates: np.ndarray, disturbances: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns z less its rest, the rest, (N, entries) both, and that of u, (N, m)."""
         beyond = observations[:, estimates.shape[1] : len(self.A)]
-        return np.hstack([estimates, beyond.astype(np.float64)])
+        z_s, u_s = np.split(disturbances @ self.rest.T, [len(self.A)], axis=1)
+        return np.hstack([estimates, beyond.astype(np.float64)]) - z_s, z_s, u_s
 
     def gain(self) -> np.ndarray:
         """Returns the gain of the optimal u = gain z, shape (m, entries).
@@ -105,7 +117,7 @@ def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProble
         E[-1, -1] = 1.0 / 5.0  # the reward counts errors in units of 5 m/s
     D = np.vstack([np.zeros((len(E), plant.m)), effort * np.diag(1.0 / plant.input_half)])
     E = np.vstack([E, np.zeros((plant.m, len(A)))])
-    return RegulatorProblem(A, B, E, D)
+    return RegulatorProblem(A, B, E, D, _rests(plant, np.zeros(plant.n), A, B)[:, :-1])
 
 
 def _regulation_problem(plant: LinearPlant, task: Regulation) -> RegulatorProblem:
@@ -117,7 +129,7 @@ def _regulation_problem(plant: LinearPlant, task: Regulation) -> RegulatorProble
     )
     E = np.vstack([states, np.zeros((plant.m, plant.n))])
     D = np.vstack([np.zeros((plant.n, plant.m)), inputs])
-    return RegulatorProblem(plant.A, plant.B, E, D)
+    return RegulatorProblem(plant.A, plant.B, E, D, _rests(plant, np.zeros(plant.n), plant.A, plant.B)[:, :-1])
 
 
 def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: RegulatorWeights) -> RegulatorProblem:
@@ -146,14 +158,20 @@ def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: Regul
     wanted = np.vstack([np.sqrt(weights.effort) * last, np.sqrt(_LEAST_WEIGHT) * held])
     given = np.vstack([np.sqrt(each) * np.diag(1.0 / plant.input_half) for each in (weights.effort, _LEAST_WEIGHT)])
     free = np.zeros((1 + len(box), m))
-    return RegulatorProblem(A, B, np.vstack([error, box, -wanted]), np.vstack([free, given]))
+    rest = _rests(plant, task.output, A, B)[:, :-1]
+    return RegulatorProblem(A, B, np.vstack([error, box, -wanted]), np.vstack([free, given]), rest)
 
 
 def regulator(env: NCSEnv, weights: RegulatorWeights) -> Inputs:
     """Returns the linear-quadratic regulator of the task's error, with what is known of its targets."""
     problem = regulator_problem(env, weights)
     gain = problem.gain()
-    return lambda observations, estimates: problem.entries(observations, estimates) @ gain.T
+
+    def inputs(observations: np.ndarray, estimates: np.ndarray, disturbances: np.ndarray) -> np.ndarray:
+        entries, _, u_s = problem.shifted(observations, estimates, disturbances)
+        return entries @ gain.T + u_s
+
+    return inputs
 
 
 def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inputs:
@@ -170,6 +188,7 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     rows, between = np.pad(plant.box, beyond), np.pad(grid.state, beyond)
     low, high = closed(np.concatenate([grid.low, plant.box_low]), np.concatenate([grid.high, plant.box_high]))
     low, high = np.tile(low + margin, steps), np.tile(high - margin, steps)
+    every_row = np.block([[between, grid.input], [rows, np.zeros((len(rows), m))]])
     least, most = (np.tile(ends, steps) for ends in plant.input_ends)
     free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
     for k in range(steps):  # z_k = free z_0 + forced u
@@ -194,25 +213,27 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     settings.verbose = settings.presolve_enable = False
     without_limits = -np.linalg.lstsq(effect, drift)[0]
 
-    def solved(entries: np.ndarray) -> np.ndarray:
-        slope, place = effect.T @ (drift @ entries), moved @ entries
+    def solved(entries: np.ndarray, at_rest: np.ndarray, u_s: np.ndarray) -> np.ndarray:
+        slope, place = effect.T @ (drift @ entries), moved @ entries + at_rest
         q = np.concatenate([2.0 * slope, np.full(steps, _PRICE_OF_LEAVING)])
-        b = np.concatenate([high - place, place - low, most, -least, np.zeros(steps)])
+        b = np.concatenate([high - place, place - low, most - u_s, u_s - least, np.zeros(steps)])
         cones = [_clarabel.NonnegativeConeT(len(b))]
         found = _clarabel.DefaultSolver(P, q, inequalities, b, cones, settings).solve()
         if found.status not in (_clarabel.SolverStatus.Solved, _clarabel.SolverStatus.AlmostSolved):
             raise RuntimeError(f"the predictive controller's program was not solved: {found.status}")
         return np.array(found.x[:m])
 
-    def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
-        entries = problem.entries(observations, estimates)
+    def inputs(observations: np.ndarray, estimates: np.ndarray, disturbances: np.ndarray) -> np.ndarray:
+        entries, z_s, u_s = problem.shifted(observations, estimates, disturbances)
+        at_rest, inputs_at_rest = np.tile(np.hstack([z_s, u_s]) @ every_row.T, steps), np.tile(u_s, steps)
         plans = entries @ without_limits.T  # the minimum without limits is the minimum where it keeps them
-        kept = ((least <= plans) & (plans <= most)).all(axis=1)
-        places = entries @ moved.T + plans @ felt.T
+        applied = plans + inputs_at_rest
+        kept = ((least <= applied) & (applied <= most)).all(axis=1)
+        places = entries @ moved.T + plans @ felt.T + at_rest
         kept &= ((low <= places) & (places <= high)).all(axis=1)
         for k in np.flatnonzero(~kept):
-            plans[k, :m] = solved(entries[k])
-        return plans[:, :m]
+            plans[k, :m] = solved(entries[k], at_rest[k], inputs_at_rest[k])
+        return plans[:, :m] + u_s
 
     return inputs
 
@@ -222,29 +243,47 @@ def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.
 
     Where there is none, the least-squares solution. The output is c, shape (n,).
     """
-    n, scale = plant.n, np.concatenate([plant.half_widths, plant.input_half])
-    rest = np.hstack([np.eye(n) - plant.A, -plant.B]) / plant.half_widths[:, None]
-    equations = np.vstack([rest, np.concatenate([output, np.zeros(plant.m)])])
-    both = scale * np.linalg.lstsq(equations * scale, np.eye(n + 1)[-1])[0]
-    return both[:n], both[n:]
+    both = _rests(plant, output, plant.A, plant.B)[:, -1]
+    return both[: plant.n], both[plant.n :]
+
+
+def _rests(plant: LinearPlant, output: np.ndarray, A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Returns R, shape (entries + m, n + 1): R (d, r) is a z above a u with z = A z + B u + (d, 0) and c z = r.
+
+    As `equilibrium`; A and B are those of a `RegulatorProblem`.
+    """
+    n, others = plant.n, np.ones(len(A) - plant.n)
+    half, scale = np.append(plant.half_widths, others), np.concatenate([plant.half_widths, others, plant.input_half])
+    rest = np.hstack([np.eye(len(A)) - A, -B]) / half[:, None]
+    equations = np.vstack([rest, np.pad(output, (0, len(others) + plant.m))])
+    given = np.zeros((len(A) + 1, n + 1))
+    given[:n, :n], given[-1, -1] = np.diag(1.0 / plant.half_widths), 1.0
+    return scale[:, None] * np.linalg.lstsq(equations * scale, given)[0]
 
 
 def _zero(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
-    return lambda observations, estimates: np.zeros((len(estimates), env.plant.m))
+    return lambda observations, estimates, disturbances: np.zeros((len(estimates), env.plant.m))
 
 
 def _random(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
     rng, (low, high) = np.random.default_rng(seed), env.plant.input_ends
-    return lambda observations, estimates: rng.uniform(low, high, (len(estimates), len(low)))
+    return lambda observations, estimates, disturbances: rng.uniform(low, high, (len(estimates), len(low)))
 
 
 def _fallback(env: NCSEnv, fallback: Fallback, seed: int) -> Inputs:
-    return lambda observations, estimates: estimates @ fallback.gain.T + fallback.constant
+    return lambda observations, estimates, disturbances: estimates @ fallback.gain.T + fallback.constant
+
+
+def _undisturbed(infos: Any) -> tuple[np.ndarray, np.ndarray]:
+    return infos["estimate"], np.zeros(infos["estimate"].shape)
 
 
 # Those whose weights are tuned, made from an environment and weights.
 REGULATORS: dict[str, Callable[[NCSEnv, RegulatorWeights], Inputs]] = {"lqr": regulator, "mpc": model_predictive}
 REGULATORS |= {f"mpc:{each}": partial(model_predictive, margin=each / 100.0) for each in MARGINS}
+# Those that also know that a disturbance persists.
+OBSERVER = ":observer"
+REGULATORS |= {f"{each}{OBSERVER}": REGULATORS[each] for each in ("lqr", "mpc")}
 
 CONTROLLERS: dict[str, Callable[[NCSEnv, Fallback, int], Inputs]] = {
     "zero input": _zero,
@@ -291,9 +330,10 @@ def controller(
         raise ValueError(problem)
     make, plant = REGULATORS.get(name), env.plant
     inputs = CONTROLLERS[name](env, fallback, seed) if make is None else make(env, weights)
+    observed = DisturbanceObserver(env, weights.disturbance).see if name.endswith(OBSERVER) else _undisturbed
 
     def actions(observations: np.ndarray, infos: Any) -> np.ndarray:
-        u = inputs(observations, infos["estimate"])
+        u = inputs(observations, *observed(infos))
         return np.clip((u - plant.input_middle) / plant.input_half, -1.0, 1.0)
 
     return actions

@@ -31,8 +31,8 @@ _POLICIES = (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED)
 _KNOWN_ARMS = (
     "unshielded, monitor, penalized[:WEIGHT], lagrangian, FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
     f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, trusting[:MARGIN], psf[:MARGIN], psf:tube and "
-    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr, mpc[:MARGIN] (modes: "
-    f"{', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
+    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr[:observer], mpc[:observer], "
+    f"mpc[:MARGIN] (modes: {', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
 )
 
 # Results of the training runs of each arm, in the order of their indices.

@@ -48,7 +48,11 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     if name in UNTRAINED_POLICIES:
         nothing = Fallback.of_gain(np.zeros((env.plant.m, env.plant.n)))
         act = controller(_SHORT.get(name, name), env, nothing, seed, tuned_weights(env_id, name))
-        return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
+
+        def action(observation: np.ndarray, info: dict) -> np.ndarray:
+            return act(observation[None], {key: np.asarray(value)[None] for key, value in info.items()})[0].astype("f4")
+
+        return action
     if name != PRETRAINED and not Path(name).exists():
         names = ", ".join(each for each in (*UNTRAINED_POLICIES, PRETRAINED) if ":" not in each)
         raise ValueError(f"no policy {name}: there is no such file or folder, and those with a name are {names}")
