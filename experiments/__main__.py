@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
+    "bounds": ("BoundsSettings", "experiments.commands.bounds:bounds", {}),
     "channel": ("ChannelSettings", "experiments.commands.channel:channel", {}),
     "requirements": ("RequirementsSettings", "experiments.commands.requirements:requirements", {}),
     "attack": ("AttackSettings", "experiments.commands.attack:attack", {}),
