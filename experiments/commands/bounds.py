@@ -54,6 +54,8 @@ def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray
         for row in table_rows(read_file(path, LARGEST_LOG), chosen, forms):
             rows.append(row)
             require_packets(len(rows))
+        if not rows:
+            raise ValueError(f"it has no rows; {forms}")
     except OSError as error:
         raise ValueError(f"cannot read the record in {shown(path)}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -61,7 +63,7 @@ def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray
     except ValueError as error:
         raise ValueError(f"{shown(path)}: {error}") from None
     table, m = np.reshape(rows, (-1, len(wanted))), len(inputs)
-    ends_open = len(table) > 0 and bool(np.isnan(table[-1, :m]).all())
+    ends_open = bool(np.isnan(table[-1, :m]).all())
     acted, measured = table[: len(table) - ends_open, :m], table[:, m:]
     for numbers, names in ((acted, inputs), (measured, outputs)):
         if np.isnan(numbers).any():

@@ -249,6 +249,7 @@ class BoundsSettings:
         sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.
         estimate_sensor: Seek them in the record, too.
         out: File for the numbers (JSON).
+        seed: Not used, since nothing is drawn; every command takes it.
     """
 
     file: tyro.conf.Positional[Path]
@@ -257,6 +258,7 @@ class BoundsSettings:
     sensor: tuple[float, ...] = ()
     estimate_sensor: bool = False
     out: Path | None = None
+    seed: int = 0
 
     def __post_init__(self) -> None:
         _refuse_both(self.env, self.plant)

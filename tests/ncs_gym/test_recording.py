@@ -167,8 +167,8 @@ def test_records_are_in_the_units_of_the_model_and_inputs_act_after_its_delays()
     plain, phi = servo(np.eye(2)), 1e-4
     u, y, _ = driven(plain, 60, 0.01, phi)
     there = replace(plain, at=([3.0, -1.0], [5.0])).with_delays(2)
-    late = np.vstack([u, np.zeros((2, 1))])
-    moved = bounds_from_recording(there, late + 5.0, np.vstack([np.zeros((2, 2)), y]) + [3.0, -1.0], sensor=phi)
+    late, shifted = np.vstack([u, np.zeros((2, 1))]) + 5.0, np.vstack([np.zeros((2, 2)), y]) + np.array([3.0, -1.0])
+    moved = bounds_from_recording(there, late, shifted, sensor=phi)
     found = bounds_from_recording(plain, u, y, sensor=phi)
     assert moved.steps == found.steps == 60
     assert moved.upper == pytest.approx(found.upper)
@@ -194,7 +194,7 @@ def test_bounds_of_a_factor_make_a_plant():
     assert found.outputs == ("angle", "rate")
     assert LinearPlant(model, Limits(state=[1, 2], input=2), bounds, labels).n == 2
     assert max(map(len, str(found).splitlines())) <= 80
-    with pytest.raises(ValueError, match="factor must be a number >= 1, got 0.5"):
+    with pytest.raises(ValueError, match=r"factor must be a number >= 1, got 0\.5"):
         found.bounds(0.5)
     with pytest.raises(ValueError, match='of must be "upper" or "explaining"'):
         found.bounds(2, of="lower")

@@ -63,7 +63,7 @@ def test_sensors_are_given_or_sought(files):
         ("force,position,y2\n0,1,2\n,1,2\n0,1,1\n", "row 2 has no 'force'"),
         ("force,position,y2\n0,1,one\n", "line 2: 'one' is no number; a record has the columns"),
         ("force,position,y2\n0,1\n", "line 2 has not 3 cells"),
-        ("force,position,y2\n", "the record is too short"),
+        ("force,position,y2\n", "it has no rows; a record has the columns"),
         ("force,position,y2\n0,1,2\n", "the record is too short: it has 0 steps, 20 are needed"),
         ("\xff", "it is no text in UTF-8"),
     ],

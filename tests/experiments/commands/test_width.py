@@ -81,6 +81,11 @@ class Shown:
         record = self.request.getfixturevalue("record")
         return printed("channel", record(0.02 * np.arange(500), delay=0.01, loss=0.2), "--env", "ncs_gym/CartPole-v0")
 
+    def bounds(self):
+        rows = ["u1,x1", *(f"0,{0.01 * (-1) ** k}" for k in range(40))]
+        (self.folder / "record.csv").write_text("\n".join(rows))
+        return printed("bounds", self.folder / "record.csv", "--plant", self.plant)
+
     def requirements(self):
         columns = (1e-4 * k for k in range(12))
         return printed("requirements", "--plant", self.plant, "--ages", 0, "--resolutions", *columns)
