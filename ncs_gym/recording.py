@@ -147,7 +147,7 @@ class RecordedBounds(ReadOnlyArrays):
         return "\n".join([*lines, *(fill(each, 80) for each in self._sentences())])
 
     def _sentences(self) -> list[str]:
-        ends = f" at least {counted(self.window, 'step')} from its ends" if self.window > 1 else ""
+        ends = f", unless one did within {counted(self.window, 'step')} of its ends" if self.window > 1 else ""
         most, run = 100.0 * self.left.max(), counted(int(self.longest.max()), "step")
         sentences = [
             'If the model is right, this record proves that disturbances as large as "at least" occurred, and none '
@@ -175,7 +175,7 @@ def bounds_from_recording(
     weights: Any = None,
     labels: Mapping[str, Any] | None = None,
 ) -> RecordedBounds:
-    """Returns half-widths of x+ = A x + B u + E s, y = H x + v that a recording proves (theory: set membership).
+    """Returns half-widths of s and v in x+ = A x + B u + E s, y = H x + v that a recording proves.
 
     - `explaining` minimizes the weighted sum of max |s_i| over all s, v and first states that fit every sample, a
       sparse linear program; `lower` minimizes each max |s_i| alone.
@@ -183,9 +183,9 @@ def bounds_from_recording(
       s_i + l v + c s, so that |s_i| <= |l y| + |l| |v| + |c| |s| at the largest one.
 
     Args:
-        model: The equations. An input of its delays ago is what acts.
-        inputs: What acted in step k, shape (N, m), in the model's own units, as are outputs.
-        outputs: Sampled before it, shape (N + 1, p), or (N, p), where the last input is not used.
+        model: The equations.
+        inputs: Of each step, shape (N, m), in the model's own units as the outputs; they act after its delays.
+        outputs: Sampled before the input, shape (N + 1, p), or (N, p), where the last input is not used.
         E: Directions of the disturbance, shape (n, q); the identity if None.
         sensor: Half-widths of sensor noise, a number or shape (p,), as of a data sheet; None to have them estimated.
         weights: Of the half-widths in `explaining`, shape (q,), or (q + p,) if those of sensors are sought, too; by
@@ -202,7 +202,7 @@ def bounds_from_recording(
     u, y = as_matrix(inputs, (None, m), "inputs") - model.input, as_matrix(outputs, (None, p), "outputs")
     if len(y) - len(u) not in (0, 1):
         raise ValueError(f"outputs must have as many rows as inputs, or one more, got {len(y):,} and {len(u):,}")
-    y, u = (y - H @ model.state)[model.delays :], u[: len(y) - 1 - model.delays]
+    y, u = (y - H @ model.state)[model.delays :], u[: max(len(y) - 1 - model.delays, 0)]
     is_identity, E = E is None, np.eye(n) if E is None else as_matrix(E, (n, None), "E")
     if not np.abs(E).max(axis=0).all():
         raise ValueError("every direction of E must move a state, one is zero")
@@ -348,39 +348,27 @@ class _Record:
         through = (self.of_disturbance(nu) * self.s_unit / flat[:, None, None]).reshape(-1, nu * q)
         equal, told = [], []
         for seen, times in ((predict, len(data)), (beside, 1)):
-            moved = np.split(seen, nu + 1, axis=1), np.split(seen @ through, nu, axis=1)
-            equal.append(
-                hstack(
-                    [
-                        sum(kron(eye_array(times, size, k=j), csr_array(each)) for j, each in enumerate(blocks))
-                        for blocks, size in zip(moved, (N + 1, N), strict=True)
-                    ]
-                )
-            )
+            of_noise = _shifted(np.split(seen, nu + 1, axis=1), times, N + 1)
+            equal.append(hstack([of_noise, _shifted(np.split(seen @ through, nu, axis=1), times, N)]))
             told.append((data[:times] @ seen.T).ravel())
-        free, noise = len(kept) + p, eye_array((N + 1) * p)
+        equal, size, free = vstack(equal), (N + 1) * p + N * q, len(kept) + p
         some, half = kron(eye_array(N), csr_array(np.eye(q)[kept])), kron(np.ones((N, 1)), eye_array(len(kept)))
-        loud, size = kron(np.ones((N + 1, 1)), eye_array(p)), (N + 1) * p + N * q
-        equal = vstack(equal)
-        A_ub = [
-            [None, some, -half, None],
-            [None, -some, -half, None],
-            [noise, None, None, -loud],
-            [-noise, None, None, -loud],
-        ]
+        noise, loud = eye_array((N + 1) * p), kron(np.ones((N + 1, 1)), eye_array(p))
+        within = [[None, some, -half, None], [None, -some, -half, None]]
+        within += [[noise, None, None, -loud], [-noise, None, None, -loud]]
+        ends = [(0.0, None)] * p if phi is None else [(each, each) for each in phi / self.y_unit]
         program = {
             "c": np.concatenate([np.zeros(size), cost, np.zeros(free - len(cost))]),
-            "A_ub": block_array(A_ub, format="csr"),
+            "A_ub": block_array(within, format="csr"),
             "b_ub": np.zeros(2 * (N * len(kept) + (N + 1) * p)),
             "A_eq": hstack([equal, csr_array((equal.shape[0], free))], format="csr"),
             "b_eq": np.concatenate(told),
-            "bounds": [(None, None)] * size + [(0.0, None)] * len(kept)
-            + ([(0.0, None)] * p if phi is None else [(each, each) for each in phi / self.y_unit]),
-        }  # fmt: skip
+            "bounds": [(None, None)] * size + [(0.0, None)] * len(kept) + ends,
+        }
         for method in ("highs-ipm", "highs-ds"):
-            found = linprog(**program, method=method)
+            found: Any = linprog(**program, method=method)
             if found.status == 0:
-                return np.asarray(found.x)[size : size + len(cost)]
+                return found.x[size : size + len(cost)]
             if found.status == 2:
                 raise ValueError(
                     "no disturbance along E and no sensor noise within its half-widths explain the record: give more "
@@ -416,25 +404,25 @@ class _Record:
         weight = np.tile(np.where(np.arange(q) == i, same, others) * self.s_unit, W) / self.s_unit[i]
         own = W // 2 * q + i
         weight[own] = 0.0
-        # l in units s_unit[i] / y_unit, and bounds of the sizes of l and of what it lets through.
-        unit = self.s_unit[i] / np.tile(self.y_unit, W + 1)
-        state, through = self.of_state(W).T * unit, self.of_disturbance(W).reshape(-1, W * q).T * unit
-        state = state / np.maximum(np.abs(state).max(axis=1, keepdims=True), 1e-300)
-        R, S = len(unit), W * q
-        zero = np.zeros
+        # l = z @ beside in units s_unit[i] / y_unit; with z come bounds of the sizes of l and of what it lets through.
+        flat = np.tile(self.y_unit, W + 1)
+        beside = _beside(self.of_state(W) / flat[:, None])
+        through = (beside / flat @ self.of_disturbance(W).reshape(len(flat), -1)).T * self.s_unit[i]
+        size = np.concatenate([beside.T, through])
+        bounds = np.eye(len(size))
         found = linprog(
-            np.concatenate([zero(R), noise * unit / self.s_unit[i], weight]),
-            A_eq=np.block([[state, zero((len(state), R + S))], [through[own], zero(R + S)]]),
-            b_eq=np.append(zero(len(state)), 1.0),
-            A_ub=np.block([[np.eye(R), -np.eye(R), zero((R, S))], [-np.eye(R), -np.eye(R), zero((R, S))],
-                           [through, zero((S, R)), -np.eye(S)], [-through, zero((S, R)), -np.eye(S)]]),
-            b_ub=zero(2 * (R + S)),
-            bounds=[(None, None)] * R + [(0.0, None)] * (R + S),
+            np.concatenate([np.zeros(len(beside)), noise / flat, weight]),
+            A_eq=[[*through[own], *np.zeros(len(size))]],
+            b_eq=[1.0],
+            A_ub=np.block([[size, -bounds], [-size, -bounds]]),
+            b_ub=np.zeros(2 * len(size)),
+            bounds=(None, None),
             method="highs",
-        )  # fmt: skip
+        )
         if found.status != 0:
             raise ValueError(f"direction {i + 1} of E is not told by the outputs: {found.message}")
-        return found.x[:R] * unit
+        z = found.x[: len(beside)]
+        return z / (z @ through[own]) @ beside * self.s_unit[i] / flat
 
     def growths(self, found: np.ndarray, noise: np.ndarray, phi: np.ndarray) -> list[tuple[float, float, int]]:
         """Returns for each direction t, change and number of the output or input whose size it grows with the most.
@@ -464,6 +452,13 @@ def _slope(values: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
 
 def _rank(of_state: np.ndarray) -> int:
     return int(np.linalg.matrix_rank(of_state / np.maximum(np.abs(of_state).max(axis=0), 1e-300), rtol=_RANK_PRECISION))
+
+
+def _shifted(blocks: list[np.ndarray], rows: int, columns: int) -> Any:
+    """Returns the sparse matrix of block rows, each of which has these blocks one further to the right."""
+    from scipy.sparse import csr_array, eye_array, kron
+
+    return sum(kron(eye_array(rows, columns, k=j), csr_array(each)) for j, each in enumerate(blocks))
 
 
 def _beside(of_state: np.ndarray) -> np.ndarray:

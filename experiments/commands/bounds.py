@@ -21,7 +21,7 @@ from shields.atomic_write import write_atomically
 def bounds(settings: BoundsSettings) -> None:
     """Runs `ncs bounds`."""
     require_place(settings.out)
-    plant = registered_env(settings.env).plant if settings.plant is None else LinearPlant.load(settings.plant)
+    plant = LinearPlant.load(settings.plant) if settings.plant else registered_env(settings.env or "").plant
     n = len(plant.model.A)
     outputs = output_names(plant.model.H, plant.state_names[:n])
     inputs, measured = _read(settings.file, [*plant.input_names], outputs)

@@ -83,17 +83,26 @@ def test_bounds_are_those_of_a_dense_program_and_of_the_corners_of_the_noise():
     assert found.upper == pytest.approx(np.max(largest, axis=0), rel=1e-5)
 
 
-@pytest.mark.parametrize("E", [None, [[0.005], [0.1]]])
-def test_sensors_are_weighed_too_where_nothing_is_known_of_them_as_in_a_dense_program(E):
-    model, w = servo(), np.array([1.0, 2.0, 5.0] if E is None else [1.0, 5.0])
-    u, y, _ = driven(model, 40, 0.02, 0.002, E=np.array([[0.005], [0.1]]))
+MOTOR = Model.sampled([[0, 1, 0], [-20, -2, 10], [0, -1, -20]], [[0], [0], [20]], [[1, 0, 0], [0, 0, 1]], 0.02)
+HELD = np.array([[0.005], [0.1]])
+
+
+@pytest.mark.parametrize(
+    ("model", "E"),
+    [(servo(), None), (servo(), HELD), (servo([[1, 0], [0, 1], [1, 1]]), HELD), (MOTOR, MOTOR.B), (MOTOR, None)],
+)
+def test_sensors_are_weighed_too_where_nothing_is_known_of_them_as_in_a_dense_program(model, E):
+    q, p = 1 if E is not None else len(model.A), len(model.H)
+    w = np.arange(1.0, 1.0 + q + p)
+    u, y, _ = driven(model, 40, np.full(q, 0.02), 0.002, E=E)
     found = bounds_from_recording(model, u, y, E, weights=w)
     theta, noise, told = oracle(model, u, y, E)
     phi = cp.max(cp.abs(noise), axis=0)
-    least = cp.Problem(cp.Minimize(w[:-1] @ theta + w[-1:] @ phi), told).solve()
+    least = cp.Problem(cp.Minimize(w[:q] @ theta + w[q:] @ phi), told).solve()
     assert w @ [*found.explaining, *found.sensor] == pytest.approx(least, rel=1e-3)
     assert not found.is_sensor_known
-    assert found.bounds(1.5, of="explaining", first_error=1).sensor.half == pytest.approx(1.5 * found.sensor)
+    bounds = found.bounds(1.5, of="explaining", first_error=1)
+    assert bounds.sensor.half == pytest.approx(1.5 * found.sensor)
 
 
 def oracle(model, u, y, E=None):
@@ -114,7 +123,7 @@ def test_outputs_alone_bound_disturbances_along_few_directions():
     assert (found.lower <= np.abs(s).max(axis=0)).all()
     assert (inner <= found.upper).all()
     assert np.isfinite(found.upper).all()
-    assert "steps from its ends" in " ".join(str(found).split())
+    assert "unless one did within 7 steps of its ends." in " ".join(str(found).split())
 
 
 def test_outputs_that_do_not_tell_a_direction_leave_no_upper_bound_of_it():
@@ -213,6 +222,7 @@ U, Y = np.zeros((30, 1)), np.random.default_rng(0).uniform(-1e-3, 1e-3, (31, 2))
         ({"outputs": Y[:, :1]}, r"outputs must have shape \(any, 2\)"),
         ({"inputs": U[:19], "outputs": Y[:20]}, "the record is too short: it has 19 steps, 20 are needed"),
         ({"inputs": U[:1], "outputs": Y[:1]}, "the record is too short: it has 0 steps, 20 are needed"),
+        ({"model": servo(np.eye(2)).with_delays(40)}, "the record is too short: it has 0 steps"),
         ({"E": [[1.0]]}, r"E must have shape \(2, any\)"),
         ({"E": [[1.0, 0.0], [0.0, 0.0]]}, "every direction of E must move a state, one is zero"),
         ({"sensor": -1.0}, r"sensor must be half-widths, a number or shape \(2,\), got -1.0"),
