@@ -40,6 +40,7 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
     "export-c": ("ExportCSettings", "experiments.commands.export_c:export_c_files", {}),
+    "bounds": ("BoundsSettings", "experiments.commands.bounds:bounds", {}),
     "channel": ("ChannelSettings", "experiments.commands.channel:channel", {}),
     "requirements": ("RequirementsSettings", "experiments.commands.requirements:requirements", {}),
     "attack": ("AttackSettings", "experiments.commands.attack:attack", {}),

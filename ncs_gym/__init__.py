@@ -30,6 +30,7 @@ from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FamilyProcess, FunctionProcess, GymProcess, LinearProcess, Process, linear_model
 from ncs_gym.processes.linearization import NoEquilibriumWarning
+from ncs_gym.recording import RecordedBounds, bounds_from_recording
 from ncs_gym.registration import register_all, register_plant
 from ncs_gym.rendering import Annotation
 from ncs_gym.tasks.base_task import Task
@@ -93,6 +94,7 @@ __all__ = [
     "PacketLog",
     "Process",
     "RandomChannel",
+    "RecordedBounds",
     "Regulation",
     "Remainder",
     "RequestActions",
@@ -111,6 +113,7 @@ __all__ = [
     "VectorRequestActions",
     "batch_reactor",
     "bound_violation_probability",
+    "bounds_from_recording",
     "cart_pole",
     "certified_error_set",
     "contract_of",

@@ -4,6 +4,7 @@ from experiments.settings.arguments import Assignments
 from experiments.settings.certificates import (
     AttackSettings,
     AuditSettings,
+    BoundsSettings,
     ChannelSettings,
     ExportCSettings,
     RenderSettings,
@@ -27,6 +28,7 @@ __all__ = [
     "AttackSettings",
     "AuditSettings",
     "BackendSettings",
+    "BoundsSettings",
     "ChannelSettings",
     "CompareSettings",
     "EvaluateSettings",

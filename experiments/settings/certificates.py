@@ -256,6 +256,39 @@ class ChannelSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BoundsSettings:
+    """Reads a record of a plant, and says what bounds of its disturbances the record proves, and what it does not.
+
+    Attributes:
+        file: A table (CSV, or Parquet where pyarrow is installed) with the plant's inputs and outputs by name as
+            columns and a row per step: outputs as sampled, then the input that acted, which may be empty in the last
+            row. An output that is not a state is y1, y2, ... by its number. Further columns are not read.
+        env: Id of an environment with the plant, or module:id, which first imports the module.
+        plant: File of the plant (`LinearPlant.save`), in place of an environment's. Its disturbance says along which
+            directions to seek: E of Through(E, ...), else every state.
+        sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.
+        estimate_sensor: Seek them in the record, too.
+        out: File for the numbers (JSON).
+        seed: Not used, since nothing is drawn; every command takes it.
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    plant: Path | None = None
+    sensor: tuple[float, ...] = ()
+    estimate_sensor: bool = False
+    out: Path | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _refuse_both(self.env, self.plant)
+        if self.env is None and self.plant is None:
+            raise ValueError("give the plant of the record: --plant FILE or --env ID")
+        if self.sensor and self.estimate_sensor:
+            raise ValueError("give either --sensor or --estimate-sensor, not both")
+
+
+@dataclass(frozen=True, kw_only=True)
 class RenderSettings:
     """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
 

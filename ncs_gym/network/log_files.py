@@ -10,7 +10,7 @@ import io
 import os
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,37 +76,49 @@ def read_record(path: str | os.PathLike[str]) -> Record:
     except OSError as error:
         raise ValueError(f"cannot read packets from {shown(path)}: {error.strerror or error}") from error
     try:
-        if content.startswith(b"PAR1"):
-            return _of_table(_parquet_rows(content))
         if content.startswith(b"PING "):
             return _of_ping(content.decode().replace("\r\n", "\n"))
-        return _of_table(_csv_rows(io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")))
+        return _of_table(table_rows(content, _chosen, _FORMS))
     except UnicodeDecodeError as error:
         raise ValueError(f"{shown(path)}: it is no text in UTF-8; {_FORMS}") from error
     except ValueError as error:
         raise ValueError(f"{shown(path)}: {error}") from None
 
 
-def _csv_rows(file: io.TextIOBase) -> Iterable[tuple[float, float]]:
-    """Yields the times of each row, NaN for an empty one."""
+def table_rows(content: bytes, chosen: Callable[[list[str]], list[str]], forms: str) -> Iterable[tuple[float, ...]]:
+    """Returns the numbers of some columns of a table, CSV or Parquet, by rows; NaN for an empty cell.
+
+    Args:
+        content: Of the file.
+        chosen: Returns the columns that are read, given the names of all; raises ValueError if they are not there.
+        forms: What tables may be like, for messages.
+
+    Raises:
+        ValueError: If it is no such table, as the rows are read.
+        UnicodeDecodeError: If it is no text in UTF-8.
+    """
+    if content.startswith(b"PAR1"):
+        return _parquet_rows(content, chosen, forms)
+    return _csv_rows(io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline=""), chosen, forms)
+
+
+def _csv_rows(file: io.TextIOBase, chosen: Callable[[list[str]], list[str]], forms: str) -> Iterable[tuple[float, ...]]:
     rows = csv.reader(file, strict=True)
     try:
         names = next(rows, [])
-        _require_names(names)
+        columns = [names.index(each) for each in chosen(names)]
         for cells in rows:
-            if len(cells) != 2:
-                raise ValueError(f"line {rows.line_num} has not two cells; {_FORMS}")
-            for cell in cells:
+            if len(cells) != len(names):
+                raise ValueError(f"line {rows.line_num} has not {len(names)} cells; {forms}")
+            for cell in (cells[each] for each in columns):
                 if cell and not _NUMBER.fullmatch(cell):
-                    raise ValueError(f"line {rows.line_num}: {shown(cell)} is no time in seconds; {_FORMS}")
-            times = dict(zip(names, (float(cell or "nan") for cell in cells), strict=True))
-            yield times["sent"], times["received"]
+                    raise ValueError(f"line {rows.line_num}: {shown(cell)} is no number; {forms}")
+            yield tuple(float(cells[each] or "nan") for each in columns)
     except csv.Error as error:
-        raise ValueError(f"line {rows.line_num} is not of a CSV file ({reason_of(error)}); {_FORMS}") from error
+        raise ValueError(f"line {rows.line_num} is not of a CSV file ({reason_of(error)}); {forms}") from error
 
 
-def _parquet_rows(content: bytes) -> Iterable[tuple[float, float]]:
-    """Returns the times of each row, NaN for an empty one."""
+def _parquet_rows(content: bytes, chosen: Callable[[list[str]], list[str]], forms: str) -> Iterable[tuple[float, ...]]:
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -114,24 +126,25 @@ def _parquet_rows(content: bytes) -> Iterable[tuple[float, float]]:
         raise ValueError("a Parquet table is read with pyarrow: install it, or write the table as CSV") from None
     try:
         file = pq.ParquetFile(io.BytesIO(content))
-        _require_names(file.schema_arrow.names)
+        names = chosen(file.schema_arrow.names)
         require_packets(file.metadata.num_rows)
-        if any(kind not in (pa.float64(), pa.int64()) for kind in file.schema_arrow.types):
-            raise ValueError(f"its columns are not numbers of 64 bits; {_FORMS}")
-        columns: Any = file.read()
-        times = [columns[name].cast(pa.float64()).fill_null(float("nan")).to_numpy() for name in ("sent", "received")]
+        if any(file.schema_arrow.field(name).type not in (pa.float64(), pa.int64()) for name in names):
+            raise ValueError(f"its columns are not numbers of 64 bits; {forms}")
+        columns: Any = file.read(columns=names)
+        found = [columns[name].cast(pa.float64()).fill_null(float("nan")).to_numpy() for name in names]
     except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"it is no Parquet table ({reason_of(error)}); {_FORMS}") from error
-    return zip(*(each.tolist() for each in times), strict=True)
+        raise ValueError(f"it is no Parquet table ({reason_of(error)}); {forms}") from error
+    return zip(*(each.tolist() for each in found), strict=True)
 
 
-def _require_names(names: list[str]) -> None:
-    """Raises ValueError unless a table has both columns and no other."""
+def _chosen(names: list[str]) -> list[str]:
+    """Returns sent and received; raises ValueError unless a table has both columns and no other."""
     if sorted(names) != _NAMES:
         raise ValueError(f"its first line or its columns are {shown(names)}; {_FORMS}")
+    return ["sent", "received"]
 
 
-def _of_table(rows: Iterable[tuple[float, float]]) -> Record:
+def _of_table(rows: Iterable[tuple[float, ...]]) -> Record:
     """Returns the packets of a table, whose rows are in the order of sending.
 
     A packet without a row is not seen, as in a log of the receiver, which has none of what was lost.

@@ -1,0 +1,74 @@
+"""`ncs bounds`: half-widths of disturbances and sensor noise that a record of a plant proves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from experiments.runs.loops import registered_env
+from experiments.runs.output_folder import require_place
+from experiments.settings import BoundsSettings
+from ncs_gym import LinearPlant, Through, bounds_from_recording
+from ncs_gym.network.log_files import table_rows
+from ncs_gym.reading import LARGEST_LOG, read_file, require_packets
+from ncs_gym.recording import output_names
+from ncs_gym.validation import shown
+from shields.atomic_write import write_atomically
+
+
+def bounds(settings: BoundsSettings) -> None:
+    """Runs `ncs bounds`."""
+    require_place(settings.out)
+    plant = LinearPlant.load(settings.plant) if settings.plant else registered_env(settings.env or "").plant
+    n = len(plant.model.A)
+    outputs = output_names(plant.model.H, plant.state_names[:n])
+    inputs, measured = _read(settings.file, [*plant.input_names], outputs)
+    parts = plant.bounds.disturbance.parts
+    E = np.hstack([each.E for each in parts]) if all(isinstance(each, Through) for each in parts) else None
+    noise = plant.bounds.sized(n, plant.p).sensor.support(np.eye(plant.p)) if not settings.sensor else settings.sensor
+    labels = {"states": dict.fromkeys(plant.state_names[:n]), "inputs": dict.fromkeys(plant.input_names)}
+    found = bounds_from_recording(
+        plant.model, inputs, measured, E, None if settings.estimate_sensor else noise, labels=labels
+    )
+    print(found)
+    if settings.out is not None:
+        document = {"plant": plant.fingerprint} | found.document
+        write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
+
+
+def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the inputs, shape (N, m), and the outputs, (N, p) or (N + 1, p), of a table with these columns."""
+    wanted = [*inputs, *outputs]
+    forms = f"a record has the columns {', '.join(wanted)} of numbers, and a row for each step"
+
+    def chosen(names: list[str]) -> list[str]:
+        for each in wanted:
+            if names.count(each) != 1:
+                raise ValueError(f"it has {names.count(each)} columns {shown(each)}; {forms}")
+        return wanted
+
+    try:
+        rows = []
+        for row in table_rows(read_file(path, LARGEST_LOG), chosen, forms):
+            rows.append(row)
+            require_packets(len(rows))
+        if not rows:
+            raise ValueError(f"it has no rows; {forms}")
+    except OSError as error:
+        raise ValueError(f"cannot read the record in {shown(path)}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{shown(path)}: it is no text in UTF-8; {forms}") from error
+    except ValueError as error:
+        raise ValueError(f"{shown(path)}: {error}") from None
+    table, m = np.reshape(rows, (-1, len(wanted))), len(inputs)
+    ends_open = bool(np.isnan(table[-1, :m]).all())
+    acted, measured = table[: len(table) - ends_open, :m], table[:, m:]
+    for numbers, names in ((acted, inputs), (measured, outputs)):
+        if np.isnan(numbers).any():
+            row, column = np.argwhere(np.isnan(numbers))[0]
+            raise ValueError(
+                f"{shown(path)}: row {row + 1} has no {shown(names[column])}; give a part of the record without gaps"
+            )
+    return acted, measured
