@@ -239,7 +239,7 @@ def bounds_from_recording(
         longest=np.array([_longest_run(each) for each in may_leave.T]),
         grows=tuple(
             Growth(name, signals[j], change, t)
-            for name, (t, change, j) in zip(directions, record.growths(found, noise, phi), strict=True)
+            for name, (t, change, j) in zip(directions, record.growths(found, noise), strict=True)
             if t > _LEAST_T and change > _LEAST_GROWTH
         ),
         first_error=np.abs(one) @ phi if record.window == 1 else np.full(n, np.inf),
@@ -351,7 +351,7 @@ class _Record:
             of_noise = _shifted(np.split(seen, nu + 1, axis=1), times, N + 1)
             equal.append(hstack([of_noise, _shifted(np.split(seen @ through, nu, axis=1), times, N)]))
             told.append((data[:times] @ seen.T).ravel())
-        equal, size, free = vstack(equal), (N + 1) * p + N * q, len(kept) + p
+        equal, told, size, free = vstack(equal), np.concatenate(told), (N + 1) * p + N * q, len(kept) + p
         some, half = kron(eye_array(N), csr_array(np.eye(q)[kept])), kron(np.ones((N, 1)), eye_array(len(kept)))
         noise, loud = eye_array((N + 1) * p), kron(np.ones((N + 1, 1)), eye_array(p))
         within = [[None, some, -half, None], [None, -some, -half, None]]
@@ -361,8 +361,8 @@ class _Record:
             "c": np.concatenate([np.zeros(size), cost, np.zeros(free - len(cost))]),
             "A_ub": block_array(within, format="csr"),
             "b_ub": np.zeros(2 * (N * len(kept) + (N + 1) * p)),
-            "A_eq": hstack([equal, csr_array((equal.shape[0], free))], format="csr"),
-            "b_eq": np.concatenate(told),
+            "A_eq": hstack([equal, csr_array((len(told), free))], format="csr"),
+            "b_eq": told,
             "bounds": [(None, None)] * size + [(0.0, None)] * len(kept) + ends,
         }
         for method in ("highs-ipm", "highs-ds"):
@@ -424,13 +424,13 @@ class _Record:
         z = found.x[: len(beside)]
         return z / (z @ through[own]) @ beside * self.s_unit[i] / flat
 
-    def growths(self, found: np.ndarray, noise: np.ndarray, phi: np.ndarray) -> list[tuple[float, float, int]]:
+    def growths(self, found: np.ndarray, noise: np.ndarray) -> list[tuple[float, float, int]]:
         """Returns for each direction t, change and number of the output or input whose size it grows with the most.
 
-        What noise may have done to a disturbance or to an output does not count.
+        What noise may have done to a disturbance does not count.
         """
         seen = slice(self.window // 2, self.window // 2 + len(found))
-        sizes = np.concatenate([np.maximum(np.abs(self.y[seen]) - phi, 0.0), np.abs(self.u[seen])], axis=1)
+        sizes = np.concatenate([np.abs(self.y[seen]), np.abs(self.u[seen])], axis=1)
         certain = np.maximum(np.abs(found) - noise, 0.0)
         return [max((*_slope(each, size), j) for j, size in enumerate(sizes.T)) for each in certain.T]
 

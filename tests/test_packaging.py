@@ -29,7 +29,7 @@ MODULES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*
 LAYERS = {
     "ncs_gym": (
         {"exact", "installation", "reading", "shared", "validation"},
-        {"uncertainty", "plants", "model", "limits", "bounds"},
+        {"uncertainty", "plants", "model", "limits", "bounds", "recording"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
         {"envs"},
