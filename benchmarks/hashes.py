@@ -22,6 +22,7 @@ from gymnasium.vector import AutoresetMode
 
 from benchmarks.commands import run
 from ncs_gym import NCSEnv, Packet
+from ncs_gym.envs.env import ncs_env
 from shields import SafeLoop, SafetyShield, VectorSafetyShield, certificate_for
 
 STEPS, COUNT = 300, 5
@@ -60,7 +61,7 @@ def hashes(names: Names = ()) -> Iterator[tuple[str, str, str]]:
         if has_certificate(name):
             for mode in MODES:
                 yield name, mode, episodes_hash(SafetyShield(gym.make(name), mode=mode, on_unproved="ignore"))
-            yield name, "loop", loop_hash(gym.make(name).unwrapped)
+            yield name, "loop", loop_hash(ncs_env(gym.make(name)))
             vectors["project"] = partial(VectorSafetyShield, on_unproved="ignore")
         for how, wrapped in vectors.items():
             for autoreset in AUTORESETS:

@@ -10,12 +10,12 @@ from scipy.optimize import linprog
 
 import shields
 from ncs_gym import ChannelContract
-from shields import Certificate, CertificateError, SafetyFilter, certificate_for, reach_of, setpoint_range
+from shields import Certificate, CertificateError, certificate_for, reach_of, setpoint_range
 from shields.held import held_text
 from shields.runtime.rows_within_step import rows_within_step
 from tests.certificates import certificate_of
 from tests.plants import named
-from tests.product import altered, linear_plant
+from tests.product import altered, linear_plant, safety_filter
 
 # Points this share of half a range inside of an end are not overridden, those so far outside are.
 NEAR = 1e-4
@@ -67,7 +67,7 @@ def ages_of(certificate):
 @pytest.mark.parametrize(("name", "kind"), KINDS)
 def test_loop_rests_unchanged_just_inside_and_is_overridden_just_outside(name, kind):
     plant, certificate = certified(name, kind)
-    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     directions = null_space(np.hstack([plant.A - np.eye(plant.n), plant.B]))
     judged = 0
     for age in ages_of(certificate):
@@ -157,7 +157,7 @@ def test_nothing_is_held_where_an_estimate_may_be_farther_off_than_the_box_is_wi
     )  # fmt: skip
     certificate = certificate_of(plant, None, "polytope")
     assert setpoint_range(certificate, plant, 0) is None
-    shield = SafetyFilter(certificate, plant)
+    shield = safety_filter(certificate, plant)
     assert shield.decide(np.zeros(2), certificate.Sigma, np.full(1, 0.1)).intervened
     assert "x1 nowhere" in held_text(certificate, plant)
 

@@ -11,7 +11,7 @@ from experiments.runs.policies import policy_by_name
 from ncs_gym import Channel, SetpointTracking
 from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
-from tests.product import linear_plant, loop_env
+from tests.product import gym_vector_env, linear_plant, loop_env
 
 WEIGHTS, PUSH = RegulatorWeights(0.1, 0.01, 0.2), np.array([0.012, -0.008])
 # A stable plant and one that integrates, each with a push that its input can hold its first state against.
@@ -92,7 +92,7 @@ def test_observer_undoes_the_lag_of_a_filter_that_trusts_a_noisy_sensor_little()
 
 def test_estimates_stay_within_the_bound_and_begin_anew_with_an_episode():
     plant = calm(PLANTS["stable"]).plant
-    envs = gym.make_vec("ncs_gym/LinearNCS-v0", 2, plant=plant, max_episode_steps=30)
+    envs = gym_vector_env(2, plant=plant, max_episode_steps=30)
     observer, (_, infos) = DisturbanceObserver(envs.unwrapped.single, 1.0), envs.reset(seed=0)
     largest = np.sqrt(np.diag(plant.nominal_disturbance.shape_matrix))
     for step in range(32):
