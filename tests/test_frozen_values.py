@@ -53,6 +53,7 @@ from ncs_gym.rendering.episode_record import Annotation
 from ncs_gym.uncertainty.disturbances import as_disturbance
 from ncs_gym.validation import ReadOnlyArrays
 from shields import setpoint_range
+from shields.export.board_table import BoardTable
 from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
 from tests.plants import varying_truck
@@ -103,6 +104,7 @@ VALUES = [
     PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),
     safety_filter(CERTIFICATE, batch_reactor()),
     setpoint_range(CERTIFICATE, batch_reactor(), 1),
+    BoardTable.of(CERTIFICATE, batch_reactor()),
     Model(np.eye(2), np.ones((2, 1)), None, 0.1, at=(np.ones(2), np.ones(1))),
     Limits((-np.ones(2), np.ones(2)), np.ones(1), [(np.ones(2), np.ones(1), -1.0, 1.0)], np.ones(1)),
     Bounds(Box(np.zeros(2), np.ones(2)), 0.1, np.ones(2)),

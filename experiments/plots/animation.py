@@ -51,7 +51,7 @@ def _palette() -> Image.Image:
     colors = [each for each in vars(theme).values() if isinstance(each, tuple) and len(each) == 3]
     colors += [theme.load_color(level) for level in np.linspace(0.6, 0.95, 9)]
     marks = [each for each in colors if each not in grounds]  # mixtures of grounds would stand for white
-    mixed = [theme.blend(*pair, fraction) for fraction, *pair in product((0.3, 0.65), grounds, marks[::-1])]
+    mixed = [theme.blend(one, other, by) for by, one, other in product((0.3, 0.65), grounds, marks[::-1])]
     image = Image.new("P", (1, 1))
     image.putpalette([part for color in list(dict.fromkeys([*colors, *mixed]))[:255] for part in color])
     return image
