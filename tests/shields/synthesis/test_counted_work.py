@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from experiments.commands.synthesize import synthesize as run_command
+from experiments.settings import SynthesizeSettings
 from ncs_gym import ChannelContract
 from shields import Infeasible, verify
 from shields.synthesis import ellipsoid_certificates, invariant_polytope, search
@@ -82,6 +84,13 @@ def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(lo
     assert verified(certificate, loaded).valid
     told = "the synthesis was stopped at initial design 2 of 14, when the time_limit of 3 s was over: other sets may be"
     assert told in " ".join(str(certificate).split())
+
+
+def test_command_ends_after_a_minute_of_work(loaded, monkeypatch, tmp_path, capsys):
+    loaded.save(tmp_path / "plant.json")
+    monkeypatch.setattr(search.time, "thread_time", Processor(20.0))
+    run_command(SynthesizeSettings(plant=tmp_path / "plant.json", out=tmp_path / "certificate.json"))
+    assert "the time_limit of 60 s was over" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, "long"])
