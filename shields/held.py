@@ -132,5 +132,6 @@ def _row_of(output: Any, plant: LinearPlant) -> np.ndarray:
         return np.eye(plant.n)[plant.state_names.index(output)]
     if np.ndim(output) == 0:
         return np.eye(plant.n)[as_count(output, "output", low=0, high=plant.n - 1)]
-    size = plant.n if np.shape(output) != (plant.n - plant.past,) else plant.n - plant.past
+    own = plant.n - plant.past
+    size = own if np.shape(output) == (own,) else plant.n
     return np.pad(as_vector(output, size, "output"), (0, plant.n - size))

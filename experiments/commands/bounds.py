@@ -14,7 +14,7 @@ from ncs_gym import LinearPlant, Through, bounds_from_recording
 from ncs_gym.network.log_files import table_rows
 from ncs_gym.reading import LARGEST_LOG, read_file, require_packets
 from ncs_gym.recording import output_names
-from ncs_gym.validation import shown
+from ncs_gym.validation import counted, shown
 from shields.atomic_write import write_atomically
 
 
@@ -46,7 +46,7 @@ def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray
     def chosen(names: list[str]) -> list[str]:
         for each in wanted:
             if names.count(each) != 1:
-                raise ValueError(f"it has {names.count(each)} columns {shown(each)}; {forms}")
+                raise ValueError(f"it has {counted(names.count(each), 'column')} named {shown(each)}; {forms}")
         return wanted
 
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -183,7 +184,7 @@ class Loop:
         return largest_age(self.contract)
 
 
-class LoopState(CopiedWhole):
+class LoopState(CopiedWhole, ABC):
     """Where a loop is, or where N are; the last axis of every array is then the loop.
 
     A loop begins and moves with random numbers of the caller's. What a task draws comes between those of the plant and
@@ -192,7 +193,7 @@ class LoopState(CopiedWhole):
     Args:
         loop: What it is made of.
         channels: Those that episodes have unless they are given others, one for each loop; None for those of `loop`.
-        downlinks: The downlinks, likewise.
+        downlinks_own: The downlinks, likewise.
         size: N; None for one loop, whose values are numbers in place of arrays.
 
     Attributes:
@@ -316,9 +317,9 @@ class LoopState(CopiedWhole):
     downlink: Any
     network: Any
 
+    @abstractmethod
     def _receive(self, rng: np.random.Generator, u: np.ndarray, requested: Any) -> Any:
         """Samples, sends and estimates, given the inputs applied; returns whether a packet arrived."""
-        raise NotImplementedError
 
 
 class OneLoop(LoopState):

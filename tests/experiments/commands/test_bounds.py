@@ -57,8 +57,11 @@ def test_sensors_are_given_or_sought(files):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("time,force\n0,1\n", "it has 0 columns 'position'; a record has the columns force, position, y2 of numbers"),
-        ("force,force,position,y2\n0,1,2,3\n", "it has 2 columns 'force'"),
+        (
+            "time,force\n0,1\n",
+            "it has 0 columns named 'position'; a record has the columns force, position, y2 of numbers",
+        ),
+        ("force,force,position,y2\n0,1,2,3\n", "it has 2 columns named 'force'"),
         ("force,position,y2\n0,1,2\n0,,2\n0,1,1\n", "row 2 has no 'position'; give a part of the record without gaps"),
         ("force,position,y2\n0,1,2\n,1,2\n0,1,1\n", "row 2 has no 'force'"),
         ("force,position,y2\n0,1,one\n", "line 2: 'one' is no number; a record has the columns"),
