@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop import Belief, Loop, OneLoop
+from ncs_gym.envs.loop import Belief, Guard, Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
 from ncs_gym.estimation.error_sets import ErrorSet
@@ -22,7 +22,7 @@ from ncs_gym.network.downlink import DownlinkProtocol, Inputs, no_inputs
 from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
-from ncs_gym.rendering import Annotation, Renderer, sent_at
+from ncs_gym.rendering import Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.uncertainty.disturbances import Disturbance
@@ -211,6 +211,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
         self._now = OneLoop(loop)
+        self._guard: Guard | None = None
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         input_delay = len(self._now.pending)
@@ -246,11 +247,17 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             now.process.forget()
         now.give(sources)
         now.begin(self.np_random, start, fixed, self._begin_task)
+        info, guard = self._info(no_inputs(self.plant.m), arrived=False), self._guard
+        if guard is not None:
+            guard.begin(now.beginning(self._belief))
+            info |= guard.info()
         self._consistent, self._over = True, False
-        info = self._info(no_inputs(self.plant.m), arrived=False)
         if self.renderer is not None:
-            self.renderer.begin(info, self._task_state)
-        return self._observation(), info
+            self.renderer.begin(info, self._task_state, guard and guard.annotation())
+        observation = self._observation()
+        if guard is not None:
+            guard.tell()
+        return observation, info
 
     @np.errstate(all="ignore")
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -266,16 +273,26 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         if self._over:
             raise gym.error.ResetNeeded("the episode is over, as the step before said: call reset")
         self._consistent = False
-        inputs, arrived = now.move(self.np_random, read[1], self._move_task)
+        guard = self._guard
+        u = read[1] if guard is None else guard.input(read[1])
+        inputs, arrived = now.move(self.np_random, u, self._move_task)
         reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
         info = self._info(inputs, arrived=arrived, read=read)
+        if guard is not None:
+            guard.observe(self._belief)
+            info |= guard.info()
+            reward -= guard.charge
         process = now.process.process
         terminated = process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         truncated = process.truncated
         self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
-            self.renderer.record(info, self._task_state, sent_at(now.steps, now.network, now.received))
-        return self._observation(), reward, terminated, truncated, info
+            sent = sent_at(now.steps, now.network, now.received)
+            self.renderer.record(info, self._task_state, sent, guard and guard.annotation())
+        observation = self._observation()
+        if guard is not None:
+            guard.tell()
+        return observation, reward, terminated, truncated, info
 
     def _begin_task(self) -> None:
         self._task_state = self._task.begin(self.np_random, self.plant)
@@ -340,11 +357,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset before render")
         return self.renderer.render()
 
-    def annotate(self, annotation: Annotation) -> None:
-        """Shows what a shield knows in the picture of the next step or reset; nothing where nothing is drawn."""
-        if self.renderer is not None:
-            self.renderer.episode.next_annotation = annotation
-
     @property
     def episode_channel(self) -> Channel:
         """The channel of this episode."""
@@ -357,12 +369,22 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
 
     @property
     def belief(self) -> Belief:
-        """What a shield decides on, read-only: no wrapper stands between."""
+        """What a controller can know now, read-only."""
         return self._belief
 
-    def estimates_ahead(self) -> list[tuple[np.ndarray, int]]:
-        """Returns estimate and number of the error shape of now and of every step until the next decision's effect."""
-        return self._now.ahead()
+    @property
+    def guard(self) -> Guard | None:
+        """What decides the inputs in place of the actions; None without a shield."""
+        return self._guard
+
+    def install(self, guard: Guard) -> None:
+        """Has a guard decide the inputs, from the next reset on; a shield does this.
+
+        Raises:
+            ValueError: If there is one.
+        """
+        require_bare(self._guard)
+        self._guard, self._consistent = guard, False
 
     def close(self) -> None:
         """Closes the window and the process."""
@@ -380,6 +402,12 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         report = self._now.report(inputs, arrived)
         self._belief = report.belief
         return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant, read))
+
+
+def require_bare(guard: Guard | None) -> None:
+    """Raises ValueError if an environment has a guard."""
+    if guard is not None:
+        raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

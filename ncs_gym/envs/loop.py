@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -49,6 +49,7 @@ class Belief(NamedTuple):
         outside: Whether `alarm` is also about a step of the process outside E(D), a bool or shape (N,).
         applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
         committed: The input decided in the last step, of the same shape.
+        moves: Steps and resets of this loop since it was made, an int or shape (N,): the one clock.
     """
 
     estimate: np.ndarray
@@ -60,6 +61,14 @@ class Belief(NamedTuple):
     outside: Any
     applied: np.ndarray
     committed: np.ndarray
+    moves: Any = 0
+
+    @property
+    def stays(self) -> Any:
+        """Whether an error in a certified set is known to stay there while the contract is kept, of one loop or N."""
+        if self.estimate.ndim == 1:
+            return self.table.is_certified(self.number)
+        return self.table.certified.take(self.number)
 
     @property
     def error_shape(self) -> np.ndarray:
@@ -67,6 +76,54 @@ class Belief(NamedTuple):
         if self.estimate.ndim == 1:
             return self.table.shape(self.number)
         return self.table.shapes.take(self.number, axis=0)
+
+
+class Beginning(NamedTuple):
+    """What a guard is told where episodes begin.
+
+    Attributes:
+        belief: What a controller can know.
+        start: What the start is known to lie in, an ellipsoid or the state itself; of N loops, states that episodes
+            were started at by an option or outside the initial set, NaN elsewhere, shape (N, n).
+        earlier: Estimate and number of the error set of every step before the first decision takes effect; of N loops
+            of those that begin alone.
+        channels: Those of the present episodes.
+    """
+
+    belief: Belief
+    start: Any
+    earlier: list[tuple[np.ndarray, Any]]
+    channels: Sequence[Channel]
+
+
+class Guard(Protocol):
+    """Decides the inputs of a loop, or of N, given what a controller can know, and reports on it.
+
+    An environment calls `begin` where episodes begin, `input` and then `observe` in every step; then it asks for `info`
+    and `charge`, and, when all else is done, has the guard `tell` what it has to.
+    """
+
+    @property
+    def charge(self) -> Any:
+        """What is subtracted from the reward of the last step, a number or shape (N,)."""
+
+    def begin(self, beginning: Beginning, mask: np.ndarray | None = None) -> None:
+        """Begins episodes, of N loops where `mask`, shape (N,), says so."""
+
+    def input(self, u: np.ndarray) -> np.ndarray:
+        """Returns the input to apply in place of a proposed one, shape (m,) or (m, N); neither is written into."""
+
+    def observe(self, belief: Belief) -> None:
+        """Takes in what is known after the step."""
+
+    def info(self) -> dict[str, Any]:
+        """Returns the guard's keys of `info`, fresh arrays."""
+
+    def tell(self) -> None:
+        """Warns or raises, if there is a reason."""
+
+    def annotation(self, loop: int = 0) -> Any:
+        """Returns what the picture of the last step shows of a loop."""
 
 
 class Report(NamedTuple):
@@ -200,6 +257,7 @@ class LoopState(CopiedWhole, ABC):
         state: x, shape (n,) or (n, N).
         worst: `worst_constraint_values` of the last step, shape (k + q,) or (k + q, N).
         steps, episodes: Steps taken in the episode, and episodes begun, ints or shape (N,).
+        moves: Steps and resets since the loop was made, an int or shape (N,).
         start: What the start of the episode is known to lie in, for one loop; for N, states that episodes were started
             at by an option or outside the initial set, NaN elsewhere, shape (N, n).
         channels, downlinks: Those of the present episodes.
@@ -252,6 +310,7 @@ class LoopState(CopiedWhole, ABC):
             u: What is decided now, shape (m,) or (m, N) [physical units].
             task: Moves the task, given the input applied.
         """
+        self.moves = self.moves + 1
         inputs = self.downlink.exchange(rng, self.steps, u)
         before, requested = self.state, None
         if self.requests is not None:
@@ -285,7 +344,7 @@ class LoopState(CopiedWhole, ABC):
                 asked = forced = self.nothing
         self.violations = self.violations + (cost if counted is None else cost * counted)
         (applied, committed, missing), table = inputs, estimator.table
-        belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed)
+        belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed, self.moves)
         happened = belief, self.steps, self.state, estimator.mean, arrived, self.packets
         kept = values, worst, cost, self.violations
         return Report(*happened, *kept, missing, asked, forced, self._others | self.process.infos)
@@ -296,12 +355,16 @@ class LoopState(CopiedWhole, ABC):
         return self.downlink.committed.pending
 
     def ahead(self, *chosen: np.ndarray) -> list[tuple[np.ndarray, Any]]:
-        """Returns estimate and number of the error set of now and of every step until the next decision's effect.
+        """Returns estimate and number of the error set of now and of every step before the next decision's effect.
 
         Args:
             chosen: Indices of the loops that count, of N; all by default.
         """
-        return [self.estimator.numbered(self.pending[:steps], *chosen) for steps in range(len(self.pending) + 1)]
+        return [self.estimator.numbered(self.pending[:steps], *chosen) for steps in range(len(self.pending))]
+
+    def beginning(self, belief: Belief, *chosen: np.ndarray) -> Beginning:
+        """Returns what a guard is told where episodes begin, of N loops those with these indices."""
+        return Beginning(belief, self.start, self.ahead(*chosen), self.channels.now)
 
     # Of one loop or of many: those of the classes below.
     nothing: Any = False
@@ -310,6 +373,7 @@ class LoopState(CopiedWhole, ABC):
     memory: Any
     steps: Any
     episodes: Any
+    moves: Any
     packets: Any
     violations: Any
     start: Any
@@ -333,7 +397,7 @@ class OneLoop(LoopState):
         super().__init__(loop)
         self.estimator = Estimator(loop.plant, loop.channel, histories=loop.histories(loop.channel))
         self.downlink = DownlinkState(loop.protocol, loop.plant.m)
-        self.steps = self.episodes = 0
+        self.steps = self.episodes = self.moves = 0
         self.start = loop.initial_set
         self.received: list[Any] = []
 
@@ -352,7 +416,7 @@ class OneLoop(LoopState):
             fixed: What `read` returned of parameters.
             task: Begins the task's episode.
         """
-        loop = self.loop
+        loop, self.moves = self.loop, self.moves + 1
         initial, first = (None, start) if start is not None else (loop.initial_set, self._drawn_start(rng))
         self.state, self.start = self.process.start(rng, first, initial, fixed)
         task()
@@ -403,7 +467,7 @@ class ManyLoops(LoopState):
         self.downlink = VectorDownlinkState(loop.protocol, plant.m, size)
         self.nothing = np.zeros(size, np.bool_)
         self.packets, self.violations = np.zeros(size, np.int64), np.zeros(size)
-        self.steps, self.episodes = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self.steps, self.episodes, self.moves = np.zeros((3, size), np.int64)
         self.state, self.start = np.zeros((plant.n, size)), np.full((size, plant.n), np.nan)
         self.worst = plant.values_at_start(self.state)
 
@@ -424,7 +488,7 @@ class ManyLoops(LoopState):
             fixed: What `read` returned of parameters.
             task: Begins the task's episodes, given their mask.
         """
-        loop, rows = self.loop, np.flatnonzero(mask)
+        loop, rows, self.moves = self.loop, np.flatnonzero(mask), self.moves + mask
         count = len(rows)
         first_states = ((1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng, count)).T
         first_errors = self.process.first_error(rng, count)

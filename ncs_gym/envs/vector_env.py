@@ -10,10 +10,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv
+from ncs_gym.envs.autoreset import Autoreset, Begun, Moved
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv, require_bare
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop import Belief, Loop, ManyLoops, with_columns
+from ncs_gym.envs.loop import Belief, Guard, Loop, ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, actions_of, read_actions
 from ncs_gym.estimation.error_sets import ErrorSet
@@ -23,11 +24,11 @@ from ncs_gym.network.downlink import DownlinkProtocol, Inputs, no_inputs
 from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
-from ncs_gym.rendering import Annotation, PacketRecord
+from ncs_gym.rendering import PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, frozen, setting, shown
+from ncs_gym.validation import as_count, setting, shown
 
 
 class NCSVectorEnv(SpecOfJson, VectorEnv):
@@ -57,7 +58,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         steps: Steps taken in each episode, shape (N,).
         episodes: Episodes begun in each environment, shape (N,).
         starts: States that episodes were started at by an option or outside the initial set, NaN elsewhere, (N, n).
-        ticks: Steps of the whole vector since it was made.
 
     Raises:
         ValueError: If a setting is wrong; see `NCSEnv`.
@@ -83,7 +83,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
     downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
-    autoreset_mode: AutoresetMode = setting("autoreset_mode")
+    autoreset_mode: AutoresetMode = setting("autoreset_mode", "_autoreset.mode")
     steps: np.ndarray = setting("steps", "_now.steps")
     episodes: np.ndarray = setting("episodes", "_now.episodes")
     starts: np.ndarray = setting("starts", "_now.start")
@@ -102,8 +102,8 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self.num_envs = as_count(num_envs, "num_envs", low=1)
         limit = None if type(max_episode_steps) is int and max_episode_steps == -1 else max_episode_steps
         self._max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
-        self._autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset_mode}
+        self._autoreset = Autoreset(autoreset_mode, self.num_envs)
+        self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset.mode}
         self.rendered_env = as_count(rendered_env, "rendered_env", low=0, high=self.num_envs - 1)
         own = [self._one_each(each, name) for name, each in zip(CHANNELS, (channel, downlink), strict=True)]
         if self._max_episode_steps is not None:
@@ -118,10 +118,9 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._observer = Observer(self._task, single.observation_space, single.observe, single.horizon, many=True)
         self._now = ManyLoops(single.loop, self.num_envs, *own)
-        self._done = np.zeros(self.num_envs, np.bool_)
-        self.ticks, self._consistent = 0, False
+        self._consistent = False
         self._belief: Belief
-        self._ended: tuple[np.ndarray, Belief] | None = None
+        self._guard: Guard | None = None
 
     @property
     def state(self) -> np.ndarray:
@@ -140,17 +139,22 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
 
     @property
     def belief(self) -> Belief:
-        """What a shield decides on, read-only: no wrapper stands between."""
+        """What a controller can know now, read-only."""
         return self._belief
 
     @property
-    def ended(self) -> tuple[np.ndarray, Belief] | None:
-        """With SAME_STEP, where an episode ended in the last step, shape (N,), and what was known at its end."""
-        return self._ended
+    def guard(self) -> Guard | None:
+        """What decides the inputs in place of the actions; None without a shield."""
+        return self._guard
 
-    def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), numbers (k,)."""
-        return self._now.ahead(chosen)
+    def install(self, guard: Guard) -> None:
+        """Has a guard decide the inputs, from the next reset on; a shield does this.
+
+        Raises:
+            ValueError: If there is one.
+        """
+        require_bare(self._guard)
+        self._guard, self._consistent = guard, False
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -182,13 +186,15 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             raise gym.error.ResetNeeded("reset all environments first")
         chosen = np.flatnonzero(mask).tolist()
         sources = self._now.drawn(sources, self.np_random, chosen)
-        self._consistent, self._ended = False, None
+        self._consistent = False
         self._now.give(sources, chosen)
-        self._begin(mask, starts, fixed)
-        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
+        observation, info = self._begin(mask, starts, fixed)
+        self._autoreset.over = self._autoreset.over & ~mask
         self._consistent = True
         self._draw(info, begins=mask, moved=False)
-        return self._observation(), info
+        if self._guard is not None:
+            self._guard.tell()
+        return observation, info
 
     @np.errstate(all="ignore")
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -198,32 +204,51 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        u, now = read_actions(self.plant, actions, self.num_envs)[1], self._now
+        u = read_actions(self.plant, actions, self.num_envs)[1]
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
-        some_done = np.count_nonzero(self._done) > 0
-        if some_done and self._autoreset_mode is AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
-        self._consistent, self._ended = False, None
-        inputs, arrived = now.move(self.np_random, u, self._move_task)
-        self.ticks += 1
-        reward = self._task.reward_many(self.plant, self._task_state, now.state, inputs.applied)
-        restarted = self._done.copy() if some_done else None
-        if restarted is not None:  # NEXT_STEP: the last step ended these episodes
-            self._begin(restarted, None)
-            applied, committed = (frozen(np.where(restarted, 0.0, each)) for each in inputs[:2])
-            reward[restarted], arrived[restarted] = 0.0, False
-            inputs = Inputs(applied, committed, inputs.missing & ~restarted)
-        info = self._info(inputs, arrived, None)
-        terminated, truncated = self._ends(info["cost"], restarted)
-        self._done = terminated | truncated
-        observation = self._observation()
-        if self._autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
-            observation, info = self._restarted(observation, info)
-            restarted = self._ended and self._ended[0]
+        self._autoreset.require_under_way()
+        self._consistent = False
+        moved = self._autoreset.step(lambda: self._move(u), self._begin)
         self._consistent = True
-        self._draw(info, begins=restarted)
-        return observation, reward, terminated, truncated, info
+        self._draw(moved[-1], begins=self._autoreset.begun)
+        if self._guard is not None:
+            self._guard.tell()
+        return moved
+
+    def _move(self, u: np.ndarray) -> Moved:
+        """Returns what a step returns in which no episode begins, given the inputs proposed, shape (m, N)."""
+        now, guard = self._now, self._guard
+        u = u if guard is None else guard.input(u)
+        inputs, arrived = now.move(self.np_random, u, self._move_task)
+        reward = self._task.reward_many(self.plant, self._task_state, now.state, inputs.applied)
+        info = self._info(inputs, arrived, None)
+        if guard is not None:
+            guard.observe(self._belief)
+            info |= guard.info()
+            reward = reward - guard.charge
+        terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
+        process = now.process.process
+        if process.terminated is not False:  # other people's environments may end
+            terminated, truncated = terminated | process.terminated, truncated | process.truncated
+        if self._single.terminate_on_violation:
+            terminated |= info["cost"] > 0.0
+        if self._max_episode_steps is not None:
+            truncated |= self.steps >= self._max_episode_steps
+        return self._observation(), reward, terminated, truncated, info
+
+    def _begin(self, mask: np.ndarray, starts: np.ndarray | None = None, fixed: np.ndarray | None = None) -> Begun:
+        """Begins episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set.
+
+        `fixed` is what the process read of the parameters of a family, (N, k).
+        """
+        now = self._now
+        now.begin(self.np_random, mask, starts, fixed, self._begin_task)
+        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
+        if self._guard is not None:
+            self._guard.begin(now.beginning(self._belief, np.flatnonzero(mask)), mask)
+            info |= self._guard.info()
+        return self._observation(), info
 
     def _move_task(self, u: np.ndarray) -> None:
         self._task_state = self._task.advance_many(self.np_random, self.plant, self._task_state, u)
@@ -257,22 +282,19 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         picture = self._single.renderer.render()
         return None if picture is None else (picture,) * self.num_envs
 
-    def annotate(self, annotation: Annotation) -> None:
-        """Shows what a shield knows of `rendered_env` in the picture of the next step or reset."""
-        self._single.annotate(annotation)
-
-    def _draw(self, info: dict[str, Any], begins: np.ndarray | None, *, moved: bool = True) -> None:
+    def _draw(self, info: dict[str, Any], begins: np.ndarray, *, moved: bool = True) -> None:
         renderer, e = self._single.renderer, self.rendered_env
         if renderer is None:
             return
+        note = self._guard and self._guard.annotation(e)
         own = {key: value[e] for key, value in info.items() if not key.startswith(("_", "final"))}
         task_state = np.copy(self._task_state[..., e])[()]
-        if begins is not None and begins[e]:
-            renderer.begin(own, task_state)
+        if begins[e]:
+            renderer.begin(own, task_state, note)
         elif moved:
             step = int(self.steps[e])
             sends, arrival = self._now.network.arrival_of(e, step)
-            renderer.record(own, task_state, PacketRecord(step, arrival) if sends else None)
+            renderer.record(own, task_state, PacketRecord(step, arrival) if sends else None, note)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the process."""
@@ -286,28 +308,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
             ValueError: If one is not finite or the shape is wrong.
         """
         return read_actions(self.plant, actions, self.num_envs)[1]
-
-    def _ends(self, cost: np.ndarray, restarted: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes are terminated and which truncated, shape (N,) each; those that just began are not."""
-        terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
-        process = self._now.process.process
-        if process.terminated is not False:  # other people's environments may end
-            terminated, truncated = terminated | process.terminated, truncated | process.truncated
-        if self._single.terminate_on_violation:
-            terminated |= cost > 0.0
-        if self._max_episode_steps is not None:
-            truncated |= self.steps >= self._max_episode_steps
-        if restarted is not None:
-            terminated, truncated = terminated & ~restarted, truncated & ~restarted
-        return terminated, truncated
-
-    def _begin(self, mask: np.ndarray, starts: np.ndarray | None, fixed: np.ndarray | None = None) -> None:
-        """Starts episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set.
-
-        `fixed` is what the process read of the parameters of a family, (N, k).
-        """
-        self._now.begin(self.np_random, mask, starts, fixed, self._begin_task)
-        self._done = self._done & ~mask
 
     def _begin_task(self, mask: np.ndarray) -> None:
         begun = self._task.begin_many(self.np_random, self.plant, int(np.count_nonzero(mask)))
@@ -335,36 +335,3 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         report = self._now.report(inputs, arrived, counted)
         self._belief = report.belief
         return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant))
-
-    def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
-        """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
-        done = self._done.copy()
-        ended = self._belief
-        self._ended = frozen(done), ended
-        final = {key: _where(done, value, np.zeros_like(value)) for key, value in info.items()}
-        final |= {f"_{key}": done.copy() for key in info}
-        final_observation = _where(done, observation, np.zeros_like(observation))
-        self._begin(done, None)
-        fresh = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
-        inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
-        self._belief = self._belief._replace(applied=frozen(next(inputs)), committed=frozen(next(inputs)))
-        merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
-        return _where(done, self._observation(), observation), merged | {
-            "final_obs": final_observation,
-            "_final_obs": done.copy(),
-            "final_info": final,
-            "_final_info": done.copy(),
-        }
-
-
-def _where(mask: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the first array where a mask (N,) is True, the second elsewhere; both have N as first axis."""
-    return np.where(mask.reshape(-1, *[1] * (first.ndim - 1)), first, second)
-
-
-def _autoreset_mode(value: AutoresetMode | str) -> AutoresetMode:
-    """Returns a mode given as such or by its name."""
-    for mode in AutoresetMode:
-        if value is mode or (isinstance(value, str) and value == mode.value):
-            return mode
-    raise ValueError(f"autoreset_mode must be one of {[mode.value for mode in AutoresetMode]}, got {shown(value)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -30,7 +30,7 @@ class ConvexSet(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Annotation:
-    """What a shield knows about the step it is about to take, to be shown in the picture of that step.
+    """What a shield knows about the step that was taken, to be shown in its picture.
 
     Attributes:
         safe_set: The set that the shield keeps the state in.
@@ -87,35 +87,32 @@ class EpisodeRecord:
         interventions: Whether the shield replaced the input that led to each of these states.
         packets: The recent packets, oldest first.
         annotation: What the shield knows about the step that led here; None without a shield.
-        next_annotation: What it knows about the next step or reset, until that is recorded.
     """
 
     def __init__(self, plant: LinearPlant, task: Task) -> None:
         self.plant, self._task = plant, task
-        self.next_annotation: Annotation | None = None
 
-    def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
+    def begin(self, info: Mapping[str, Any], task_state: Any, note: Annotation | None = None) -> None:
         """Starts an episode, with the info of its reset."""
         self.step = 0
         self.path: deque[np.ndarray] = deque(maxlen=RECENT_STEPS)
         self.interventions: deque[bool] = deque(maxlen=RECENT_STEPS)
         self.packets: deque[PacketRecord] = deque(maxlen=RECENT_STEPS)
-        note = self.next_annotation
-        if note is not None:  # nothing is proposed at a start, also where a step led to it
-            self.next_annotation = replace(note, proposed=None, intervened=False, interventions=0)
-        self._store(info, task_state)
+        self._store(info, task_state, note)
 
-    def add(self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None) -> None:
+    def add(
+        self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None, note: Annotation | None = None
+    ) -> None:
         """Adds a step, with its info and what became of its sample; None where none is sent."""
         self.step += 1
-        self._store(info, task_state)
+        self._store(info, task_state, note)
         if sent is not None:
             self.packets.append(sent)
 
-    def _store(self, info: Mapping[str, Any], task_state: Any) -> None:
+    def _store(self, info: Mapping[str, Any], task_state: Any, note: Annotation | None) -> None:
         self.info, self._task_state = deepcopy(dict(info)), task_state
         self.state, self.estimate, self.violated = self.info["state"], self.info["estimate"], bool(info["cost"] > 0.0)
-        self.annotation, self.next_annotation = (note := self.next_annotation), None
+        self.annotation = note
         self.intervened = note is not None and note.intervened and note.protects
         self.path.append(self.state)
         self.interventions.append(note is not None and note.intervened)

@@ -11,7 +11,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.drawings import drawing_of
-from ncs_gym.rendering.episode_record import EpisodeRecord, PacketRecord
+from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, PacketRecord
 from ncs_gym.rendering.panel import draw_header, draw_panel
 from ncs_gym.rendering.phase_plane import PhasePlane
 from ncs_gym.tasks.base_task import Task
@@ -40,14 +40,16 @@ class Renderer:
         self._plane = PhasePlane(plant)
         self._canvas: Canvas | None = None
 
-    def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
-        """Starts an episode, with the info that `reset` returns and the state of the task."""
-        self.episode.begin(info, task_state)
+    def begin(self, info: Mapping[str, Any], task_state: Any, note: Annotation | None = None) -> None:
+        """Starts an episode, with the info that `reset` returns, the state of the task, and what a shield knows."""
+        self.episode.begin(info, task_state, note)
         self._show()
 
-    def record(self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None) -> None:
-        """Adds a step, with its info, the state of the task after it, and its sample; None where none is sent."""
-        self.episode.add(info, task_state, sent)
+    def record(
+        self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None, note: Annotation | None = None
+    ) -> None:
+        """Adds a step, with its info, the state of the task after it, its sample (None where none is sent)."""
+        self.episode.add(info, task_state, sent, note)
         self._show()
 
     def render(self) -> np.ndarray | None:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ncs_gym.envs.loop import Belief
 from ncs_gym.network.contract import largest_age
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
@@ -64,29 +65,6 @@ class MonitorState(NamedTuple):
     wait: Any = 0
 
 
-class LoopObservation(NamedTuple):
-    """What is observed of one control loop after a step; of N of them, arrays whose last axis is the loop.
-
-    Attributes:
-        estimate: x_hat, shape (n,) or (n, N); NaN if it is unusable.
-        errors: What is known of the error shapes, in the same order.
-        alarm: Whether the innovation monitor raised an alarm, or a simulation saw what it would be about.
-        age: Steps since the newest sample used was taken, which is asked for only to explain a large error.
-        damaged: Whether that alarm is about a sample that was no finite numbers.
-        stays: Whether an error in a certified set is known to stay there while the contract is kept, which its shape
-            alone does not say (`ErrorStatistics.certified`).
-        outside: Whether that alarm is about a step that a simulation saw, and perhaps no measurement shows.
-    """
-
-    estimate: np.ndarray
-    errors: PredictedErrors
-    alarm: Any
-    age: Any = 0
-    damaged: Any = False
-    stays: Any = False
-    outside: Any = False
-
-
 class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
 
@@ -126,28 +104,31 @@ class GuaranteeMonitor:
         self._under_way = plant.past if self._is_local else 0
         self._limits = np.tile([plant.input_middle, plant.input_half], self._under_way // plant.m)
 
-    def start(self, known_inside: Any, unmoved: Any, report: LoopObservation, *, is_first: bool = True) -> MonitorState:
+    def start(
+        self, known_inside: Any, belief: Belief, errors: PredictedErrors, *, is_first: bool = True
+    ) -> MonitorState:
         """Returns the state at the start of an episode, or where the state of one is found.
 
         Args:
             known_inside: Whether every possible start lies in S, or in the box with a certified plan stored.
-            unmoved: Whether the environment has not moved since.
-            report: What is observed.
+            belief: What is known.
+            errors: What follows from the error shape of the estimate.
             is_first: Whether no step of the episode led here.
         """
-        broken = _first(unmoved * 0, _not(unmoved), OTHER_STEPS)
-        state = self._observe(self._within_limits(broken, report), known_inside, report, 0)
+        broken = self._within_limits(known_inside * 0, belief.estimate, errors)
+        state = self._observe(broken, known_inside, belief, errors, 0)
         return state if is_first else state._replace(wait=longer_wait(state.wait, not self._within_step, 0))
 
-    def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
+    def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, Belief, PredictedErrors]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
 
         That is of x_0 .. x_{c-1} whether it is known to be in S, and the way from it in the box (`known_inside`), and
-        what is observed of it.
+        what is known of its estimate.
         """
         broken, wait = state.broken, state.wait
-        for ahead, (inside, report) in enumerate(earlier):
-            seen = self._observe(self._within_limits(broken, report), inside, report, 0)
+        for ahead, (inside, belief, errors) in enumerate(earlier):
+            broken = self._within_limits(broken, belief.estimate, errors)
+            seen = self._observe(broken, inside, belief, errors, 0)
             broken = seen.broken
             if self._within_step:  # what is not proved of x_j is not of the way to x_{j+1}
                 wait = longer_wait(wait, inside & seen.inside, ahead + 1)
@@ -161,7 +142,8 @@ class GuaranteeMonitor:
         decision: Decision,
         moved_once: Any,
         same_input: Any,
-        report: LoopObservation,
+        belief: Belief,
+        errors: PredictedErrors,
         on_time: Any = True,
     ) -> MonitorState:
         """Returns the state one step later.
@@ -169,9 +151,10 @@ class GuaranteeMonitor:
         Args:
             state: Before the step.
             decision: What was decided then.
-            moved_once: Whether the environment moved exactly one step.
+            moved_once: Whether the loop moved exactly one step.
             same_input: Whether the input applied is the one decided.
-            report: What is observed after the step.
+            belief: What is known after the step.
+            errors: What follows from the error shape of the estimate.
             on_time: Behind a downlink, whether the input applied is the one decided for this step.
         """
         broken = state.broken
@@ -187,7 +170,7 @@ class GuaranteeMonitor:
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
         # A passed test proves the times on the grid and the next state; the first one needs x itself in the box.
         on_the_way = inside & state.inside if self._within_step else True
-        return self._observe(broken, inside, report, state.wait, on_the_way)
+        return self._observe(broken, inside, belief, errors, state.wait, on_the_way)
 
     def reasons(self, state: MonitorState, age: Any = 0) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does.
@@ -208,23 +191,23 @@ class GuaranteeMonitor:
         reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
         return _first(reason, is_large, LARGE_ERROR)
 
-    def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
+    def _within_limits(self, broken: Any, estimate: np.ndarray, errors: PredictedErrors) -> Any:
         if not self._under_way:
             return broken
-        middle, half = self._limits if report.estimate.ndim == 1 else self._limits[..., None]
-        stored, errors = report.estimate[-self._under_way :], report.errors.half_widths[-self._under_way :]
-        return _first(broken, _not(_rows_all(np.abs(stored - middle) + errors <= half)), LEFT_MODEL)
+        middle, half = self._limits if estimate.ndim == 1 else self._limits[..., None]
+        stored, widths = estimate[-self._under_way :], errors.half_widths[-self._under_way :]
+        return _first(broken, _not(_rows_all(np.abs(stored - middle) + widths <= half)), LEFT_MODEL)
 
     def _observe(
-        self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True
+        self, broken: Any, inside: Any, belief: Belief, errors: PredictedErrors, wait: Any, on_the_way: Any = True
     ) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves: not what was on the way."""
-        estimate, errors, alarm, _, damaged, stays, outside = report
+        estimate, alarm, damaged = belief.estimate, belief.alarm, belief.damaged
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
         if alarm is not False or damaged is not False:
-            broken = _first(_first(_first(broken, damaged, NOT_FINITE), outside, OUTSIDE_BOUND), alarm, ALARM)
+            broken = _first(_first(_first(broken, damaged, NOT_FINITE), belief.outside, OUTSIDE_BOUND), alarm, ALARM)
         if np.count_nonzero(within) < within.size:  # quicker than all()
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
@@ -235,7 +218,7 @@ class GuaranteeMonitor:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
         if self._input_delay or self._within_step:
             wait = longer_wait(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
-        return MonitorState(broken, inside, errors.certified, stays, wait)
+        return MonitorState(broken, inside, errors.certified, belief.stays, wait)
 
 
 def longer_wait(wait: Any, proved: Any, ahead: int) -> Any:
@@ -297,8 +280,12 @@ class LostGuarantee:
     def tell_of(self, reason: str) -> None:
         """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
         if reason:
-            self.note(CODES[reason])
+            self.note_of(reason)
             self.tell()
+
+    def note_of(self, reason: str) -> None:
+        """Takes in why a single loop is not proved safe."""
+        self.note(CODES[reason])
 
 
 def _not(condition: Any) -> Any:

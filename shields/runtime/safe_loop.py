@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
+from ncs_gym.envs.loop import Belief
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol
@@ -39,10 +40,9 @@ from shields.runtime.guarantee import (
     OTHER_EPISODE,
     OTHER_INPUT,
     UNKNOWN_START,
-    LoopObservation,
     LostGuarantee,
 )
-from shields.runtime.monitored_filter import MonitoredFilter
+from shields.runtime.guard import OneGuard
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, starts_known
 
@@ -148,8 +148,8 @@ class SafeLoop(CopiedWhole):
         histories = arrival_histories(plant, channel, self._contract, coarsens=True)
         self._estimator = Estimator(plant, channel, histories=histories)
         protocol = downlink_protocol(downlink, downlink_contract)
-        self._monitored = MonitoredFilter(self._filter, protocol)
-        self._input_delay = self._monitored.input_delay
+        self._guard, self._decided = OneGuard(self._filter, protocol), np.zeros(plant.m)
+        self._input_delay = protocol.input_delay
         warn_of_broken_contract(self._contract, channel, self._input_delay, counts_losses=True)
         self._inputs = CommittedInputs(self._input_delay, plant.m)
         self._requests = None
@@ -277,12 +277,12 @@ class SafeLoop(CopiedWhole):
         self._phase = _Phase.STOPPED
         self._take_in(arrived, self.steps + (phase is _Phase.DECIDED))
         if phase is _Phase.DECIDED:
-            decided, due = np.array(self._monitored.decided), self._inputs.pop()
+            due = self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
             taken = due if told is None else told
             self._applied.add(due)
             self._estimator.advance(taken, arrived)
-            self._monitored.advance(told, True, self._report(), decided)
+            self._guard.observe(self._belief(told))
             if self._unknown is not None:  # samples of before tell nothing of a state that an unknown input moved
                 self._unknown = () if told is None else (taken, *self._unknown[: self._oldest_sought])
         self._applied.compare(heard, self.steps, self.episode)
@@ -323,7 +323,9 @@ class SafeLoop(CopiedWhole):
             warn_caller(f"{wanted}; u = K x_hat is applied instead", UserWarning)
         self._phase = _Phase.STOPPED
         u = np.full_like(low, np.nan) if u is None else np.minimum(np.maximum(u, low), high)
-        decision = self._monitored.decide(u)
+        decision = self._guard.decide(u)
+        self._decided = decision.input
+        decision = decision._replace(input=decision.input.copy())  # the caller may write into it
         self._inputs.commit(decision.input)
         if requests is not None:
             requests.ask(ask or self._unknown is not None)  # a state that is not known is to be found
@@ -389,14 +391,14 @@ class SafeLoop(CopiedWhole):
         if self._unknown is not None:
             is_finite = all(np.isfinite(y).all() for y in self._recent(self._unknown).values())
             return UNKNOWN_START if is_finite else NOT_FINITE
-        if self._monitored.reason or self._applied.is_confirmed(self.steps):
-            return self._monitored.reason
+        if (reason := self._guard.reason) or self._applied.is_confirmed(self.steps):
+            return reason
         return OTHER_EPISODE if self._applied.hears_of_others(self.steps) else NOT_CONFIRMED
 
     @property
     def plan_length(self) -> int:
         """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
-        return 0 if self._phase is _Phase.STOPPED else self._monitored.plan_length
+        return 0 if self._phase is _Phase.STOPPED else self._guard.plan_length
 
     @property
     def estimate(self) -> np.ndarray:
@@ -456,10 +458,8 @@ class SafeLoop(CopiedWhole):
     def _begin(self, known: Sequence[StartKnown]) -> None:
         """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
         pending = self._inputs.pending
-        ahead = [self._estimator.numbered(pending[:steps]) for steps in range(self._input_delay)]
-        table, errors = self._estimator.table, self._monitored.errors
-        earlier = [LoopObservation(mean, errors.one(table, number), False) for mean, number in ahead]
-        self._monitored.begin(self._report(), known, is_first=self.steps == 0, earlier=earlier, pending=pending)
+        earlier = [self._estimator.numbered(pending[:steps]) for steps in range(self._input_delay)]
+        self._guard.start(self._belief(None), known, earlier, is_first=self.steps == 0, pending=pending)
 
     def _take_in(self, packets: Iterable[Packet], step: int) -> None:
         """Keeps the samples of this episode that arrive by a step and may be used, and notes two values of one."""
@@ -488,13 +488,14 @@ class SafeLoop(CopiedWhole):
             self._estimator.restart(found[0], inputs[:since])
             self._begin(starts_known(self._filter, None, self._input_delay))
 
-    def _report(self) -> LoopObservation:
+    def _belief(self, applied: np.ndarray | None) -> Belief:
+        """Returns what is known now, given the input applied in the last step; None if it is not known."""
         estimator = self._estimator
         estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
-        errors = self._monitored.errors.one(estimator.table, number)
-        stays = estimator.table.is_certified(number)
+        applied = np.full(self._filter.plant.m, np.nan) if applied is None else applied
         alarm = estimator.alarm or self._contradicted
-        return LoopObservation(estimate, errors, alarm, estimator.age, estimator.damaged, stays)
+        seen = estimate, number, estimator.table, estimator.age, alarm, estimator.damaged, False
+        return Belief(*seen, applied, self._decided, self.steps)
 
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""

@@ -384,10 +384,12 @@ class NumberedErrors:
         self._alone: dict[int, PredictedErrors] = {}
         self._known: PredictedErrors
 
-    def one(self, table: ErrorTable, number: int) -> PredictedErrors:
-        """Returns what is known of one error shape, without a last axis."""
+    def of(self, table: ErrorTable, number: Any) -> PredictedErrors:
+        """Returns what is known of an error shape, without a last axis, or of N, numbers of shape (N,)."""
         if table is not self._table:
             self._take(table)
+        if isinstance(number, np.ndarray):
+            return self._many(table, number)
         errors = self._alone.get(number)
         if errors is None:
             if len(self._alone) >= MOST_REMEMBERED:
@@ -395,10 +397,7 @@ class NumberedErrors:
             errors = self._alone[number] = self._filter.errors_of(table.shape(number))
         return errors
 
-    def many(self, table: ErrorTable, numbers: np.ndarray) -> PredictedErrors:
-        """Returns what is known of N error shapes, numbers of shape (N,)."""
-        if table is not self._table:
-            self._take(table)
+    def _many(self, table: ErrorTable, numbers: np.ndarray) -> PredictedErrors:
         known = self._known
         if len(table.shapes) > len(known.radius):
             known = known.followed_by(self._filter.errors_of_many(table.shapes[len(known.radius) :]))

@@ -1,0 +1,360 @@
+"""Filter and monitor of a loop, or of N: what is applied in place of what is proposed, and what is proved of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from math import hypot
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import Annotation, Channel, Ellipsoid
+from ncs_gym.envs.loop import Beginning, Belief
+from ncs_gym.network import CommittedInputs, DownlinkProtocol
+from ncs_gym.network.contract import warn_of_broken_contract
+from ncs_gym.validation import CopiedWhole
+from shields.runtime.decisions import Decision
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LostGuarantee, MonitorState
+from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
+from shields.runtime.set_test import PredictedErrors, norms
+from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
+
+# Why states are not proved safe, by code.
+REASONS = np.array(EXPLANATIONS, dtype=object)
+
+
+class Guard(CopiedWhole, ABC):
+    """Decides the inputs of a loop and follows whether they prove that its state stays in S, or in the box.
+
+    It stands inside the loop, where nothing comes between what is decided and what is applied, and knows what a
+    controller can know. Every step is one `input` and one `observe`. Its claim asks that the loop moved one step in
+    between, and that the input applied is the one that was due, whatever moved it.
+
+    Args:
+        safety_filter: Makes the decisions.
+        downlink: How commands are sent. What is observed belongs to the time at which the next input takes effect.
+        on_unproved: "warn", "raise" or "ignore"; see `LostGuarantee`.
+        size: N; None for one loop, whose values are numbers in place of arrays.
+
+    Attributes:
+        filter: The same.
+        input_delay: c, the number of steps from a decision to its effect.
+        on_unproved: The same.
+        penalty: Subtracted from the reward per intervention.
+        belief: What was observed last.
+        errors: What follows from the error shape of its estimate.
+    """
+
+    def __init__(
+        self, safety_filter: SafetyFilter, downlink: DownlinkProtocol, on_unproved: str, size: int | None = None
+    ) -> None:
+        m = safety_filter.plant.m
+        self.filter, self.input_delay = safety_filter, downlink.input_delay
+        self.on_unproved, self.penalty = on_unproved, 0.0
+        self._monitor = GuaranteeMonitor(safety_filter, downlink)
+        self._errors_of = NumberedErrors(safety_filter)
+        self._lost = LostGuarantee(on_unproved, size or 1)
+        self._schedule = None
+        if downlink.channel is not None:
+            self._schedule = CommittedInputs(self.input_delay, m if size is None else (m, size))
+        self._channels: set[Channel] = set()
+
+    belief: Belief
+    errors: PredictedErrors
+    # What was decided last of what was proposed, and what is left of the plans of mode "lookahead".
+    _decision: Decision
+    _proposed: np.ndarray
+    _stored: np.ndarray
+    _state: MonitorState
+
+    def observe(self, belief: Belief) -> None:
+        """Takes in what is known after the step that followed the decision."""
+        decided, schedule = self._decision.input, self._schedule
+        if schedule is None:
+            on_time, same_input = True, _equal(belief.applied, decided)
+        else:
+            on_time = _equal(belief.applied, schedule.due(decided))
+            same_input = _equal(belief.committed, decided)
+        moved_once = belief.moves == self.belief.moves + 1
+        self._drop(moved_once & same_input & on_time)
+        self._take(belief)
+        happened = self._decision, moved_once, same_input, belief, self.errors, on_time
+        self._state = self._monitor.advance(self._state, *happened)
+
+    def look_at(self, channels: Sequence[Channel]) -> None:
+        """Warns the caller of channels that are new and break the contract of the certificate."""
+        present = set(channels)
+        for channel in present - self._channels:
+            warn_of_broken_contract(self.filter.certificate.contract, channel, self.input_delay)
+        self._channels = present
+
+    def tell(self) -> None:
+        """Says what is new; see `LostGuarantee`."""
+        self._lost.tell()
+
+    def _take(self, belief: Belief) -> None:
+        self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
+
+    def _covered(
+        self, state: MonitorState, earlier: Sequence[tuple[np.ndarray, Any]], insides: Sequence[Any]
+    ) -> MonitorState:
+        """Returns the state with what is known of the steps before the first decision takes effect."""
+        known = []
+        for (estimate, number), inside in zip(earlier, insides, strict=True):
+            quiet = self.belief._replace(estimate=estimate, number=number, alarm=False, damaged=False, outside=False)
+            known.append((inside, quiet, self._errors_of.of(quiet.table, number)))
+        return self._monitor.cover(state, known)
+
+    @abstractmethod
+    def _drop(self, goes_on: Any) -> None:
+        """Drops plans that were certified for other states than those that follow."""
+
+
+class OneGuard(Guard):
+    """The guard of one loop."""
+
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol, on_unproved: str = "warn") -> None:
+        super().__init__(safety_filter, downlink, on_unproved)
+        self._start: Any = None
+        self._known: tuple[StartKnown, ...] = ()
+        self._idle = np.zeros(safety_filter.plant.m)
+        self._interventions = self._proved = self._count = 0
+
+    def begin(self, beginning: Beginning, mask: None = None) -> None:
+        """Begins an episode."""
+        belief, start, earlier, channels = beginning
+        if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
+            self._start, self._known = start, starts_known(self.filter, start, self.input_delay)
+        self.look_at(channels)
+        self.start(belief, self._known, earlier)
+        self._lost.begin()
+        self._interventions = self._proved = self._count = 0
+        margin = self.filter.margin(belief.estimate, self.errors, self._idle)
+        self._decision, self._proposed = Decision(self._idle, False, False, False, margin, ""), self._idle
+
+    def start(
+        self,
+        belief: Belief,
+        known: Sequence[StartKnown],
+        earlier: Sequence[tuple[np.ndarray, int]],
+        *,
+        is_first: bool = True,
+        pending: tuple[np.ndarray, ...] = (),
+    ) -> None:
+        """Begins to follow whether the state is proved safe, at the start of an episode or where its state is found.
+
+        Args:
+            belief: What is known; nobody writes into its estimate.
+            known: What is known of x_0 .. x_c (`starts_known`).
+            earlier: Estimates of x_0 .. x_{c-1}, before the first decision takes effect, and numbers of their errors.
+            is_first: Whether no step of the episode led here.
+            pending: The inputs decided for the next c steps, none of them at the start of an episode.
+        """
+        self._take(belief)
+        self._stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
+        self._state = self._monitor.start(is_safe, belief, self.errors, is_first=is_first)
+        if self._schedule is not None:
+            self._schedule.start()
+            self._schedule.pending = pending or self._schedule.pending
+            acting = pending or (None,) * len(earlier)
+            insides = [
+                known_inside(self.filter, each, mean, self._errors_of.of(belief.table, number), u)
+                for each, (mean, number), u in zip(known[:-1], earlier, acting, strict=True)
+            ]
+            self._state = self._covered(self._state, earlier, insides)
+
+    def decide(self, proposed: np.ndarray) -> Decision:
+        """Returns the decision about a proposed input, shape (m,), at the belief observed last; never raises."""
+        decision = self.filter.decide(self.belief.estimate, self.errors, proposed, self._stored)
+        self._decision, self._proposed = decision, proposed
+        self._stored = decision.plan.copy() if len(decision.plan) else decision.plan
+        return decision
+
+    def input(self, u: np.ndarray) -> np.ndarray:
+        """Returns the input to apply in place of a proposed one, shape (m,)."""
+        return self.decide(u).input
+
+    @property
+    def charge(self) -> float:
+        """The penalty of the last step."""
+        return self.penalty * self._decision.intervened
+
+    @property
+    def plan_length(self) -> int:
+        """Number of inputs stored for the steps to come."""
+        return len(self._stored)
+
+    @property
+    def reason(self) -> str:
+        """Why the state is not proved safe now; empty while it is."""
+        return EXPLANATIONS[self._monitor.reasons(self._state, self.belief.age)]
+
+    def info(self) -> dict[str, Any]:
+        """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
+        decision, proposed, reason = self._decision, self._proposed, self.reason
+        self._count += 1
+        self._proved += not reason
+        self._interventions += decision.intervened
+        if reason:
+            self._lost.note_of(reason)
+        ahead = {"shield_plan_length": self.plan_length} if self.filter.mode == "lookahead" else {}
+        return ahead | {
+            "shield_intervened": decision.intervened,
+            "input_proposed": proposed.copy(),
+            "shield_correction": hypot(*(decision.input - proposed).tolist()) if decision.intervened else 0.0,
+            "shield_margin": decision.margin,
+            "shield_guaranteed": not reason,
+            "shield_reason": reason,
+            "episode_interventions": self._interventions,
+            "episode_guaranteed": self._proved / self._count,
+        }
+
+    def annotation(self, loop: int = 0) -> Annotation:
+        """Returns what the picture of the last step shows."""
+        moved, acted = self._count > 1, self._decision.intervened
+        return _annotation(self.filter, self._proposed if moved else None, self._stored, acted, self._interventions)
+
+    def _drop(self, goes_on: bool) -> None:
+        if not goes_on:
+            self._stored = self._stored[:0]
+
+
+class ManyGuards(Guard):
+    """The guard of N loops, the last axis of every array.
+
+    Args:
+        safety_filter: Makes the decisions.
+        downlink: How commands are sent.
+        initial_set: Contains the starts that no option gave.
+        on_unproved: "warn", "raise" or "ignore".
+        size: N.
+    """
+
+    def __init__(
+        self,
+        safety_filter: SafetyFilter,
+        downlink: DownlinkProtocol,
+        initial_set: Ellipsoid,
+        on_unproved: str,
+        size: int,
+    ) -> None:
+        super().__init__(safety_filter, downlink, on_unproved, size)
+        self._size, self._idle = size, np.zeros((safety_filter.plant.m, size))
+        self._drawn = starts_known(safety_filter, initial_set, self.input_delay)
+        self._none = none = np.zeros(size, np.bool_)
+        self._state = MonitorState(np.zeros(size, np.int64), none, none, none, np.zeros(size, np.int64))
+        self._interventions, self._proved, self._count = np.zeros((3, size), np.int64)
+        self._decision = Decision(self._idle, none, none, none, np.zeros(size), none)
+        # Plans stored in mode "lookahead", NaN beyond their ends.
+        self._stored = np.full((safety_filter.lookahead.horizon, *self._idle.shape), np.nan)
+        self._no_reason = np.full(size, "", dtype=object)
+        self._no_reason.flags.writeable = False
+
+    def begin(self, beginning: Beginning, mask: np.ndarray) -> None:
+        """Begins episodes where `mask`, shape (N,), says so."""
+        belief, starts, earlier, channels = beginning
+        chosen, none = np.flatnonzero(mask), self._none
+        self.look_at(channels)
+        self._lost.begin(mask)
+        self._take(belief)
+        known = [self._drawn] * self._size
+        for e in np.flatnonzero(mask & ~np.isnan(starts[:, 0])).tolist():
+            known[e] = starts_known(self.filter, starts[e], self.input_delay)
+        is_safe = np.array([each[-1].in_safe_set for each in known])
+        if len(self._stored):
+            self._stored[..., mask] = np.nan
+            for e in chosen.tolist():
+                estimate, errors = belief.estimate[:, e].copy(), self.errors.single(e)
+                plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e][-1])
+                self._stored[: len(plan), :, e] = plan
+        started = self._monitor.start(is_safe, belief, self.errors)
+        self._state = MonitorState(*(np.where(mask, *both) for both in zip(started, self._state, strict=True)))
+        if self._schedule is not None:
+            self._schedule.start(mask)
+            insides = []
+            for ahead, (means, numbers) in enumerate(earlier):
+                errors = self._errors_of.of(belief.table, numbers)
+                inside = [
+                    known_inside(self.filter, known[e][ahead], means[:, k].copy(), errors.single(k))
+                    for k, e in enumerate(chosen.tolist())
+                ]
+                insides.append(np.array(inside, np.bool_))
+            covered = self._covered(MonitorState(*(array[chosen] for array in self._state)), earlier, insides)
+            for kept, new in zip(self._state, covered, strict=True):
+                kept[chosen] = new
+        margin, sets = self._decision.margin.copy(), self.filter.test.reachable(*self._some(chosen))
+        margin[chosen] = sets.margins(self._idle[:, chosen])[1]
+        self._decision, self._proposed = Decision(self._idle, none, none, none, margin, none), self._idle
+        self._counted, goes_on = mask, ~mask
+        self._count, self._proved = self._count * goes_on, self._proved * goes_on
+        self._interventions = self._interventions * goes_on
+
+    def input(self, u: np.ndarray) -> np.ndarray:
+        """Returns the inputs to apply in place of proposed ones, shape (m, N)."""
+        decided = self.filter.decide_columns(self.belief.estimate, self.errors, u, self._stored)
+        self._decision, self._proposed, self._counted = decided, u, ~self._none
+        self._stored = decided.plan.copy()
+        return decided.input
+
+    @property
+    def charge(self) -> np.ndarray:
+        """The penalties of the last step, shape (N,)."""
+        return self.penalty * self._decision.intervened
+
+    def info(self) -> dict[str, Any]:
+        """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
+        decided, proposed = self._decision, self._proposed
+        reasons = self._monitor.reasons(self._state, self.belief.age)
+        is_proved = reasons == 0
+        self._count, self._proved = self._count + self._counted, self._proved + (is_proved & self._counted)
+        self._interventions = self._interventions + decided.intervened
+        doubted = np.count_nonzero(reasons) > 0
+        if doubted:
+            self._lost.note(reasons, np.arange(self._size))
+        ahead = {}
+        if len(self._stored):
+            ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(self._stored[:, 0]), axis=0)
+        return ahead | {
+            "shield_intervened": decided.intervened.copy(),
+            "input_proposed": proposed.T.copy(),
+            "shield_correction": norms(decided.input - proposed),
+            "shield_margin": decided.margin.copy(),
+            "shield_guaranteed": is_proved,
+            "shield_reason": REASONS[reasons] if doubted else self._no_reason,
+            "episode_interventions": self._interventions.copy(),
+            "episode_guaranteed": self._proved / self._count,
+        }
+
+    def annotation(self, loop: int = 0) -> Annotation:
+        """Returns what the picture of the last step shows of a loop."""
+        plan, acted = self._stored[..., loop], bool(self._decision.intervened[loop])
+        plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
+        proposed = self._proposed[:, loop] if self._count[loop] > 1 else None
+        return _annotation(self.filter, proposed, plan, acted, int(self._interventions[loop]))
+
+    def _some(self, chosen: np.ndarray) -> tuple[np.ndarray, PredictedErrors]:
+        return self.belief.estimate[:, chosen], self.errors.of(chosen)
+
+    def _drop(self, goes_on: np.ndarray) -> None:
+        if len(self._stored):
+            self._stored[..., ~goes_on] = np.nan
+
+
+def _annotation(
+    safety_filter: SafetyFilter, proposed: np.ndarray | None, plan: np.ndarray, acted: bool, count: int
+) -> Annotation:
+    return Annotation(
+        safe_set=safety_filter.certificate.safe_set,
+        label=safety_filter.mode,
+        proposed=None if proposed is None else proposed.copy(),
+        intervened=acted,
+        interventions=count,
+        protects=safety_filter.mode != "monitor",
+        plan=plan.copy() if safety_filter.mode == "lookahead" else None,
+    )
+
+
+def _equal(taken: np.ndarray, decided: np.ndarray) -> Any:
+    """Returns whether inputs are equal: a truth value for shape (m,), an array (N,) for (m, N)."""
+    return taken.tolist() == decided.tolist() if taken.ndim == 1 else (taken == decided).all(axis=0)
