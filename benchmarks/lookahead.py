@@ -154,7 +154,7 @@ def decisions(safe_set: SafeSet = "polytope", steps: int = 100) -> None:
         single = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
         certificate = synthesize(single.plant, contract=single.certificate_contract, safe_set=safe_set)
         shielded = VectorSafetyShield(env, certificate, "lookahead", horizon=horizon, on_unproved="ignore")
-        shielded._filter = Recorded(certificate, single.plant, "lookahead", horizon)
+        shielded._guard.filter = Recorded(certificate, single.plant, "lookahead", horizon)
         shielded.reset(seed=0)
         for _ in range(WARM + steps):
             shielded.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))

@@ -27,12 +27,12 @@ COVARIANCE_ROUNDING, EIGENVALUE_ROUNDING = 1e-6, 1e-12
 FILLED_IN_LATER: Any = None
 
 
-# The packages, what makes their dataclasses, and what `np.errstate` puts between.
-_OURS = "ncs_gym.", "shields.", "dataclasses", "numpy._core."
+# The packages, what makes their dataclasses, and what wrappers and `np.errstate` put between.
+_OURS = "ncs_gym.", "shields.", "gymnasium.", "dataclasses", "numpy._core."
 
 
 def warn_caller(text: str, category: type[Warning]) -> None:
-    """Warns the first caller outside these packages."""
+    """Warns the first caller outside these packages and gymnasium."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(_OURS):
         level, frame = level + 1, frame.f_back

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ import numpy as np
 import ncs_gym
 import shields
 from ncs_gym import Ball, Bounds, Box, Ellipsoid, Gaussian, Limits, LinearPlant, Model, Sum, Through
+from ncs_gym.envs.report import Belief
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
 from shields import Certificate
@@ -26,6 +28,14 @@ _SOURCES = (
     ("sensor", "measurement_noise_cov", "sensor_bound"),
     ("first_error", "initial_cov", "initial_bound"),
 )
+
+
+def belief(estimate: np.ndarray, alarm: Any = False, *, stays: bool = True) -> Belief:
+    """What a monitor is told of one loop, or of N, whose error sets are certified to stay (`stays`) or not."""
+    many = estimate.ndim > 1
+    table: Any = SimpleNamespace(is_certified=lambda _: stays, certified=np.array([stays]))
+    number = np.zeros(estimate.shape[1], np.intp) if many else 0
+    return Belief(estimate, number, table, 0, alarm, False, False, estimate, estimate)
 
 
 def linear_plant(**described: Any) -> LinearPlant:

@@ -11,21 +11,19 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop import Belief, Guard, Loop, OneLoop
+from ncs_gym.envs.loop import GuardedLoop, Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
-from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.downlink import DownlinkProtocol, Inputs, no_inputs
+from ncs_gym.network.downlink import Inputs, no_inputs
 from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, as_flag, setting, shown
 
@@ -39,7 +37,7 @@ class RenderModeError(ValueError, TypeError):
     """An unknown render mode; a TypeError too, because stable-baselines3 asks for "rgb_array" and retries on that."""
 
 
-class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
+class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     """A plant behind an imperfect network; the controller sees an estimate of the state.
 
     ## Action space
@@ -150,25 +148,12 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
     observation_space: Box
     action_space: Box
-    loop: Loop = setting("loop", "_now.loop")
-    plant: LinearPlant = setting("plant", "_now.loop.plant")
-    channel: Channel = setting("channel", "_now.loop.channel")
+    _now: OneLoop
     task: Task = setting("task")
-    disturbance: Disturbance = setting("disturbance", "_now.loop.disturbance")
-    initial_set: Ellipsoid = setting("initial_set", "_now.loop.initial_set")
     terminate_on_violation: bool = setting("terminate_on_violation")
-    allow_assumption_violation: bool = setting("allow_assumption_violation", "_now.loop.allow_assumption_violation")
-    contract: ChannelContract | None = setting("contract", "_now.loop.contract")
-    certificate_contract: ChannelContract | None = setting("certificate_contract", "_now.loop.certificate_contract")
-    error_set: ErrorSet = setting("error_set", "_now.loop.error_set")
     estimator: Estimator = setting("estimator", "_now.estimator")
     horizon: int = setting("horizon")
-    noise: str = setting("noise", "_now.loop.noise")
     observe: tuple[str, ...] = setting("observe")
-    process: Process = setting("process", "_now.loop.process")
-    downlink: Channel | None = setting("downlink", "_now.loop.downlink")
-    downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
-    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
     steps: int = setting("steps", "_now.steps")
     episodes: int = setting("episodes", "_now.episodes")
     start: Ellipsoid | np.ndarray = setting("start", "_now.start")
@@ -211,7 +196,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
         self._now = OneLoop(loop)
-        self._guard: Guard | None = None
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         input_delay = len(self._now.pending)
@@ -219,7 +203,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         sets, steps = (self.error_set, self.initial_set), self._horizon + input_delay
         self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
         self._observer = Observer(self._task, self.observation_space, self._observe, self._horizon)
-        self._consistent = self._over = False
+        self._over = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -253,7 +237,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
             info |= guard.info()
         self._consistent, self._over = True, False
         if self.renderer is not None:
-            self.renderer.begin(info, self._task_state, guard and guard.annotation())
+            self.renderer.begin(info, self._task_state, None if guard is None else guard.annotation())
         observation = self._observation()
         if guard is not None:
             guard.tell()
@@ -288,7 +272,7 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
             sent = sent_at(now.steps, now.network, now.received)
-            self.renderer.record(info, self._task_state, sent, guard and guard.annotation())
+            self.renderer.record(info, self._task_state, sent, None if guard is None else guard.annotation())
         observation = self._observation()
         if guard is not None:
             guard.tell()
@@ -367,25 +351,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         """The downlink of this episode; None for an ideal one."""
         return self._now.downlinks.now[0]
 
-    @property
-    def belief(self) -> Belief:
-        """What a controller can know now, read-only."""
-        return self._belief
-
-    @property
-    def guard(self) -> Guard | None:
-        """What decides the inputs in place of the actions; None without a shield."""
-        return self._guard
-
-    def install(self, guard: Guard) -> None:
-        """Has a guard decide the inputs, from the next reset on; a shield does this.
-
-        Raises:
-            ValueError: If there is one.
-        """
-        require_bare(self._guard)
-        self._guard, self._consistent = guard, False
-
     def close(self) -> None:
         """Closes the window and the process."""
         self._now.process.close()
@@ -402,12 +367,6 @@ class NCSEnv(SpecOfJson, gym.Env[np.ndarray, np.ndarray]):
         report = self._now.report(inputs, arrived)
         self._belief = report.belief
         return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant, read))
-
-
-def require_bare(guard: Guard | None) -> None:
-    """Raises ValueError if an environment has a guard."""
-    if guard is not None:
-        raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.envs.loop import Report
+from ncs_gym.envs.report import Report
 
 # What is a number in the info of one environment, and of many an array that the environments go on using.
 SHARED = (

@@ -1,19 +1,19 @@
-"""One control loop, or N side by side: what it is made of, how it moves, and what is reported of it."""
+"""One control loop, or N side by side: what it is made of, and how it moves."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
 from ncs_gym.envs.loop_settings import CHANNELS, expect, loop_contracts, starting_set
+from ncs_gym.envs.report import Beginning, Belief, Guard, Report
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.error_table import ErrorTable
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel
@@ -27,139 +27,10 @@ from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import LinearProcess, Process, as_process, own_process
 from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import CopiedWhole, as_flag, frozen, warn_caller
+from ncs_gym.validation import CopiedWhole, as_flag, frozen, setting, warn_caller
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
-
-
-class Belief(NamedTuple):
-    """What a controller can know of a loop now; of N loops, arrays whose last axis is the loop.
-
-    A shield takes what it decides on from here, never from an `info`, into which wrappers may have written. Nobody
-    writes into the arrays.
-
-    Attributes:
-        estimate: x_hat of the time at which the next decision takes effect, shape (n,) or (n, N).
-        number: Number of the ellipsoid Sigma_k that holds its error, an int or shape (N,).
-        table: What gives that number its meaning; another one after shapes were forgotten.
-        age: Steps since the newest sample used was taken, an int or shape (N,).
-        alarm: Whether an assumption was seen to be violated, a bool or shape (N,).
-        damaged: Whether one was because a sample was no finite numbers, a bool or shape (N,).
-        outside: Whether `alarm` is also about a step of the process outside E(D), a bool or shape (N,).
-        applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
-        committed: The input decided in the last step, of the same shape.
-        moves: Steps and resets of this loop since it was made, an int or shape (N,): the one clock.
-    """
-
-    estimate: np.ndarray
-    number: Any
-    table: ErrorTable
-    age: Any
-    alarm: Any
-    damaged: Any
-    outside: Any
-    applied: np.ndarray
-    committed: np.ndarray
-    moves: Any = 0
-
-    @property
-    def stays(self) -> Any:
-        """Whether an error in a certified set is known to stay there while the contract is kept, of one loop or N."""
-        if self.estimate.ndim == 1:
-            return self.table.is_certified(self.number)
-        return self.table.certified.take(self.number)
-
-    @property
-    def error_shape(self) -> np.ndarray:
-        """Sigma_k, shape (n, n) and read-only, or a fresh array of shape (N, n, n)."""
-        if self.estimate.ndim == 1:
-            return self.table.shape(self.number)
-        return self.table.shapes.take(self.number, axis=0)
-
-
-class Beginning(NamedTuple):
-    """What a guard is told where episodes begin.
-
-    Attributes:
-        belief: What a controller can know.
-        start: What the start is known to lie in, an ellipsoid or the state itself; of N loops, states that episodes
-            were started at by an option or outside the initial set, NaN elsewhere, shape (N, n).
-        earlier: Estimate and number of the error set of every step before the first decision takes effect; of N loops
-            of those that begin alone.
-        channels: Those of the present episodes.
-    """
-
-    belief: Belief
-    start: Any
-    earlier: list[tuple[np.ndarray, Any]]
-    channels: Sequence[Channel]
-
-
-class Guard(Protocol):
-    """Decides the inputs of a loop, or of N, given what a controller can know, and reports on it.
-
-    An environment calls `begin` where episodes begin, `input` and then `observe` in every step; then it asks for `info`
-    and `charge`, and, when all else is done, has the guard `tell` what it has to.
-    """
-
-    @property
-    def charge(self) -> Any:
-        """What is subtracted from the reward of the last step, a number or shape (N,)."""
-
-    def begin(self, beginning: Beginning, mask: np.ndarray | None = None) -> None:
-        """Begins episodes, of N loops where `mask`, shape (N,), says so."""
-
-    def input(self, u: np.ndarray) -> np.ndarray:
-        """Returns the input to apply in place of a proposed one, shape (m,) or (m, N); neither is written into."""
-
-    def observe(self, belief: Belief) -> None:
-        """Takes in what is known after the step."""
-
-    def info(self) -> dict[str, Any]:
-        """Returns the guard's keys of `info`, fresh arrays."""
-
-    def tell(self) -> None:
-        """Warns or raises, if there is a reason."""
-
-    def annotation(self, loop: int = 0) -> Any:
-        """Returns what the picture of the last step shows of a loop."""
-
-
-class Report(NamedTuple):
-    """What happened in a step of a loop; of N loops, arrays whose last axis is the loop.
-
-    Attributes:
-        belief: What a controller can know; the rest is true besides.
-        steps: Steps taken in the episode, an int or shape (N,).
-        state: x, shape (n,) or (n, N).
-        mean: x_hat now, also behind a downlink, of the same shape.
-        arrived: Whether a packet arrived at this step, a bool or shape (N,).
-        packets: Samples sent in the episode, an int or shape (N,).
-        values: How far c_j x is beyond a limit now, shape (k,) or (k, N).
-        worst: The largest since the last step, and those of limits of x and u, shape (k + q,) or (k + q, N).
-        cost: 1.0 if one of these is positive, else 0.0, a float or shape (N,).
-        violations: The sum of costs in the episode, a float or shape (N,).
-        missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
-        requested: Whether a sample was requested, a bool or shape (N,).
-        forced: Whether that was so only because the contract needs it, likewise.
-        others: Infos about the episode: its channels, the parameters of the member of a family.
-    """
-
-    belief: Belief
-    steps: Any
-    state: np.ndarray
-    mean: np.ndarray
-    arrived: Any
-    packets: Any
-    values: np.ndarray
-    worst: np.ndarray
-    cost: Any
-    violations: Any
-    missing: Any
-    requested: Any
-    forced: Any
-    others: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -239,6 +110,43 @@ class Loop:
     def oldest(self) -> float:
         """The largest age of the newest sample that the contract allows [steps]; infinite without one."""
         return largest_age(self.contract)
+
+
+class GuardedLoop:
+    """What environments of one loop and of many have in common: the parts of the loop, and the guard inside it."""
+
+    loop: Loop = setting("loop", "_now.loop")
+    plant: LinearPlant = setting("plant", "_now.loop.plant")
+    channel: Channel = setting("channel", "_now.loop.channel")
+    disturbance: Disturbance = setting("disturbance", "_now.loop.disturbance")
+    initial_set: Ellipsoid = setting("initial_set", "_now.loop.initial_set")
+    allow_assumption_violation: bool = setting("allow_assumption_violation", "_now.loop.allow_assumption_violation")
+    contract: ChannelContract | None = setting("contract", "_now.loop.contract")
+    certificate_contract: ChannelContract | None = setting("certificate_contract", "_now.loop.certificate_contract")
+    error_set: ErrorSet = setting("error_set", "_now.loop.error_set")
+    noise: str = setting("noise", "_now.loop.noise")
+    process: Process = setting("process", "_now.loop.process")
+    downlink: Channel | None = setting("downlink", "_now.loop.downlink")
+    downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
+    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
+    belief: Belief = setting("belief")
+    guard: Guard | None = setting("guard")
+
+    _now: LoopState
+    _belief: Belief
+    _guard: Guard | None = None
+    # Whether there is an episode that no exception has interrupted.
+    _consistent = False
+
+    def install(self, guard: Guard) -> None:
+        """Has a guard decide the inputs, from the next reset on; a shield does this.
+
+        Raises:
+            ValueError: If there is one.
+        """
+        if self._guard is not None:
+            raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
+        self._guard, self._consistent = guard, False
 
 
 class LoopState(CopiedWhole, ABC):

@@ -11,27 +11,21 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.autoreset import Autoreset, Begun, Moved
-from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv, require_bare
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop import Belief, Guard, Loop, ManyLoops, with_columns
+from ncs_gym.envs.loop import GuardedLoop, ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, actions_of, read_actions
-from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.network.channel import Channel, widest
-from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.downlink import DownlinkProtocol, Inputs, no_inputs
+from ncs_gym.network.downlink import Inputs, no_inputs
 from ncs_gym.network.requests import require_on_request
-from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.process import Process
 from ncs_gym.rendering import PacketRecord
 from ncs_gym.tasks.base_task import Task
-from ncs_gym.uncertainty.disturbances import Disturbance
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, setting, shown
 
 
-class NCSVectorEnv(SpecOfJson, VectorEnv):
+class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
     """N copies of `NCSEnv` with the same semantics, spaces and info keys; every info value has N as its first axis.
 
     Inside, the environment is the last axis, so that A x + B u stands as in the formulas. What depends only on when
@@ -64,24 +58,11 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     """
 
     single: NCSEnv = setting("single")
-    loop: Loop = setting("loop", "_now.loop")
-    plant: LinearPlant = setting("plant", "_now.loop.plant")
-    channel: Channel = setting("channel", "_now.loop.channel")
+    _now: ManyLoops
     task: Task = setting("task")
-    disturbance: Disturbance = setting("disturbance", "_now.loop.disturbance")
-    initial_set: Ellipsoid = setting("initial_set", "_now.loop.initial_set")
     terminate_on_violation: bool = setting("terminate_on_violation", "_single.terminate_on_violation")
-    allow_assumption_violation: bool = setting("allow_assumption_violation", "_now.loop.allow_assumption_violation")
     horizon: int = setting("horizon", "_single.horizon")
-    noise: str = setting("noise", "_now.loop.noise")
     observe: tuple[str, ...] = setting("observe", "_single.observe")
-    process: Process = setting("process", "_now.loop.process")
-    contract: ChannelContract | None = setting("contract", "_now.loop.contract")
-    certificate_contract: ChannelContract | None = setting("certificate_contract", "_now.loop.certificate_contract")
-    error_set: ErrorSet = setting("error_set", "_now.loop.error_set")
-    downlink: Channel | None = setting("downlink", "_now.loop.downlink")
-    downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
-    downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode", "_autoreset.mode")
     steps: np.ndarray = setting("steps", "_now.steps")
@@ -118,9 +99,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._observer = Observer(self._task, single.observation_space, single.observe, single.horizon, many=True)
         self._now = ManyLoops(single.loop, self.num_envs, *own)
-        self._consistent = False
-        self._belief: Belief
-        self._guard: Guard | None = None
 
     @property
     def state(self) -> np.ndarray:
@@ -136,25 +114,6 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
     def episode_downlinks(self) -> tuple[Channel | None, ...]:
         """The downlinks of the present episodes; None for ideal ones."""
         return tuple(self._now.downlinks.now)
-
-    @property
-    def belief(self) -> Belief:
-        """What a controller can know now, read-only."""
-        return self._belief
-
-    @property
-    def guard(self) -> Guard | None:
-        """What decides the inputs in place of the actions; None without a shield."""
-        return self._guard
-
-    def install(self, guard: Guard) -> None:
-        """Has a guard decide the inputs, from the next reset on; a shield does this.
-
-        Raises:
-            ValueError: If there is one.
-        """
-        require_bare(self._guard)
-        self._guard, self._consistent = guard, False
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -286,7 +245,7 @@ class NCSVectorEnv(SpecOfJson, VectorEnv):
         renderer, e = self._single.renderer, self.rendered_env
         if renderer is None:
             return
-        note = self._guard and self._guard.annotation(e)
+        note = None if self._guard is None else self._guard.annotation(e)
         own = {key: value[e] for key, value in info.items() if not key.startswith(("_", "final"))}
         task_state = np.copy(self._task_state[..., e])[()]
         if begins[e]:

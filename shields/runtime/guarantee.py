@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.envs.loop import Belief
+from ncs_gym.envs.report import Belief
 from ncs_gym.network.contract import largest_age
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
@@ -159,11 +159,11 @@ class GuaranteeMonitor:
         """
         broken = state.broken
         if moved_once is not True:
-            broken = _first(broken, _not(moved_once), OTHER_STEPS)
+            broken = first_broken(broken, _not(moved_once), OTHER_STEPS)
         if same_input is not True:
-            broken = _first(broken, _not(same_input), OTHER_INPUT)
+            broken = first_broken(broken, _not(same_input), OTHER_INPUT)
         if on_time is not True:
-            broken = _first(broken, _not(on_time), LATE_INPUT)
+            broken = first_broken(broken, _not(on_time), LATE_INPUT)
         inside = decision.proved
         if inside is not True and not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
@@ -179,24 +179,24 @@ class GuaranteeMonitor:
         """
         reason = state.broken
         if not self._is_promised:
-            reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
+            reason = first_broken(reason, True, NO_DOWNLINK_CONTRACT)
         if state.inside is not True:
-            reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
+            reason = first_broken(reason, _not(state.inside), NOT_KNOWN_INSIDE)
         if self._input_delay or self._within_step:
-            reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
+            reason = first_broken(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         lasts = state.certified & state.stays
         if lasts is True or _all(lasts):
             return reason
         is_large = _not(lasts)
-        reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
-        return _first(reason, is_large, LARGE_ERROR)
+        reason = first_broken(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
+        return first_broken(reason, is_large, LARGE_ERROR)
 
     def _within_limits(self, broken: Any, estimate: np.ndarray, errors: PredictedErrors) -> Any:
         if not self._under_way:
             return broken
         middle, half = self._limits if estimate.ndim == 1 else self._limits[..., None]
         stored, widths = estimate[-self._under_way :], errors.half_widths[-self._under_way :]
-        return _first(broken, _not(_rows_all(np.abs(stored - middle) + widths <= half)), LEFT_MODEL)
+        return first_broken(broken, _not(_rows_all(np.abs(stored - middle) + widths <= half)), LEFT_MODEL)
 
     def _observe(
         self, broken: Any, inside: Any, belief: Belief, errors: PredictedErrors, wait: Any, on_the_way: Any = True
@@ -207,15 +207,17 @@ class GuaranteeMonitor:
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
         if alarm is not False or damaged is not False:
-            broken = _first(_first(_first(broken, damaged, NOT_FINITE), belief.outside, OUTSIDE_BOUND), alarm, ALARM)
+            broken = first_broken(
+                first_broken(first_broken(broken, damaged, NOT_FINITE), belief.outside, OUTSIDE_BOUND), alarm, ALARM
+            )
         if np.count_nonzero(within) < within.size:  # quicker than all()
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
-            broken = _first(_first(broken, _not(usable), UNUSABLE), _not(near), FAR_OUT)
+            broken = first_broken(first_broken(broken, _not(usable), UNUSABLE), _not(near), FAR_OUT)
         if inside is not True and not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
-                broken = _first(broken, _not(inside), LEFT_MODEL)
+                broken = first_broken(broken, _not(inside), LEFT_MODEL)
         if self._input_delay or self._within_step:
             wait = longer_wait(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
         return MonitorState(broken, inside, errors.certified, belief.stays, wait)
@@ -301,7 +303,7 @@ def _all(conditions: Any) -> bool:
     return conditions is True or np.count_nonzero(conditions) == np.size(conditions)
 
 
-def _first(broken: Any, condition: Any, explanation: str) -> Any:
+def first_broken(broken: Any, condition: Any, explanation: str) -> Any:
     """Returns the code of what broke first: that of the explanation where nothing had and the condition holds."""
     if condition is False or not np.count_nonzero(condition):  # the usual case
         return broken

@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Annotation, Channel, Ellipsoid
-from ncs_gym.envs.loop import Beginning, Belief
+from ncs_gym.envs.report import Beginning, Belief
 from ncs_gym.network import CommittedInputs, DownlinkProtocol
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import CopiedWhole
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LostGuarantee, MonitorState
+from shields.runtime.guarantee import (
+    EXPLANATIONS,
+    OTHER_STEPS,
+    GuaranteeMonitor,
+    LostGuarantee,
+    MonitorState,
+    first_broken,
+)
 from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
 from shields.runtime.set_test import PredictedErrors, norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
@@ -67,6 +74,8 @@ class Guard(CopiedWhole, ABC):
     _proposed: np.ndarray
     _stored: np.ndarray
     _state: MonitorState
+    # The clock of the loop when it was observed last.
+    _moves: Any
 
     def observe(self, belief: Belief) -> None:
         """Takes in what is known after the step that followed the decision."""
@@ -76,7 +85,7 @@ class Guard(CopiedWhole, ABC):
         else:
             on_time = _equal(belief.applied, schedule.due(decided))
             same_input = _equal(belief.committed, decided)
-        moved_once = belief.moves == self.belief.moves + 1
+        moved_once, self._moves = belief.moves == self._moves + 1, belief.moves
         self._drop(moved_once & same_input & on_time)
         self._take(belief)
         happened = self._decision, moved_once, same_input, belief, self.errors, on_time
@@ -121,7 +130,7 @@ class OneGuard(Guard):
         self._idle = np.zeros(safety_filter.plant.m)
         self._interventions = self._proved = self._count = 0
 
-    def begin(self, beginning: Beginning, mask: None = None) -> None:
+    def begin(self, beginning: Beginning, mask: Any = None) -> None:
         """Begins an episode."""
         belief, start, earlier, channels = beginning
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
@@ -152,6 +161,7 @@ class OneGuard(Guard):
             pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self._take(belief)
+        self._moves = belief.moves
         self._stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
         self._state = self._monitor.start(is_safe, belief, self.errors, is_first=is_first)
         if self._schedule is not None:
@@ -244,6 +254,7 @@ class ManyGuards(Guard):
         self._drawn = starts_known(safety_filter, initial_set, self.input_delay)
         self._none = none = np.zeros(size, np.bool_)
         self._state = MonitorState(np.zeros(size, np.int64), none, none, none, np.zeros(size, np.int64))
+        self._moves = np.zeros(size, np.int64)
         self._interventions, self._proved, self._count = np.zeros((3, size), np.int64)
         self._decision = Decision(self._idle, none, none, none, np.zeros(size), none)
         # Plans stored in mode "lookahead", NaN beyond their ends.
@@ -251,7 +262,7 @@ class ManyGuards(Guard):
         self._no_reason = np.full(size, "", dtype=object)
         self._no_reason.flags.writeable = False
 
-    def begin(self, beginning: Beginning, mask: np.ndarray) -> None:
+    def begin(self, beginning: Beginning, mask: Any = None) -> None:
         """Begins episodes where `mask`, shape (N,), says so."""
         belief, starts, earlier, channels = beginning
         chosen, none = np.flatnonzero(mask), self._none
@@ -268,6 +279,8 @@ class ManyGuards(Guard):
                 estimate, errors = belief.estimate[:, e].copy(), self.errors.single(e)
                 plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
+        self._leave(~mask & (belief.moves != self._moves))
+        self._moves = belief.moves
         started = self._monitor.start(is_safe, belief, self.errors)
         self._state = MonitorState(*(np.where(mask, *both) for both in zip(started, self._state, strict=True)))
         if self._schedule is not None:
@@ -332,6 +345,12 @@ class ManyGuards(Guard):
         plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
         proposed = self._proposed[:, loop] if self._count[loop] > 1 else None
         return _annotation(self.filter, proposed, plan, acted, int(self._interventions[loop]))
+
+    def _leave(self, strayed: np.ndarray) -> None:
+        """Ends the proof of loops that moved without this guard."""
+        if np.count_nonzero(strayed):
+            self._state = self._state._replace(broken=first_broken(self._state.broken, strayed, OTHER_STEPS))
+            self._drop(~strayed)
 
     def _some(self, chosen: np.ndarray) -> tuple[np.ndarray, PredictedErrors]:
         return self.belief.estimate[:, chosen], self.errors.of(chosen)

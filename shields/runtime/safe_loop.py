@@ -10,7 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
-from ncs_gym.envs.loop import Belief
+from ncs_gym.envs.report import Belief
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol

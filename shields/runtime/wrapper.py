@@ -8,10 +8,9 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import VectorWrapper
 
 from ncs_gym import BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
-from ncs_gym.envs.env import require_bare
 from ncs_gym.validation import AroundEnvironments, as_number, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.packaged_certificates import certificate_for
@@ -30,6 +29,9 @@ class _Shield(RecordConstructorArgs):
     channel: Channel = setting("channel", "_inner.channel")
 
     env: Any
+    # The environment that the guard stands in, and the base class of wrappers around it.
+    _inside: type[NCSEnv] | type[NCSVectorEnv]
+    _wrapper: Any
 
     @property
     def penalty(self) -> float:
@@ -41,17 +43,15 @@ class _Shield(RecordConstructorArgs):
         self._guard.penalty = as_number(value, "penalty", low=0.0)
         self._saved_kwargs["penalty"] = self._guard.penalty  # for the spec
 
-    def _install(
+    def __init__(
         self,
         env: Any,
-        kind: type[NCSEnv] | type[NCSVectorEnv],
-        certificate: Any,
-        mode: str,
-        penalty: float,
-        horizon: int | None,
-        on_unproved: str,
+        certificate: Certificate | Mapping[str, Any] | str | os.PathLike[str] | None = None,
+        mode: str = "project",
+        penalty: float = 0.0,
+        horizon: int | None = None,
+        on_unproved: str = "warn",
     ) -> None:
-        """Records the settings, and installs a guard in the innermost environment."""
         if isinstance(certificate, os.PathLike):
             certificate = os.fspath(certificate)
         if not (certificate is None or isinstance(certificate, Certificate | Mapping | str)):
@@ -64,9 +64,8 @@ class _Shield(RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, certificate=recorded, **given)
         read = None if certificate is None else Certificate.read(certificate)
         inner = self._inner = getattr(env, "unwrapped", env)
-        if not isinstance(inner, kind):
-            raise ValueError(f"the shield needs an {kind.__name__} inside, got {type(inner).__name__}")
-        require_bare(inner.guard)
+        if not isinstance(inner, self._inside):
+            raise ValueError(f"the shield needs an {self._inside.__name__} inside, got {type(inner).__name__}")
         certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
         judge = SafetyFilter(certificate, inner.plant, mode, horizon)
         self._guard: Guard
@@ -85,13 +84,20 @@ class _Shield(RecordConstructorArgs):
                 BrokenContractWarning,
             )
         inner.install(self._guard)
+        self._wrapper.__init__(self, env)
 
-    def _require_guarded(self) -> None:
-        """Raises ValueError if the environment inside is not the one that has the guard any more."""
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes; see the environment's.
+
+        Raises:
+            ValueError: If the environment inside is another one than that which the shield was made for.
+            GuaranteeLostError: If x in S is not proved and that is to be raised; the episodes have begun then.
+        """
         if self.env.unwrapped.guard is not self._guard:
             raise ValueError(
                 "the environment is not the one that the shield was made for: wrap it in a shield of its own"
             )
+        return self.env.reset(seed=seed, options=options)
 
 
 class SafetyShield(_Shield, gym.Wrapper):
@@ -145,27 +151,7 @@ class SafetyShield(_Shield, gym.Wrapper):
         ValueError: If the environment is not an `NCSEnv`, has a shield already, or a setting is wrong.
     """
 
-    def __init__(
-        self,
-        env: gym.Env,
-        certificate: Certificate | Mapping[str, Any] | str | os.PathLike[str] | None = None,
-        mode: str = "project",
-        penalty: float = 0.0,
-        horizon: int | None = None,
-        on_unproved: str = "warn",
-    ) -> None:
-        self._install(env, NCSEnv, certificate, mode, penalty, horizon, on_unproved)
-        gym.Wrapper.__init__(self, env)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode; see `NCSEnv.reset`.
-
-        Raises:
-            ValueError: If the environment inside is another one than that which the shield was made for.
-            GuaranteeLostError: If x in S is not proved and that is to be raised; the episode has begun then.
-        """
-        self._require_guarded()
-        return self.env.reset(seed=seed, options=options)
+    _inside, _wrapper = NCSEnv, gym.Wrapper
 
 
 class VectorSafetyShield(_Shield, AroundEnvironments, VectorWrapper):
@@ -190,27 +176,4 @@ class VectorSafetyShield(_Shield, AroundEnvironments, VectorWrapper):
         ValueError: If the environment is not an `NCSVectorEnv`, has a shield already, or a setting is wrong.
     """
 
-    def __init__(
-        self,
-        env: VectorEnv,
-        certificate: Certificate | Mapping[str, Any] | str | os.PathLike[str] | None = None,
-        mode: str = "project",
-        penalty: float = 0.0,
-        horizon: int | None = None,
-        on_unproved: str = "warn",
-    ) -> None:
-        self._install(env, NCSVectorEnv, certificate, mode, penalty, horizon, on_unproved)
-        VectorWrapper.__init__(self, env)
-
-    def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes; see `NCSVectorEnv.reset`.
-
-        Raises:
-            ValueError: If the environment inside is another one than that which the shield was made for.
-            GuaranteeLostError: If x in S is not proved and that is to be raised; the episodes have begun then.
-        """
-        self._require_guarded()
-        # gymnasium's annotation leaves out the lists that its own vector environments take.
-        return self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+    _inside, _wrapper = NCSVectorEnv, VectorWrapper

@@ -14,13 +14,13 @@ from ncs_gym.network import downlink_protocol
 from shields import Certificate, Infeasible, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
+from shields.runtime.guarantee import GuaranteeMonitor
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import servo, swinging, with_radii
-from tests.product import altered, library_plant, safe_loop, safety_filter, sampled_plant, synthesize
+from tests.product import altered, belief, library_plant, safe_loop, safety_filter, sampled_plant, synthesize
 from tests.second_verifier.verify import verify_again
 from tests.shields.runtime.batches import decided_alike
 from tests.verdicts import verified
@@ -282,12 +282,12 @@ def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
     monitor = GuaranteeMonitor(switch, downlink_protocol(Channel(delay=1), None))
     small = switch.errors_of(plant.initial_error.shape_matrix)
     large = switch.errors_of(np.diag([0.16, 9.0]))
-    seen = LoopObservation(np.zeros(2), small, False, stays=True)
+    seen = belief(np.zeros(2))
     passed = Decision(np.zeros(1), False, True, False, 1.0, "", np.empty((0, 1)))
     fallback = passed._replace(proved=False, fallback=True)
-    state = monitor.cover(monitor.start(True, True, seen), [(True, seen)])
+    state = monitor.cover(monitor.start(True, seen, small), [(True, seen, small)])
     held = []
     for decision, errors in ((passed, large), (fallback, small), (passed, small), (passed, small), (passed, small)):
         held.append(not monitor.reasons(state))
-        state = monitor.advance(state, decision, True, True, seen._replace(errors=errors))
+        state = monitor.advance(state, decision, True, True, seen, errors)
     assert held == [True, False, False, False, True]

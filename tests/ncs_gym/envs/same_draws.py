@@ -104,6 +104,9 @@ class ScriptedEnv(NCSEnv):
             self._now.downlink.in_flight._loss_state = LossState(*(kept[index] for kept in states))
         self.np_random, self._now.violations = ScriptedGenerator(), 0.0
         info = self._info(no_inputs(self.plant.m), arrived=False)
+        if self.guard is not None:
+            self.guard.begin(self._now.beginning(self._belief))
+            info |= self.guard.info()
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple:
@@ -137,10 +140,11 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     many.np_random = rng = RecordingGenerator(many.np_random)
     begin = many._begin
 
-    def begin_unnoticed(*arguments: Any) -> None:
+    def begin_unnoticed(*arguments: Any) -> Any:
         rng.notes = False
-        begin(*arguments)
+        begun = begin(*arguments)
         rng.notes = True
+        return begun
 
     many._begin = begin_unnoticed
     names = "plant channel task disturbance initial_set terminate_on_violation contract horizon noise observe"

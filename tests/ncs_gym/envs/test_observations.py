@@ -1,6 +1,7 @@
 """What observations hold and are clipped to, and that clipping is never silent where it hides something."""
 
 import warnings
+from functools import partial
 from itertools import product
 
 import gymnasium as gym
@@ -156,19 +157,19 @@ def test_only_what_is_asked_for_is_observed_in_its_order():
 
 
 def test_spec_with_a_certificate_and_observations_is_json(tmp_path):
-    env = gym.make(CRUISE, observe=("age",))
-    certificate = certificate_of(env.unwrapped.plant)
+    made = partial(gym.make, CRUISE, observe=("age",))
+    certificate = certificate_of(made().unwrapped.plant)
     certificate.save(tmp_path / "certificate.json")
     for given in (certificate, certificate.document, tmp_path / "certificate.json", str(tmp_path / "certificate.json")):
-        shield = safety_shield(env, given)
+        shield = safety_shield(made(), given)
         again = gym.make(gym.envs.registration.EnvSpec.from_json(shield.spec.to_json()))
         assert shield.certificate.checksum == again.certificate.checksum == certificate.checksum
         np.testing.assert_array_equal(shield.reset(seed=1)[0], again.reset(seed=1)[0])
     altered = certificate.document | {"certificate": certificate.document["certificate"] | {"kappa": 0.5}}
     with pytest.raises(ValueError, match="certificate document was altered"):
-        safety_shield(env, altered)
+        safety_shield(made(), altered)
     with pytest.raises(ValueError, match="certificate must be a Certificate, its document or path"):
-        safety_shield(env, 3)
+        safety_shield(made(), 3)
 
 
 @pytest.mark.parametrize(

@@ -119,8 +119,9 @@ def test_gymnasiums_checker_renders_without_a_warning():
 def test_plants_of_any_size_are_drawn(n, m):
     env = make("ncs_gym/LinearNCS-v0", plant=random_plant(0, n, m), channel=Channel(loss=0.3, jitter=3))
     env.reset(seed=0)
-    env.unwrapped.annotate(Annotation(safe_set=Ellipsoid(np.eye(n)), label="project"))
-    env.step(env.action_space.sample())
+    inner, note = env.unwrapped, Annotation(safe_set=Ellipsoid(np.eye(n)), label="project")
+    *_, info = env.step(env.action_space.sample())
+    inner.renderer.record(info, None, None, note)
     assert count(env.render(), theme.SAFE_FILL, theme.PLANE) > 1000
 
 
@@ -201,20 +202,6 @@ def test_packets_are_lost_and_late_as_the_channel_says():
     mixed = packets(Channel(loss=0.5, jitter=3))
     assert any(each.arrival is None for each in mixed)
     assert len({each.arrival - each.stamp for each in mixed if each.arrival is not None}) > 1
-
-
-def test_annotation_lasts_one_step():
-    env = make().unwrapped
-    env.annotate(QUIET)
-    env.reset(seed=0)
-    note = env.renderer.episode.annotation
-    assert (note.safe_set, note.proposed) == (SAFE_SET, None)  # nothing is proposed before the first step
-    env.step(np.zeros(1, np.float32))
-    assert env.renderer.episode.annotation is None
-    env.annotate(QUIET)
-    for expected in (QUIET, None):
-        env.step(np.zeros(1, np.float32))
-        assert env.renderer.episode.annotation is expected
 
 
 def test_drawing_does_not_change_the_episode_nor_writing_into_an_info_the_picture():

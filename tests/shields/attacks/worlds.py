@@ -163,9 +163,17 @@ class Nature(Disturbance):
 class SeenEnv(NCSEnv):
     """Hands the plan of every decision to the adversary, as it would to a picture."""
 
-    def annotate(self, annotation) -> None:
-        if (adversary := self.disturbance.adversary) is not None and annotation.plan is not None:
-            adversary.plan = annotation.plan
+    def install(self, guard) -> None:
+        super().install(guard)
+        decide = guard.input
+
+        def overheard(u):
+            applied = decide(u)
+            if (adversary := self.disturbance.adversary) is not None and guard.filter.mode == "lookahead":
+                adversary.plan = guard.annotation().plan
+            return applied
+
+        guard.input = overheard
 
 
 def starts_of(case: Case, mode: str, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -215,7 +223,6 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         shield: Any = vector_shield(env, certificate, **given)
     else:
         env = SeenEnv(**settings)
-        env.render_mode = "rgb_array"  # nothing is drawn: there is no renderer
         shield = safety_shield(env, certificate, **given)
 
     def column(value: Any) -> np.ndarray:

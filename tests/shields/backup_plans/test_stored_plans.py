@@ -39,11 +39,12 @@ def test_a_restart_before_the_first_step_drops_the_plan_of_the_start_and_no_othe
 
 
 @pytest.mark.parametrize("goes_on", ["step", "reset"])
-def test_a_step_behind_the_shield_drops_every_plan(many, goes_on):
+def test_a_step_without_the_guard_drops_every_plan(many, goes_on):
     push, n, m = np.ones((COUNT, 2), np.float32), 4, 2
     _, info = many.reset(seed=0, options={"state": np.random.default_rng(0).uniform(-0.9, 0.9, (COUNT, n))})
     assert info["shield_plan_length"].any()
-    many.env.step(np.zeros((COUNT, m), np.float32))
+    env = many.unwrapped
+    env._now.move(env.np_random, np.zeros((m, COUNT)), env._move_task)
     untouched = np.ones(COUNT, np.bool_)
     if goes_on == "step":
         *_, info = many.step(push)

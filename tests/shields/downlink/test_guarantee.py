@@ -1,9 +1,7 @@
 """When a guarantee behind a downlink holds, when it ends and why; the first steps; the loop without Gymnasium."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorWrapper
 
 from ncs_gym import Actuator, Channel, Ellipsoid, FunctionProcess, cart_pole, truck_trailer
 from ncs_gym.network import downlink_protocol
@@ -17,7 +15,6 @@ from shields.runtime.guarantee import (
     OLD_SAMPLE,
     OTHER_INPUT,
     GuaranteeMonitor,
-    LoopObservation,
 )
 from shields.runtime.starts import starts_known
 from shields.verification.rational_matrix import (
@@ -30,7 +27,16 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 from tests.certificates import certificate_of
-from tests.product import linear_plant, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
+from tests.product import (
+    belief,
+    linear_plant,
+    loop_env,
+    safe_loop,
+    safety_filter,
+    safety_shield,
+    vector_env,
+    vector_shield,
+)
 from tests.shields.attacks.cases import behind
 from tests.shields.edges import edge_of
 
@@ -182,8 +188,7 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
 
     def reason(distance, downlink):
         monitor = GuaranteeMonitor(shield, downlink)
-        seen = LoopObservation(distance * PLANT.half_widths, errors, False, stays=True)
-        return EXPLANATIONS[monitor.reasons(monitor.start(True, True, seen))]
+        return EXPLANATIONS[monitor.reasons(monitor.start(True, belief(distance * PLANT.half_widths), errors))]
 
     ideal, lately = downlink_protocol(None, None), shielded().unwrapped.downlink_protocol
     assert [reason(distance, ideal) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
@@ -197,39 +202,35 @@ def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_s
     n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
     assert UNSTABLE.certificate.contract.max_age == allowed + 2
     largest = np.linalg.eigvalsh(UNSTABLE.certificate.error_shapes).max()
-    seen = LoopObservation(np.zeros(n), shield.errors_of(1.01 * largest * np.eye(n)), False, stays=True)
-    state = monitor.start(True, True, seen)
+    state = monitor.start(True, belief(np.zeros(n)), shield.errors_of(1.01 * largest * np.eye(n)))
     found = [EXPLANATIONS[monitor.reasons(state, age)] for age in (allowed, allowed + 1)]
     assert found == [LARGE_ERROR, OLD_SAMPLE]
 
 
-class Meddling(gym.Wrapper):
-    """Makes the environment say that other inputs were committed or applied."""
+class Meddler:
+    """Makes a loop say, where it is told to, that other inputs were committed or applied."""
 
     def __init__(self, env, key):
-        super().__init__(env)
-        self.key, self.active = key, False
+        self.key, self.active, self._report = key, False, env._now.report
+        env._now.report = self
 
-    def step(self, action):
-        *result, info = self.env.step(action)
-        if self.active:
-            inner, field = self.unwrapped, {"input": "applied", "input_committed": "committed"}[self.key]
-            inner._belief = inner._belief._replace(**{field: getattr(inner._belief, field) + 1e-12})
-        return *result, info
+    def __call__(self, *given):
+        report = self._report(*given)
+        said = getattr(report.belief, self.key) + 1e-12 * np.asarray(self.active)
+        return report._replace(belief=report.belief._replace(**{self.key: said}))
 
 
-@pytest.mark.parametrize(("key", "reason"), [("input_committed", OTHER_INPUT), ("input", LATE_INPUT)])
+@pytest.mark.parametrize(("key", "reason"), [("committed", OTHER_INPUT), ("applied", LATE_INPUT)])
 def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     certificate = certificate_of(PLANT)
     inner = loop_env(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
-    env = Meddling(inner, key)
-    shield = safety_shield(env, certificate)
+    meddler, shield = Meddler(inner, key), safety_shield(inner, certificate)
     shield.reset(seed=0)
     for _ in range(5):
         assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
-    env.active = True
+    meddler.active = True
     assert shield.step(np.array([0.2]))[4]["shield_reason"] == reason
-    env.active = False
+    meddler.active = False
     assert shield.step(np.array([0.2]))[4]["shield_reason"] == reason  # for the rest of the episode
     shield.reset()
     assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
@@ -238,13 +239,14 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
 @pytest.mark.parametrize("late", [False, True])
 def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
-    env = Meddling(loop_env(UNSTABLE.plant, **settings), "input")
+    env = loop_env(UNSTABLE.plant, **settings)
+    meddler = Meddler(env, "applied")
     shield, kept = safety_shield(env, UNSTABLE.certificate, "lookahead"), 0
     rng, push = np.random.default_rng(0), np.ones(1, np.float32)
     for seed in range(15):
-        env.active = False
+        meddler.active = False
         _, info = shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng)})
-        env.active = late
+        meddler.active = late
         *_, info = shield.step(push)
         assert not late or info["shield_reason"] == LATE_INPUT
         assert not late or info["shield_plan_length"] == 0
@@ -252,29 +254,19 @@ def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(la
     assert late or kept > 3
 
 
-class MeddlingWithMany(VectorWrapper):
-    """Makes the vector say of some environments that another input was applied than was due."""
-
-    chosen = np.zeros(6, np.bool_)
-
-    def step(self, actions):
-        *result, info = self.env.step(actions)
-        inner = self.unwrapped
-        inner._belief = inner._belief._replace(applied=inner._belief.applied + 1e-12 * self.chosen)
-        return *result, info
-
-
 def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
-    env = MeddlingWithMany(vector_env(6, plant=UNSTABLE.plant, **settings))
+    env = vector_env(6, plant=UNSTABLE.plant, **settings)
+    meddler, chosen = Meddler(env, "applied"), np.arange(6) % 2 == 0
     shield, rng, kept = vector_shield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
     for seed in range(5):
+        meddler.active = False
         shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng, 6)})
-        env.chosen = np.arange(6) % 2 == 0
+        meddler.active = chosen
         *_, info = shield.step(np.ones((6, 1), np.float32))
-        assert set(info["shield_reason"][env.chosen]) == {LATE_INPUT}
-        assert not info["shield_plan_length"][env.chosen].any()
-        kept += np.count_nonzero(info["shield_plan_length"][~env.chosen])
+        assert set(info["shield_reason"][chosen]) == {LATE_INPUT}
+        assert not info["shield_plan_length"][chosen].any()
+        kept += np.count_nonzero(info["shield_plan_length"][~chosen])
     assert kept > 3
 
 

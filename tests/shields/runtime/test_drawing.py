@@ -44,15 +44,8 @@ def test_an_intervention_shows_in_its_frame_and_in_no_other(certificate):
     assert seen == {True, False}
 
 
-def test_stepping_the_environment_below_the_shield_draws_no_shield(certificate):
-    env = shielded(certificate)
-    env.step(FULL_THROTTLE)
-    env.unwrapped.step(FULL_THROTTLE)
-    assert count(env.render(), theme.SAFE_FILL, theme.PLANE) == 0
-
-
 def test_a_shield_that_is_not_drawn_tells_nothing(certificate, monkeypatch):
     env = shielded(certificate, render_mode=None)
-    monkeypatch.setattr(type(env.unwrapped), "annotate", None)
+    monkeypatch.setattr(type(env.unwrapped.guard), "annotation", None)
     env.step(FULL_THROTTLE)
     assert env.unwrapped.renderer is None

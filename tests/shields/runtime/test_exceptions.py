@@ -4,13 +4,11 @@ import clarabel
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorWrapper
 
 from ncs_gym import Channel, Packet, truck_trailer
-from shields import VectorSafetyShield
 from shields.runtime.backup_plans import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
-from shields.runtime.monitored_filter import MonitoredFilter
+from shields.runtime.guard import OneGuard
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
@@ -21,97 +19,56 @@ MODES = ["project", "lookahead"]
 RAISED = [ValueError, KeyboardInterrupt, type("PanicException", (BaseException,), {})]
 
 
-class Raising:
-    """Raises, once it is told to, before or after what is inside has moved."""
-
-    raised = when = None
-
-    def _moved(self, move):
-        if self.when == "before":
-            raise self.raised
-        moved = move()
-        if self.when == "after":
-            raise self.raised
-        return moved
-
-    def reset(self, **given):
-        return self._moved(lambda: self.env.reset(**given))
-
-    def step(self, action):
-        return self._moved(lambda: self.env.step(action))
-
-
-class RaisingOne(Raising, gym.Wrapper):
-    pass
-
-
-class RaisingMany(Raising, VectorWrapper):
-    pass
-
-
 def stopped(*_, **__):
     raise KeyboardInterrupt
 
 
 def shield_of(kind, mode):
     if kind == "one":
-        return safety_shield(RaisingOne(loop_env(PLANT)), certificate_of(PLANT), mode)
-    return vector_shield(RaisingMany(vector_env(3, plant=PLANT)), certificate_of(PLANT), mode)
+        return safety_shield(loop_env(PLANT), certificate_of(PLANT), mode)
+    return vector_shield(vector_env(3, plant=PLANT), certificate_of(PLANT), mode)
+
+
+def raising(raised, when, whole):
+    """Raises before or after what is called."""
+
+    def call(*given, **named):
+        if when == "after":
+            whole(*given, **named)
+        raise raised
+
+    return call
+
+
+# Where an exception may come from: the loop, what is reported of it, the guard, and the task.
+PLACES = {
+    "step": ("_now.move", "_now.report", "_guard.input", "_guard.observe", "_guard.info"),
+    "reset": ("_now.begin", "_now.report", "_guard.begin", "_guard.info"),
+}
 
 
 @pytest.mark.parametrize("raised", RAISED)
 @pytest.mark.parametrize("when", ["before", "after"])
-@pytest.mark.parametrize("call", ["step", "reset"])
+@pytest.mark.parametrize(("call", "place"), [(call, place) for call in PLACES for place in PLACES[call]])
 @pytest.mark.parametrize("kind", ["one", "many"])
-def test_exception_around_an_environment_ends_the_guarantee_until_the_next_reset(kind, call, when, raised):
-    shield = shield_of(kind, "project")
-    assert np.all(shield.reset(seed=0)[1]["shield_guaranteed"])
+def test_exception_inside_an_environment_ends_its_episode(kind, call, place, when, raised, monkeypatch):
+    shield = shield_of(kind, "lookahead")
     action = np.zeros(shield.action_space.shape)
-    assert np.all(shield.step(action)[4]["shield_guaranteed"])
-    shield.env.when, shield.env.raised = when, raised
-    with pytest.raises(raised):
-        shield.step(action) if call == "step" else shield.reset(seed=1)
-    shield.env.when = None
-    lasts = when == "before" and call == "reset"  # nothing has moved
-    for _ in range(5):
-        assert np.all(shield.step(action)[4]["shield_guaranteed"] == lasts)
+    shield.reset(seed=0)
+    shield.step(action)
+    part, name = place.split(".")
+    owner = getattr(shield.unwrapped, part)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, raising(raised, when, getattr(owner, name)))
+        with pytest.raises(raised):
+            shield.step(action) if call == "step" else shield.reset(seed=1)
+    with pytest.raises(gym.error.ResetNeeded):
+        shield.step(action)
+    if kind == "many":
+        with pytest.raises(gym.error.ResetNeeded, match="reset all"):
+            shield.reset(options={"reset_mask": np.array([True, False, False])})
     assert np.all(shield.reset(seed=1)[1]["shield_guaranteed"])
     assert np.all(shield.step(action)[4]["shield_guaranteed"])
-
-
-@pytest.mark.parametrize("name", ["decide", "advance", "begin"])
-def test_exception_in_the_shield_itself_ends_the_guarantee_until_the_next_reset(name, monkeypatch):
-    shield, action = shield_of("one", "lookahead"), np.zeros(1)
-    shield.reset(seed=0)
-    shield.step(action)
-    whole = getattr(MonitoredFilter, name)
-
-    def done_and_stopped(*given, **named):
-        whole(*given, **named)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(MonitoredFilter, name, done_and_stopped)
-        with pytest.raises(KeyboardInterrupt):
-            shield.reset() if name == "begin" else shield.step(action)
-    assert not any(shield.step(action)[4]["shield_guaranteed"] for _ in range(5))
-    shield.reset()
-    assert shield.step(action)[4]["shield_guaranteed"]
-
-
-def test_exception_in_a_reset_of_some_environments_ends_the_guarantee_of_these(monkeypatch):
-    shield, action = shield_of("many", "lookahead"), np.zeros((3, 1))
-    shield.reset(seed=0)
-    shield.step(action)
-    chosen = np.array([False, True, False])
-    with monkeypatch.context() as patch:
-        patch.setattr(VectorSafetyShield, "_start", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            shield.reset(options={"reset_mask": chosen})
-    for _ in range(5):
-        np.testing.assert_array_equal(shield.step(action)[4]["shield_guaranteed"], ~chosen)
-    shield.reset(options={"reset_mask": chosen})
-    assert shield.step(action)[4]["shield_guaranteed"].all()
 
 
 class StopsWhoAsks:
@@ -121,7 +78,7 @@ class StopsWhoAsks:
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("name", ["decide", "advance", "begin"])
+@pytest.mark.parametrize("name", ["decide", "observe", "start"])
 @pytest.mark.parametrize("mode", MODES)
 def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypatch):
     loop = safe_loop(certificate_of(PLANT), PLANT, Channel(delay=1), mode)
@@ -131,12 +88,12 @@ def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypat
     with pytest.raises(KeyboardInterrupt):
         loop.decide(StopsWhoAsks())
     assert loop.guaranteed  # nothing was decided yet
-    if name == "advance":
+    if name == "observe":
         loop.decide(0.1)
 
-    call = {"decide": lambda: loop.decide(0.1), "advance": loop.receive, "begin": lambda: loop.start(np.zeros(2))}[name]
+    call = {"decide": lambda: loop.decide(0.1), "observe": loop.receive, "start": lambda: loop.start(np.zeros(2))}[name]
     with monkeypatch.context() as patch:
-        patch.setattr(MonitoredFilter, name, stopped)
+        patch.setattr(OneGuard, name, stopped)
         with pytest.raises(KeyboardInterrupt):
             call()
     assert (loop.guaranteed, loop.reason) == (False, NOT_STARTED)

@@ -9,9 +9,9 @@ from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields import Decision, SafetyFilter, certificate_for
 from shields.runtime import guarantee as proof
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor
 from tests.certificates import certificate_of
-from tests.product import safe_loop, safety_filter
+from tests.product import belief, safe_loop, safety_filter
 from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 
@@ -29,9 +29,8 @@ class Reference:
             return proof.NOT_KNOWN_INSIDE
         return "" if self.certified else proof.LARGE_ERROR
 
-    def start(self, known_inside, unmoved, *seen):
-        self.broken = "" if unmoved else proof.OTHER_STEPS
-        self.inside = known_inside
+    def start(self, known_inside, *seen):
+        self.broken, self.inside = "", known_inside
         self._observe(*seen)
 
     def step(self, passed, fallback, moved_once, same_input, *seen):
@@ -85,24 +84,24 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
         drawn = rng.choice(6, count, p=[0.5, 0.3, 0.14, 0.02, 0.02, 0.02])
         sizes = rng.choice([0.3, 1.0, 1.5, 1e7, 1e120, np.nan], count, p=[0.3, 0.3, 0.34, 0.02, 0.02, 0.02])
         estimates = certificate.safe_set.sample_boundary(rng, count) * sizes[:, None]
-        report = LoopObservation(estimates.T, known.of(drawn), alarm, stays=True)
-        started = monitor.start(inside, once, report)
+        report = belief(estimates.T, alarm), known.of(drawn)
+        started = monitor.start(inside, *report)
         if state is None:
             state = started
         else:
-            advanced = monitor.advance(state, decision(passed, fallback), once, same, report)
+            advanced = monitor.advance(state, decision(passed, fallback), once, same, *report)
             state = type(state)(*(np.where(begins, new, old) for new, old in zip(started, advanced, strict=True)))
         reasons = [EXPLANATIONS[code] for code in monitor.reasons(state)]
         for e, reference in enumerate(references):
             observed = estimates[e], shapes[drawn[e]], bool(alarm[e])
-            alone = LoopObservation(estimates[e], shield.errors_of(shapes[drawn[e]]), bool(alarm[e]), stays=True)
+            alone = belief(estimates[e], bool(alarm[e])), shield.errors_of(shapes[drawn[e]])
             if begins[e]:
-                reference.start(bool(inside[e]), bool(once[e]), *observed)
-                states[e] = monitor.start(bool(inside[e]), bool(once[e]), alone)
+                reference.start(bool(inside[e]), *observed)
+                states[e] = monitor.start(bool(inside[e]), *alone)
             else:
                 facts = bool(passed[e]), bool(fallback[e]), bool(once[e]), bool(same[e])
                 reference.step(*facts, *observed)
-                states[e] = monitor.advance(states[e], decision(*facts[:2]), *facts[2:], alone)
+                states[e] = monitor.advance(states[e], decision(*facts[:2]), *facts[2:], *alone)
             assert reasons[e] == reference.reason
             assert EXPLANATIONS[monitor.reasons(states[e])] == reference.reason
         seen |= set(reasons)

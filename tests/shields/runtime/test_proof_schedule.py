@@ -16,11 +16,11 @@ from scipy.linalg import expm
 from ncs_gym import Channel, LinearPlant, Packet
 from ncs_gym.network import downlink_protocol
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
+from shields.runtime.guarantee import GuaranteeMonitor
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 from tests.plants import swinging
-from tests.product import altered, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
+from tests.product import altered, belief, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
 
 KEEPING = ("project", "switch", "boundary", "lookahead")
 STEPS = 8
@@ -222,22 +222,22 @@ def test_flags_are_those_of_the_table_for_every_sequence_of_proofs(points, c):
     proofs = np.array(list(product((NOTHING, ESTIMATE, DECISION), repeat=steps + c))).T
     expected = as_the_table_says(proofs, c, bool(points))
 
-    def seen(proof: np.ndarray) -> LoopObservation:
+    def seen(proof: np.ndarray) -> tuple[Any, Any]:
         estimates = np.where(proof == ESTIMATE, 0.0, np.array([[0.95], [7.5]]))
         errors = shield.errors_of_many(plant.initial_error.shape_matrix[None]).of(np.zeros(len(proof), np.intp))
-        return LoopObservation(estimates, errors, np.zeros(len(proof), np.bool_), stays=True)
+        return belief(estimates, np.zeros(len(proof), np.bool_)), errors
 
     def inputs(proof: np.ndarray) -> Decision:
         passed = proof == DECISION
         return Decision(np.zeros((1, len(proof))), ~passed, passed, np.zeros_like(passed), passed, passed)
 
     every = np.ones(proofs.shape[1], np.bool_)
-    state = monitor.start(proofs[c] == DECISION, every, seen(proofs[c]))
-    state = monitor.cover(state, [(each == DECISION, seen(each)) for each in proofs[:c]])
+    state = monitor.start(proofs[c] == DECISION, *seen(proofs[c]))
+    state = monitor.cover(state, [(each == DECISION, *seen(each)) for each in proofs[:c]])
     for k, flags in enumerate(expected):
         assert ((monitor.reasons(state, np.zeros(len(every))) == 0) == flags).all(), f"step {k}"
         if k + 1 < steps:
             proof = proofs[k + c + 1]
-            state = monitor.advance(state, inputs(proof), every, every, seen(proof))
+            state = monitor.advance(state, inputs(proof), every, every, *seen(proof))
     assert expected.any()
     assert not expected.all()

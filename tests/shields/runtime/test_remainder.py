@@ -6,10 +6,11 @@ import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Remainder
 from shields import Infeasible
-from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor, LoopObservation
+from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor
 from tests.certificates import certificate_of
 from tests.plants import with_remainder
 from tests.product import (
+    belief,
     family_of,
     linear_plant,
     loop_env,
@@ -109,8 +110,7 @@ def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_
     for error, reason in ((0.0, ""), (0.009, ""), (0.011, LEFT_MODEL)):
         errors = shield.errors_of(np.diag([1e-12, 1e-12, error**2]))
         for last in (0.99, -0.99):
-            seen = LoopObservation(np.array([0.0, 0.0, last]), errors, False, stays=True)
-            state = GuaranteeMonitor(shield).start(True, True, seen)
+            state = GuaranteeMonitor(shield).start(True, belief(np.array([0.0, 0.0, last])), errors)
             assert EXPLANATIONS[state.broken] == reason
 
 

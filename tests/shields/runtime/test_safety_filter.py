@@ -351,7 +351,5 @@ def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
         for growing in (each[:2], each):
             table.shapes = growing
             numbers = np.arange(len(growing))[::-1]
-            assert all(known.one(table, k) is shield.errors_of(growing[k]) for k in numbers.tolist())
-            np.testing.assert_array_equal(
-                known.many(table, numbers).radius, shield.errors_of_many(growing[::-1]).radius
-            )
+            assert all(known.of(table, k) is shield.errors_of(growing[k]) for k in numbers.tolist())
+            np.testing.assert_array_equal(known.of(table, numbers).radius, shield.errors_of_many(growing[::-1]).radius)

@@ -88,7 +88,6 @@ def test_lists_of_infos_inside_are_refused_with_where_to_put_the_wrapper(certifi
     asked = DictInfoToList(vector_env(2, plant=PLANT, channel=Channel(on_request=True)))
     classic = DictInfoToList(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
     around = {
-        "VectorSafetyShield": vector_shield(inside, certificate),
         "VectorRequestActions": VectorRequestActions(asked),
         "VectorNetworked": VectorNetworked(classic),
         "SB3VecEnv": SB3VecEnv(inside),

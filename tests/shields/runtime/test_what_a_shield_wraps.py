@@ -1,81 +1,241 @@
-"""A shield says at each reset whether what it was made for is what it wraps."""
+"""The guard stands inside: no wrapper comes between it and the plant."""
 
-from dataclasses import replace
+import copy
+import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorWrapper
-from gymnasium.wrappers import StickyAction
+from gymnasium import wrappers
+from gymnasium.vector import VectorActionWrapper
+from stable_baselines3.common.monitor import Monitor
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearProcess, truck_trailer
-from shields.runtime.guarantee import OTHER_STEPS
+from ncs_gym import AdversarialDisturbance, truck_trailer
+from shields import SafetyShield
+from shields.runtime.guarantee import OTHER_INPUT, OTHER_STEPS
 from tests.certificates import certificate_of
 from tests.product import loop_env, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
-# Settings of another loop: what only somebody with a will to can put in place of the one that moves.
-CHANGED = {
-    "plant": truck_trailer(mass=4000.0),
-    "channel": Channel(delay=4, quantization_step=0.5),
-    "contract": ChannelContract(3),
-    "downlink": Channel(delay=2),
-    "process": LinearProcess(),
-    "initial_set": Ellipsoid(3.0 * np.eye(2)),
-}
+CERTIFICATE = certificate_of(PLANT)
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def scalar(**settings):
-    return safety_shield(loop_env(PLANT, **settings), certificate_of(PLANT))
+    return safety_shield(loop_env(PLANT), CERTIFICATE, **settings)
 
 
 def vector(**settings):
-    return vector_shield(vector_env(2, plant=PLANT, **settings), certificate_of(PLANT))
+    return vector_shield(vector_env(2, plant=PLANT), CERTIFICATE, **settings)
 
 
-# Where settings are kept: in the environment, inside a vector, or in the vector, which has neither process nor start.
-@pytest.mark.parametrize("name", CHANGED)
-@pytest.mark.parametrize("shielded", [scalar, vector])
-def test_changed_setting_is_said_at_the_next_reset_and_without_one_nothing_is_guaranteed(shielded, name):
-    shield = shielded()
+class Backwards(gym.ActionWrapper):
+    """Does the opposite of what it is told."""
+
+    def action(self, action):
+        return -action
+
+
+class Backwards2(VectorActionWrapper):
+    """The same of many."""
+
+    def actions(self, actions):
+        return -actions
+
+
+class WarmUp(gym.Wrapper):
+    """Moves before an episode is handed on, and restarts in the middle of it."""
+
+    def reset(self, **given):
+        self.env.reset(**given)
+        observation, *_, info = self.env.step(np.ones(1, np.float32))
+        return observation, info
+
+
+class InPlace(gym.Wrapper):
+    """Writes into the action while it is applied, and into all arrays that come back."""
+
+    def step(self, action):
+        action = np.array(action)
+        result = self.env.step(action)
+        action[...] = 1.0
+        for value in result[-1].values():
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                value[...] = 7.0
+        return result
+
+
+# What wrappers may do to actions, resets and infos, on the way to the environment.
+INSIDE = {
+    "clips": wrappers.ClipAction,
+    "rescales": lambda env: wrappers.RescaleAction(env, np.float32(-3.0), np.float32(5.0)),
+    "sticks": lambda env: wrappers.StickyAction(env, 0.5),
+    "repeats": lambda env: Repeats(env),
+    "skips": lambda env: wrappers.MaxAndSkipObservation(env, 3),
+    "begins by itself": wrappers.Autoreset,
+    "reverses": Backwards,
+    "moves first": WarmUp,
+    "writes": InPlace,
+    "counts": Monitor,
+}
+
+
+class Repeats(gym.Wrapper):
+    """Applies every action four times."""
+
+    def step(self, action):
+        for _ in range(4):
+            result = self.env.step(action)
+        return result
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead", "boundary", "switch"])
+@pytest.mark.parametrize("name", INSIDE)
+def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
+    nature = AdversarialDisturbance(CERTIFICATE.M)
+    env = safety_shield(INSIDE[name](loop_env(PLANT, disturbance=nature)), CERTIFICATE, mode)
+    bare = loop_env(PLANT, disturbance=nature)
+    rng, broken = np.random.default_rng(0), 0
+    for seed in range(2):
+        env.reset(seed=seed)
+        bare.reset(seed=seed)
+        for step in range(60):
+            action = np.full(1, rng.choice([-1.0, 1.0]) if step % 20 < 5 else 1.0, np.float32)
+            env.step(action)
+            belief = env.unwrapped.belief
+            assert np.abs(PLANT.box_rows @ env.unwrapped.state).max() <= 1.0
+            assert env.unwrapped.guard.reason == ""
+            assert belief.applied.flags.writeable is False
+            broken += bare.step(action)[4]["cost"]
+    assert broken > 0
+
+
+@pytest.mark.parametrize("order", ["inside", "outside"])
+def test_an_action_counts_as_it_arrives_whatever_wrappers_make_of_it(order):
+    env = vector_env(2, plant=PLANT)
+    env = (
+        vector_shield(Backwards2(env), CERTIFICATE)
+        if order == "inside"
+        else Backwards2(vector_shield(env, CERTIFICATE))
+    )
+    env.reset(seed=0)
+    for _ in range(30):
+        *_, info = env.step(np.ones((2, 1), np.float32))
+        np.testing.assert_array_equal(info["input_proposed"], np.tile(PLANT.input_low, (2, 1)))
+        assert info["shield_guaranteed"].all()
+    assert info["episode_interventions"].all()
+
+
+def test_repeated_actions_are_charged_each_time():
+    env, once = (
+        safety_shield(wrap(loop_env(PLANT)), CERTIFICATE, penalty=0.5)
+        for wrap in (lambda env: wrappers.RepeatAction(env, num_repeats=4), lambda env: env)
+    )
+    for each in (env, once):
+        each.reset(seed=0)
+    action = np.ones(1, np.float32)
+    for _ in range(5):
+        sums = sum(once.step(action)[1] for _ in range(4))
+        _, reward, *_, info = env.step(action)
+        assert reward == pytest.approx(sums)
+    assert info["episode_interventions"] > 5
+
+
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_the_environment_is_guarded_by_whatever_name_it_is_called(made):
+    shield = made()
     shield.reset(seed=0)
-    now = shield.unwrapped._now  # what moves: an environment itself has no settings to be changed
-    now.loop = replace(now.loop, **{name: CHANGED[name]})
+    action = np.ones(shield.action_space.shape, np.float32)
+    for _ in range(20):
+        info = shield.unwrapped.step(action)[-1]
+        assert np.all(info["shield_guaranteed"])
+    assert np.all(info["episode_interventions"] > 5)
+    assert np.all(shield.step(action)[-1]["shield_guaranteed"])
+
+
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_a_loop_that_moves_without_its_guard_proves_nothing_until_the_next_reset(made):
+    shield = made(on_unproved="ignore")
+    env, action = shield.unwrapped, np.zeros(shield.action_space.shape)
     for _ in range(2):
-        with pytest.raises(ValueError, match="the loop is not the one that the shield was made for"):
-            shield.reset()
-    *_, info = shield.step(np.zeros(shield.action_space.shape))
-    assert np.all(info["shield_reason"] == OTHER_STEPS)
+        assert np.all(shield.reset(seed=0)[1]["shield_guaranteed"])
+        assert np.all(shield.step(action)[-1]["shield_guaranteed"])
+        env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)), env._move_task)
+        for _ in range(3):
+            info = shield.step(action)[-1]
+            assert np.all(info["shield_reason"] == OTHER_STEPS)
+            assert not np.any(info["shield_guaranteed"])
 
 
-@pytest.mark.parametrize("shielded", [scalar, vector])
-def test_another_environment_in_place_of_the_wrapped_one_is_said_at_the_next_reset(shielded):
-    shield = shielded()
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_another_input_than_the_one_decided_is_seen(made, monkeypatch):
+    shield = made(on_unproved="ignore")
+    env, action = shield.unwrapped, np.full(shield.action_space.shape, 0.1)
     shield.reset(seed=0)
-    other = shielded().env
-    other.reset(seed=0)
+    move = env._now.move
+    assert np.all(shield.step(action)[-1]["shield_guaranteed"])
+    with monkeypatch.context() as patch:
+        patch.setattr(env._now, "move", lambda rng, u, task: move(rng, 0.9 * u, task))
+        assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_INPUT)
+    assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_INPUT)
+    assert np.all(shield.reset()[1]["shield_guaranteed"])
+
+
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_another_environment_in_place_of_the_wrapped_one_is_said_at_the_next_reset(made):
+    shield, other = made(), made().env
+    shield.reset(seed=0)
     shield.env = other
     with pytest.raises(ValueError, match="the environment is not the one that the shield was made for"):
         shield.reset()
 
 
-def test_wrapper_put_inside_after_wrapping_is_refused_at_the_next_reset():
-    shield = scalar()
+def test_a_shield_that_is_refused_leaves_the_environment_bare():
+    env = loop_env(PLANT)
+    for wrong in ({"mode": "hope"}, {"penalty": -1.0}, {"on_unproved": "log"}, {"certificate": "missing.json"}):
+        with pytest.raises(ValueError, match=r".+"):
+            safety_shield(env, **({"certificate": CERTIFICATE} | wrong))
+    assert env.guard is None
+    shield = safety_shield(env, CERTIFICATE)
+    assert env.guard is shield.unwrapped.guard is not None
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_a_copy_goes_on_alike_with_a_guard_of_its_own(made, mode, copied):
+    shield = made(mode=mode, penalty=0.5)
     shield.reset(seed=0)
-    shield.env = StickyAction(shield.env, 0.5)
-    with pytest.raises(ValueError, match="the shield must be inside StickyAction"):
-        shield.reset()
-    shield.env = gym.Wrapper(shield.env.env)  # that only looks
-    assert shield.reset()[1]["shield_guaranteed"]
+    action = np.ones(shield.action_space.shape, np.float32)
+    for _ in range(5):
+        shield.step(action)
+    twin = copied(shield)
+    assert twin.unwrapped.guard is not shield.unwrapped.guard
+    assert twin.filter is twin.unwrapped.guard.filter
+    for _ in range(10):
+        one, other = shield.step(action), twin.step(action)
+        np.testing.assert_array_equal(one[1], other[1])
+        assert one[-1].keys() == other[-1].keys()
+        for key, value in one[-1].items():
+            np.testing.assert_array_equal(value, other[-1][key], err_msg=key)
+    twin.penalty = 0.0
+    assert shield.penalty == 0.5
+    twin.reset()
 
 
-def test_wrapper_that_changes_a_setting_in_its_reset_is_found_at_the_next_one():
-    class Widens(VectorWrapper):
-        def reset(self, **keywords):
-            now = self.unwrapped._now
-            now.loop = replace(now.loop, initial_set=Ellipsoid(3.0 * np.eye(2)))
-            return self.env.reset(**keywords)
+@pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
+def test_shields_in_gymnasiums_vectors_of_environments(mode):
+    env = gym.make_vec(CRUISE, num_envs=2, vectorization_mode=mode, wrappers=[SafetyShield])
+    env.reset(seed=0)
+    for _ in range(20):
+        *_, info = env.step(np.ones((2, 1), np.float32))
+    assert info["shield_guaranteed"].all()
+    assert (info["episode_interventions"] > 5).all()
+    env.close()
 
-    shield = vector_shield(Widens(vector_env(2, plant=PLANT)), certificate_of(PLANT))
-    with pytest.raises(ValueError, match="the loop is not the one"):
-        shield.reset(seed=0)
+
+def test_specification_makes_the_shield_again():
+    shield = gym.make(safety_shield(gym.make(CRUISE), CERTIFICATE, "switch", 0.25).spec)
+    assert isinstance(shield, SafetyShield)
+    assert (shield.mode, shield.penalty, shield.unwrapped.guard.penalty) == ("switch", 0.25, 0.25)
+    assert shield.filter is shield.unwrapped.guard.filter

@@ -12,8 +12,6 @@ from ncs_gym import AdversarialDisturbance, Ellipsoid
 from shields import SafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
-    OTHER_INPUT,
-    OTHER_STEPS,
 )
 from tests.product import safety_shield, vector_shield
 
@@ -118,12 +116,6 @@ def test_monitor_keeps_the_proof_while_nothing_unsafe_is_proposed(certificate):
     assert infos[-1]["episode_interventions"] == 0
 
 
-def test_spec_recreates_the_shielded_environment(certificate):
-    env = gym.make(shielded(certificate, "switch", 0.25).spec)
-    assert isinstance(env, SafetyShield)
-    assert (env.filter.mode, env.penalty) == ("switch", 0.25)
-
-
 # The proof and its assumptions, each broken on purpose.
 
 
@@ -131,36 +123,6 @@ def test_initial_set_that_leaves_the_safe_set_is_not_trusted(certificate):
     env = shielded(certificate, initial_set=Ellipsoid(4.5 * np.eye(2)))
     reasons = {env.reset(seed=seed)[1]["shield_reason"] for seed in range(40)}
     assert reasons == {"", NOT_KNOWN_INSIDE}
-
-
-def test_changed_input_is_noticed_and_latched(certificate):
-    class Meddler(gym.Wrapper):
-        calls = 0
-
-        def step(self, action):
-            self.calls += 1
-            return self.env.step(action * 0.9 if self.calls == 3 else action)
-
-    infos = play(safety_shield(Meddler(gym.make(CRUISE)), certificate), full, 10, seed=0)
-    assert [info["shield_reason"] for info in infos] == [""] * 3 + [OTHER_INPUT] * 8
-
-
-def test_inner_wrapper_that_chooses_the_start_is_not_trusted(certificate):
-    class Elsewhere(gym.Wrapper):
-        def reset(self, *, seed=None, options=None):
-            return self.env.reset(seed=seed, options={"state": [1.99, 1.9]})
-
-    class WarmUp(gym.Wrapper):
-        def reset(self, *, seed=None, options=None):
-            self.env.reset(seed=seed)
-            observation, *_, info = self.env.step(full(None))
-            return observation, info
-
-    reasons = [
-        safety_shield(layer(gym.make(CRUISE)), certificate).reset(seed=0)[1]["shield_reason"]
-        for layer in (Elsewhere, WarmUp)
-    ]
-    assert reasons == [NOT_KNOWN_INSIDE, OTHER_STEPS]
 
 
 def emptied(info):
@@ -213,38 +175,13 @@ def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, auto
         env.reset(seed=0)
     action, overridden = np.ones(plain.action_space.shape, np.float32), 0
     for _ in range(60):
-        one, other = plain.step(action)[4], inside.step(action)[4]
-        outside.step(action)
-        for key in KEYS.keys() & one.keys():
-            np.testing.assert_array_equal(one[key], other[key])
+        one = plain.step(action)[4]
         for env in (inside, outside):
+            env.step(action)
             np.testing.assert_array_equal(plain.unwrapped.belief.applied, env.unwrapped.belief.applied)
+            own = env.unwrapped.guard.info() if autoreset is None else {}
+            for key in KEYS.keys() & own.keys() - {"episode_interventions"}:  # which this call has counted again
+                np.testing.assert_array_equal(one[key], own[key])
         assert np.all(one["shield_guaranteed"])
         overridden += np.count_nonzero(one["shield_intervened"])
     assert overridden > 10
-
-
-@pytest.mark.parametrize("kind", ["scalar", "vector"])
-def test_what_is_handed_on_lies_in_the_action_space(kind, certificate):
-    """A recorder inside the shield stores what was applied."""
-    seen = []
-
-    def spy(base):
-        class Spy(base):
-            def step(self, action):
-                seen.append(np.array(action))
-                return self.env.step(action)
-
-        return Spy
-
-    if kind == "scalar":
-        env, shape = safety_shield(spy(gym.Wrapper)(gym.make(CRUISE)), certificate), (1,)
-    else:
-        inner = spy(gym.vector.VectorWrapper)(gym.make_vec(CRUISE, num_envs=3))
-        env, shape = vector_shield(inner, certificate), (3, 1)
-    env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        *_, info = env.step((3.0 * rng.standard_normal(shape)).astype(np.float32))
-        assert env.action_space.contains(seen[-1])
-        np.testing.assert_array_equal(seen[-1], info["action_applied"])
