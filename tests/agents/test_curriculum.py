@@ -101,7 +101,11 @@ def test_specification_of_vector_wrappers_makes_no_environments_without_them():
     for other in (gym.make_vec(CLASSIC, num_envs=2), gym.make_vec(ID, num_envs=2, vectorization_mode="sync")):
         with pytest.raises(ValueError, match="VectorRandomChannel is for an NCSVectorEnv"):
             VectorRandomChannel(other, [Channel()])
-    made_of = [vector_shield(envs), VectorRandomChannel(envs, [Channel()]), CostPenalty(envs, 1.0)]
+    made_of = [
+        vector_shield(gym.make_vec(ID, num_envs=2)),
+        VectorRandomChannel(envs, [Channel()]),
+        CostPenalty(envs, 1.0),
+    ]
     made_of.append(VectorNetworked(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"), Channel(delay=1)))
     for env in made_of:
         assert env.spec.additional_wrappers[-1].name == type(env).__name__
