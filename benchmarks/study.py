@@ -1,4 +1,4 @@
-"""The study of docs/results.md, the same arms in three environments: `python -m benchmarks.study COMMAND`.
+"""The study of docs/experiments.md, the same arms in three environments: `python -m benchmarks.study COMMAND`.
 
 Commands: compare, pages.
 """
@@ -35,7 +35,7 @@ from ncs_gym.validation import counted
 ROOT = Path(__file__).resolve().parents[1]
 # Where the numbers are kept, and the pages that show them.
 NUMBERS = Path("docs/results.json")
-PAGES = ("docs/results.md", "docs/index.md", "docs/when_not.md", "README.md")
+PAGES = ("docs/experiments.md",)
 # Environments in which the network decides.
 ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
 # Agents, and what needs no training, each tuned by itself (`benchmarks.learning`); margins are in percent.

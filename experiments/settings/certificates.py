@@ -290,7 +290,7 @@ class BoundsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
+    """Draws an episode of a policy, as an animation or its last frame (docs/ncs_gym.md).
 
     Attributes:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
