@@ -28,6 +28,8 @@ QUICK_PAGES = (
     "docs/ncs_gym.md",
     "docs/shield.md",
     "docs/vector.md",
+    "docs/networked.md",
+    "docs/lookahead.md",
 )
 # Their programs run in a process of their own; some train an agent, or synthesize certificates that take seconds.
 SLOW_PAGES = (
