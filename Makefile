@@ -120,8 +120,9 @@ docs: $(DOCS_INSTALLED) ## the site, in site/
 	$(BIN)/python docs/hooks/build_site.py
 	$(BIN)/python -m pytest -n auto --dist worksteal -m 'site and not slow'
 
-words: ## words of README and of every page
-	@wc -w README.md docs/*.md
+words: ## words of README and of every page, with the sum of the pages
+	@wc -w README.md
+	@wc -w docs/*.md
 
 # Known vulnerabilities of what constraints.txt names, by OSV: any index of packages will do, a network is needed.
 audit: $(AUDIT_INSTALLED) ## known vulnerabilities of the dependencies (asks a database on the internet)

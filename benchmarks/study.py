@@ -1,4 +1,4 @@
-"""The study of docs/results.md, the same arms in three environments: `python -m benchmarks.study COMMAND`.
+"""The study of docs/experiments.md, the same arms in three environments: `python -m benchmarks.study COMMAND`.
 
 Commands: compare, pages.
 """
@@ -35,7 +35,7 @@ from ncs_gym.validation import counted
 ROOT = Path(__file__).resolve().parents[1]
 # Where the numbers are kept, and the pages that show them.
 NUMBERS = Path("docs/results.json")
-PAGES = ("docs/results.md", "docs/index.md", "docs/when_not.md", "README.md")
+PAGES = ("docs/experiments.md",)
 # Environments in which the network decides.
 ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
 # Agents, and what needs no training, each tuned by itself (`benchmarks.learning`); margins are in percent.
@@ -304,12 +304,6 @@ def evaluation_table(env: dict[str, Any]) -> str:
     return text_table(rows, rules=(2, 2 + len(env["trained"])))
 
 
-def agents_of(env: dict[str, Any]) -> str:
-    """Returns of an environment the arms that were trained, and the regulator behind lookahead."""
-    arms = {name: arm for name, arm in env["arms"].items() if arm["train_steps"] or name == f"lqr+{SOUND}"}
-    return evaluation_table(env | {"arms": arms})
-
-
 def comparisons_table(summary: dict[str, Any]) -> str:
     """Returns the declared comparisons: differences of violating episodes in points, the primary one first.
 
@@ -412,9 +406,8 @@ _TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
 
 
 def quotable(summary: dict[str, Any]) -> dict[str, str]:
-    """Returns the tables that pages quote, by name; that of the agents has the name of their environment."""
-    agents = {name: agents_of(env) for name, env in summary["environments"].items()}
-    return {name: table(summary) for name, table in _TABLES.items()} | agents
+    """Returns the tables that pages may quote, by name."""
+    return {name: table(summary) for name, table in _TABLES.items()}
 
 
 def all_tables(summary: dict[str, Any]) -> str:

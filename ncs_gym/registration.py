@@ -188,7 +188,7 @@ BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, qua
 PENDULUM_CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
 
 
-# Where the network decides (docs/results.md): a sample per step, one step late, 40 % of which are lost, for the tank
+# The network decides here (docs/experiments.md): a sample per step, one step late, 40 % of which are lost, for the tank
 # never more than five in a row, for the vehicles seven. What disturbs them keeps its sign for half a period.
 CSTR_CHANNEL = Channel(loss=0.4, delay=1, max_consecutive_losses=5, quantization_step=0.1)
 CONVOY_CHANNEL = Channel(loss=0.4, delay=1, max_consecutive_losses=7, quantization_step=0.05)

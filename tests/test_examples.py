@@ -126,7 +126,7 @@ TRAINING = {
 }
 # They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
 LONG = {"both_directions.py", "lost_hour.py", "mpc_loop.py", "quadruple_tank.py", "unstable_plant_loop.py"}
-# Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
+# Packages that no extra installs, and the versions that the examples were tried with (docs/agents.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},
     "tianshou_processes.py": {"tianshou": "2.0.1"},
@@ -157,7 +157,7 @@ def test_examples_that_train_compute_with_one_thread():
 
 
 def test_versions_of_foreign_packages_are_those_that_the_page_names():
-    page = (ROOT / "docs" / "integrations.md").read_text()
+    page = (ROOT / "docs" / "agents.md").read_text()
     for name, packages in FOREIGN.items():
         (row,) = (line for line in page.splitlines() if name in line)
         assert all(version in row for version in packages.values() if version)
@@ -174,7 +174,7 @@ def test_example_prints_what_it_is_about(name):
 def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, tmp_path):
     missing = [package for package in FOREIGN.get(name, ()) if importlib.util.find_spec(package) is None]
     if missing:
-        pytest.skip(f"{', '.join(missing)} not installed: a virtual environment of its own (docs/integrations.md)")
+        pytest.skip(f"{', '.join(missing)} not installed: a virtual environment of its own (docs/agents.md)")
     run = run_example(name, *RUNS[name][0], cwd=tmp_path, MINARI_DATASETS_PATH=str(tmp_path))
     assert run.returncode == 0, run.stderr
     assert_expected(name, run.stdout)
@@ -190,9 +190,9 @@ LOGGERS = {
 @pytest.mark.parametrize("package", LOGGERS)
 def test_loggers_that_are_installed_get_what_tensorboard_gets(package, tmp_path):
     version, pattern = LOGGERS[package]
-    assert version in (ROOT / "docs" / "integrations.md").read_text()
+    assert version in (ROOT / "docs" / "agents.md").read_text()
     if importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} not installed: a virtual environment of its own (docs/integrations.md)")
+        pytest.skip(f"{package} not installed: a virtual environment of its own (docs/agents.md)")
     run = run_example("loggers.py", *RUNS["loggers.py"][0], cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert re.search(pattern, run.stderr + run.stdout)

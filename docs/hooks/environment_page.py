@@ -21,7 +21,7 @@ from shields import Certificate, SafetyShield, verify
 
 # Characters in a line of a block that fit the page.
 WIDTH = 110
-CAPTION = "*The last frame of a short episode behind the shield; [Pictures](../rendering.md) explains what is drawn.*"
+CAPTION = "*The last frame of a short episode behind the shield ([what is drawn](../ncs_gym.md#pictures)).*"
 
 
 def environment_page(env_id: str, picture: str = "") -> str:

@@ -9,7 +9,7 @@ NOTEBOOK = Path(__file__).resolve().parent.parent.parent / "examples" / "tour.ip
 
 
 def add_page(docs: Path, nav: list[Any]) -> None:
-    """Writes the page and its pictures, and adds it to the navigation after the tutorial.
+    """Writes the page and its pictures, and adds it to the navigation after the first page.
 
     Args:
         docs: Folder of the site's pages.
@@ -40,7 +40,7 @@ def _fenced(text: str, language: str) -> str:
 def _enter(nav: list[Any]) -> bool:
     for index, entry in enumerate(nav):
         target = next(iter(entry.values())) if isinstance(entry, dict) else entry
-        if target == "tutorial.md":
+        if target == "index.md":
             nav.insert(index + 1, {"Notebook": "tour.md"})
             return True
         if isinstance(target, list) and _enter(target):

@@ -225,7 +225,7 @@ class ChannelSettings:
 
     Attributes:
         file: A table with the columns sent and received in seconds, received empty where a packet was lost, or the
-            output of Linux `ping -D` (docs/requirements.md has recipes for others).
+            output of Linux `ping -D` (docs/contracts.md has recipes for others).
         sampling_period: Duration of a control step [s]; by default that of --env or --plant, or the time between
             packets.
         env: Id of an environment whose contract is compared with the record.
@@ -290,7 +290,7 @@ class BoundsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
+    """Draws an episode of a policy, as an animation or its last frame (docs/ncs_gym.md).
 
     Attributes:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of

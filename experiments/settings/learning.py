@@ -29,7 +29,7 @@ class BackendSettings:
     """Where training runs are executed; their results do not depend on it.
 
     Attributes:
-        engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/scaling.md).
+        engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/vector.md).
         jobs: Worker processes of the engine "local".
         ray_address: Of the engine "ray": "local" starts a Ray, "auto" and HOST:PORT join one of which this is a node.
     """

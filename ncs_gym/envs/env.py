@@ -117,7 +117,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
             if the plant is unstable, none if it is stable. A channel that may break it is allowed.
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
-            the extra `[render]` (docs/rendering.md).
+            the extra `[render]` (docs/ncs_gym.md).
         horizon: Steps the observation space is sized for; give it beside a longer `max_episode_steps`.
         noise: "truncated"; "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds but for a probability that `bound_violation_probability` bounds (docs/shield.md); or

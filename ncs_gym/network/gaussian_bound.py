@@ -14,7 +14,7 @@ from ncs_gym.validation import as_count, shown
 def bound_violation_probability(plant: LinearPlant, channel: Channel, steps: int) -> float:
     """Returns a bound on the probability that Gaussian noise leaves a bound of the certificate within some steps.
 
-    T delta_w + N delta_v + delta_0 (docs/shield_proof.md, "Gaussian noise"), the union bound over every draw of process
+    T delta_w + N delta_v + delta_0 (docs/shield.md, "Gaussian noise"), the union bound over every draw of process
     noise, of sensor noise, of which N = floor(T / M) samples with transmission period M have one, and of the first
     error; a covariance that is zero counts nothing. With `noise="gaussian"` a shield whose certificate verifies keeps
     x_k in S for all k <= T with at least the remaining probability.

@@ -68,7 +68,7 @@ class PacketLog(ReadOnlyArrays):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Returns the packets in a file (docs/requirements.md has recipes that make one of other records).
+        """Returns the packets in a file (docs/contracts.md has recipes that make one of other records).
 
         Args:
             path: A table (CSV; Parquet where pyarrow is installed) with the columns sent and received alone, in

@@ -50,7 +50,7 @@ def max_margin_gain(
 
     For a gain and multipliers, (I) has a smallest solution L, a Lyapunov series, which grows with the square of the
     radii. So the tolerated radii are those at which L just uses up the first limit, a function with derivatives. The
-    search is local and begins at linear-quadratic regulators (docs/shield_proof.md, "How the sets are found").
+    search is local and begins at linear-quadratic regulators.
 
     Args:
         problem: The scaled design problem.

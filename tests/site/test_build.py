@@ -50,9 +50,9 @@ def test_notebook_becomes_a_page_with_its_pictures(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(HOOKS)
     import notebook_page
 
-    nav = [{"Start": ["index.md", {"Tutorial": "tutorial.md"}]}]
+    nav = [{"Start": ["index.md", {"Other": "other.md"}]}]
     notebook_page.add_page(tmp_path, nav)
-    assert nav == [{"Start": ["index.md", {"Tutorial": "tutorial.md"}, {"Notebook": "tour.md"}]}]
+    assert nav == [{"Start": ["index.md", {"Notebook": "tour.md"}, {"Other": "other.md"}]}]
     page = (tmp_path / "tour.md").read_text()
     assert page.count("](tour-") == len(list(tmp_path.glob("tour-*.png"))) == 3
     cells = json.loads(notebook_page.NOTEBOOK.read_text())["cells"]

@@ -204,7 +204,7 @@ def test_node_with_another_source_is_refused_in_one_sentence():
 
 @contextmanager
 def running_head(tmp_path_factory):
-    """Address, environment and process of a cluster as in docs/scaling.md, with a home and a token of its own."""
+    """Address, environment and process of a cluster as in docs/vector.md, with a home and a token of its own."""
     own = {"HOME": str(tmp_path_factory.mktemp("home")), "RAY_AUTH_MODE": "token"}
     own |= {"RAY_TMPDIR": str(tmp_path_factory.mktemp("r")), "RAY_USAGE_STATS_ENABLED": "0"}
     tool = [sys.executable, "-m", "ray.scripts.scripts"]

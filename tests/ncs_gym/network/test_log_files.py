@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import json
 import math
 import re
 import sys
@@ -22,7 +21,7 @@ from hypothesis import strategies as st
 from ncs_gym import PacketLog, contract_of, truck_trailer
 from tests.product import loop_env
 
-PAGE = Path(__file__).parents[3] / "docs" / "requirements.md"
+PAGE = Path(__file__).parents[3] / "docs" / "contracts.md"
 
 
 def ages_by_clock(packets, dt):
@@ -267,7 +266,7 @@ def test_file_that_is_not_certain_is_refused_in_one_sentence(content, words, wri
     assert len(str(refusal.value)) < 600
     if words.startswith("are [") or "none of Linux" in words or "another host" in words:
         assert "a table with the columns sent and received alone, in seconds" in str(refusal.value)
-        assert "docs/requirements.md has recipes for others" in str(refusal.value)
+        assert "docs/contracts.md has recipes for others" in str(refusal.value)
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -383,37 +382,12 @@ class Bag:
         return SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=raw, nanosec=0)))
 
 
-EPOCH, NTP = 1_700_000_000, 2**32
+EPOCH = 1_700_000_000
 RECIPES = {
-    "one sender of several": {"all.csv": "sent,received,can_id\n0,1,291\n0,9,7\n2,,291\n3,3.5,291\n"},
     "a column of delays, all in milliseconds": {"delays.csv": "sent,delay,size\n0,1000,60\n2000,,60\n3000,500,60\n"},
     "dates": {
         "dates.csv": "sent,received\n2026-01-01T00:00:00.5Z,2026-01-01T00:00:01.5Z\n2026-01-01T00:00:02.5Z,\n"
         "2026-01-01T01:00:03.5+01:00,2026-01-01T00:00:04Z\n"
-    },
-    "ping of macOS": {
-        "ping.txt": "PING host (192.0.2.1): 56 data bytes\n64 bytes from 192.0.2.1: icmp_seq=0 ttl=64 time=1000 ms\n"
-        "64 bytes from 192.0.2.9: icmp_seq=200 ttl=64 time=1 ms\n"
-        "64 bytes from 192.0.2.1: icmp_seq=300 ttl=64 time=500.000 ms\n"
-    },
-    "irtt client": {
-        "irtt.json": json.dumps(
-            {
-                "round_trips": [
-                    {
-                        "timestamps": {"client": {"send": {"wall": 17 * 10**17 + at, "monotonic": at}}},
-                        "delay": {} if rtt is None else {"receive": 1, "rtt": rtt, "send": 2},
-                        "ipdv": {"rtt": 7, "send": 7},
-                    }
-                    for at, rtt in ((10**7, 10**9), (10**7 + 2 * 10**9, None), (10**7 + 3 * 10**9, 5 * 10**8))
-                ]
-            }
-        )
-    },
-    "owping -R": {
-        "owping.txt": f"0 {4 * 10**9 * NTP:020d} 1 1e-05 {(4 * 10**9 + 1) * NTP:020d} 1 1e-05 255\n"
-        f"2 {(4 * 10**9 + 3) * NTP:020d} 1 1e-05 {(4 * 10**9 + 3) * NTP + NTP // 2:020d} 1 1e-05 255\n"
-        f"1 {(4 * 10**9 + 2) * NTP:020d} 1 1e-05 {0:020d} 0 0 255\n"
     },
     "tcpdump at both ends": {
         "sent.txt": f"{EPOCH}.000000000\t01ff\n{EPOCH + 2}.000000000\t02ff\n{EPOCH + 3}.000000000\t03ff\n",
@@ -425,7 +399,7 @@ RECIPES = {
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_recipe_of_the_page_makes_a_record(name, tmp_path, monkeypatch):
-    recipes = PAGE.read_text().partition("makes a table `t`")[2].partition("\n\n`iperf3`")[0]
+    recipes = PAGE.read_text().partition("makes a table `t`")[2]
     head, *parts = re.split(r"^    # ", recipes.partition(":\n")[2], flags=re.MULTILINE)
     (recipe,) = (part for part in parts if part.startswith(name))
     for file, text in RECIPES[name].items():
@@ -438,9 +412,6 @@ def test_recipe_of_the_page_makes_a_record(name, tmp_path, monkeypatch):
     if name == "a bag of ROS 2":
         assert (log.sent.tolist(), log.delays.round(9).tolist()) == ([1.0, 3.0, 5.0], 3 * [0.01])
         return
-    if name == "ping of macOS":
-        assert len(log.sent) == 3000
-        assert np.isfinite(log.delays).sum() == 2
-    assert np.allclose(log.delays[[0, -1 if len(log.sent) == 3 else 300]], [1.0, 0.5])
+    assert np.allclose(log.delays[[0, -1]], [1.0, 0.5])
     assert np.isnan(log.delays[1])
-    assert np.allclose(log.sent[[0, 1, -1]] - log.sent[0], [0.0, 2.0, 3.0] if len(log.sent) == 3 else [0, 0.01, 29.99])
+    assert np.allclose(log.sent - log.sent[0], [0.0, 2.0, 3.0])
