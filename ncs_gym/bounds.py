@@ -5,8 +5,8 @@ A number or a vector stands for half-widths per entry. Ellipsoids around sets ar
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -178,21 +178,10 @@ class Sum(UncertainSet):
         """The part that is a Gaussian; None if there is none."""
         return next((each for each in self.parts if isinstance(each, Gaussian)), None)
 
-    def without(self, others: Sequence[Any]) -> Sum:
-        """Returns the sum of the parts that are not among others."""
-        return Sum(tuple(each for each in self.parts if not any(each is other for other in others)))
-
-    def as_one(self, weight: np.ndarray) -> Any:
-        """Returns the only part, or else the ellipsoid of the smallest tr(W P), which must be about zero.
-
-        Raises:
-            ValueError: If one of several parts has two different ends.
-        """
-        if len(self.parts) == 1:
-            return self.parts[0]
-        if pushes_of(self):
-            raise ValueError("a set with two different ends is not added to others: give the sum as Through(E, Box)")
-        return self.ellipsoid(weight)
+    @property
+    def declared(self) -> Sum:
+        """The sum of all but what a model leaves out."""
+        return Sum(tuple(each for each in self.parts if not each.is_left_out))
 
     def sized(self, size: int) -> Any:  # noqa: D102
         sized = tuple(each.sized(size) for each in self.parts)
@@ -268,29 +257,38 @@ class Bounds(ReadOnlyArrays):
     first_error: Any
 
     def __post_init__(self) -> None:
-        self._put(lambda value, _: as_set(value), (0, 0))
-        for name in ("sensor", "first_error"):
-            if np.any(middle := getattr(self, name).middle):
+        for name in ("disturbance", "sensor", "first_error"):
+            with _naming(name):
+                self._set(**{name: as_set(getattr(self, name))})
+            if name != "disturbance" and np.any(middle := getattr(self, name).middle):
                 found = shown(np.asarray(middle).tolist())
                 raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {found}")
 
-    def sized(self, n: int, p: int) -> Bounds:
-        """Returns the bounds of a plant with n states and p outputs, each of which is a sum of sets.
+    def sums(self, n: int, p: int) -> list[Sum]:
+        """Returns the three sets as sums, checked to be those of a plant with n states and p outputs.
 
         Raises:
-            ValueError: If one is a set in another dimension.
+            ValueError: If one is a set in another dimension, or they are not allowed beside each other.
         """
-        bounds = Bounds(self.disturbance, self.sensor, self.first_error)
-        bounds._put(lambda each, size: Sum((each,)).sized(size), (n, p))
-        return bounds
+        sums = [Sum((each,)) for each in (self.disturbance, self.sensor, self.first_error)]
+        left_out = [sum(part.is_left_out for part in each.parts) for each in sums]
+        if left_out[0] > 1 or any(left_out[1:]):
+            raise ValueError("Bounds of disturbances may have one remainder, and others none")
+        if len(deltas := {each.gaussian.delta for each in sums if each.gaussian}) > 1:
+            raise ValueError(f"all Gaussians of a plant must have the same delta, got {shown(sorted(deltas))}")
+        for name, each, size in zip(("disturbance", "sensor", "first_error"), sums, (n, p, n), strict=True):
+            with _naming(name):
+                each.sized(size)
+        return sums
 
-    def _put(self, made: Any, sizes: tuple[int, int]) -> None:
-        n, p = sizes
-        for name, size in (("disturbance", n), ("sensor", p), ("first_error", n)):
-            try:
-                object.__setattr__(self, name, made(getattr(self, name), size))
-            except ValueError as error:
-                raise ValueError(f"Bounds({name}=...): {error}") from error
+
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """Says in what is refused which of the bounds it is."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"Bounds({name}=...): {error}") from error
 
 
 def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.validation import counted
-
-if TYPE_CHECKING:
-    from ncs_gym.plants.linear_plant import LinearPlant
 
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
@@ -23,7 +20,7 @@ _UNBROKEN = "\N{NO-BREAK SPACE}"
 _WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noise", "the first estimate is exact")
 
 
-def described(plant: LinearPlant) -> str:
+def described(plant: BetweenSamples) -> str:
     """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
     counts = ((plant.n, "state"), (plant.m, "input"), (plant.p, "output"))
     sizes = ", ".join(counted(count, name) for count, name in counts)
@@ -52,7 +49,7 @@ def described(plant: LinearPlant) -> str:
     for title, (sizes_of, names, units) in extents.items():
         parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
         lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]
-    lines["assumptions"] = list(plant.assumptions)
+    lines["assumptions"] = list(assumptions_of(plant))
     shown_lines = (
         fill(text, _WIDTH, initial_indent=f"{title if number == 0 else '':<{_INDENT}}", subsequent_indent=" " * _INDENT)
         for title, texts in lines.items()
@@ -61,7 +58,7 @@ def described(plant: LinearPlant) -> str:
     return "\n".join(shown_lines).replace(_UNBROKEN, " ")
 
 
-def assumptions_of(plant: LinearPlant) -> tuple[str, ...]:
+def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
     """Returns what is assumed of everything uncertain about a plant."""
     first = [plant.initial_cov, *([] if plant.initial_bound is None else [plant.initial_bound.shape_matrix])]
     zero = (
@@ -104,7 +101,7 @@ def _between(name: str, low: float, high: float, center: float, unit: str) -> st
     return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
 
 
-def row_limit(plant: LinearPlant, j: int) -> str:
+def row_limit(plant: BetweenSamples, j: int) -> str:
     """Returns what row j of the safe box limits."""
     row, low, high = plant.box[j], float(plant.box_low[j]), float(plant.box_high[j])
     limited = np.flatnonzero(row).tolist()
@@ -115,13 +112,13 @@ def row_limit(plant: LinearPlant, j: int) -> str:
     return _sum_between(row, low, high, plant.operating_state, plant.state_names)
 
 
-def input_limit(plant: LinearPlant, i: int) -> str:
+def input_limit(plant: BetweenSamples, i: int) -> str:
     """Returns between what input i is."""
     low, high, center = float(plant.input_low[i]), float(plant.input_high[i]), float(plant.operating_input[i])
     return _between(plant.input_names[i], low, high, center, plant.input_units[i])
 
 
-def mixed_limit(plant: LinearPlant, j: int) -> str:
+def mixed_limit(plant: BetweenSamples, j: int) -> str:
     """Returns what row j of the limits of states and inputs together limits."""
     low, high = plant.mixed_ends[:, j].tolist()
     row, center = np.roll(plant.mixed_rows[j], plant.m), np.concatenate([plant.operating_input, plant.operating_state])
@@ -146,7 +143,7 @@ def _factor(size: float) -> str:
     return "" if size == 1.0 else f"{size:.4g} "
 
 
-def outputs_of(plant: LinearPlant) -> tuple[list[str], list[str]]:
+def outputs_of(plant: BetweenSamples) -> tuple[list[str], list[str]]:
     """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
     names, units = [], []
     for j, row in enumerate(plant.H):

@@ -191,7 +191,7 @@ def test_constant_disturbance_is_refused_beside_between_samples_at_every_entranc
     entrances = [
         lambda: make(between_samples=8),
         lambda: altered(plant, between_samples=8),
-        lambda: LinearPlant.read(edited),
+        lambda: LinearPlant.load(edited),
         lambda: gym_env(plant=plant, between_samples=8),
         lambda: gym_env(plant=edited),
         lambda: gym_vector_env(2, plant=plant, between_samples=8),
@@ -204,7 +204,7 @@ def test_constant_disturbance_is_refused_beside_between_samples_at_every_entranc
                 entrance()
     finally:
         del gym.registry[env_id]
-    assert make(between_samples=1).fingerprint == LinearPlant.read(document).fingerprint == plant.fingerprint
+    assert make(between_samples=1).fingerprint == LinearPlant.load(document).fingerprint == plant.fingerprint
 
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
