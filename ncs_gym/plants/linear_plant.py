@@ -13,26 +13,22 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from ncs_gym import exact
-from ncs_gym.bounds import DELTA, Bounds, Gaussian, Sum, Through
+from ncs_gym.bounds import DELTA, Bounds, Sum
 from ncs_gym.limits import Deviations, Limits
 from ncs_gym.model import Model, as_point
 from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import Source, weight_of
 from ncs_gym.plants.resting_point import at_rest, with_residual
-from ncs_gym.plants.statespace import SAME_STEP, zero_order_hold
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.validation import as_names, as_number, as_numbers, as_units, counted, read_only, reason_of, shown
+from ncs_gym.validation import as_names, as_numbers, as_units, counted, read_only, reason_of, shown
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
-# Disturbances of a step of a model whose response to a constant is worse conditioned are not traced back to its cause.
-LARGEST_CONDITION = 1e9
 # What identifies a plant, beside its sets.
 _NUMBERS = (
     *("A", "B", "H", "dt", "box", "box_ends", "input_ends", "mixed_rows", "mixed_ends"),
@@ -120,40 +116,6 @@ class LinearPlant(BetweenSamples):
             state_names=self.state_names + past,
             state_units=self.state_units + self.input_units * len(ages),
         )
-
-    def resampled(self, dt: float) -> LinearPlant:
-        """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
-
-        Whatever disturbs it is taken to act in continuous time and to be constant during a step: with
-        G(dt) = int_0^dt exp(Ac s) ds, the disturbances of a step become G(dt') G(dt)^-1 d. What is declared of sensors
-        and of the first estimate stays as it is, and so does `between_samples`: a longer step may need more times.
-        Where that is not what disturbs your plant, make the plant anew.
-
-        Raises:
-            ValueError: If dt is out of range, the plant has no continuous model, or a remainder or past inputs, which
-                belong to its step.
-        """
-        dt = as_number(dt, "dt", low=0.0, low_open=True)
-        if abs(dt - self.dt) <= SAME_STEP * self.dt:
-            return self
-        if self.past:
-            raise ValueError(f"delays and limits of rates belong to their step: make the plant anew with dt={dt:g}")
-        if self.continuous_model is None or self.remainder is not None:
-            raise ValueError(
-                f"only a plant that was sampled from a model in continuous time, without a remainder, can be sampled "
-                f"every {dt:g} s: make it by Model.sampled"
-            )
-        n, model = self.n, self.model
-        Ac, Bc = self.continuous_model[:, :n], self.continuous_model[:, n:]
-        of_constant = [zero_order_hold(Ac, np.eye(n), step)[1] for step in (dt, self.dt)]
-        if np.linalg.cond(of_constant[1] * self.half_widths / self.half_widths[:, None]) > LARGEST_CONDITION:
-            raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
-        G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
-        sampled = Model.sampled(Ac, Bc, model.H, dt, model.at)
-        if model.offset is not None:
-            sampled = replace(sampled, offset=exact.product(G, model.offset))
-        disturbance = Sum(tuple(_through(G, each) for each in self.bounds.disturbance.parts))
-        return replace(self, model=sampled, bounds=replace(self.bounds, disturbance=disturbance))
 
     @property
     def document(self) -> dict[str, Any]:
@@ -297,14 +259,6 @@ class LinearPlant(BetweenSamples):
         if numbers is None or numbers.ndim != 2:
             return as_point(value, len(center), f"the {of}"), center
         return np.array([as_point(each, len(center), f"the {of}") for each in numbers]).reshape(-1, len(center)), center
-
-
-def _through(G: np.ndarray, declared: Any) -> Any:
-    """Returns the set of all G d, also of Gaussian ones."""
-    if not isinstance(declared, Gaussian):
-        return Through(G, declared)
-    product = exact.product(G, declared.covariance, G.T)
-    return Gaussian(0.5 * (product + product.T), declared.delta)
 
 
 def _digest(numbers: Iterable[tuple[Any, Any]]) -> str:

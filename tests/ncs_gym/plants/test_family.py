@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from ncs_gym import Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
 from ncs_gym.uncertainty.family import Family
 from tests.plants import varying_cart_pole, varying_truck
-from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, resampled, sampled_plant
+from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, sampled_plant
 
 MASSES = {"mass": (3800.0, 4200.0)}
 POLE = {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}
@@ -474,7 +474,6 @@ REFUSED = {
         lambda: rate_limited(family_of(two(B=[[0.0], [0.4]])), 0.5),
         r"must be \[A, B, s\] of shape \(3, 5\)",
     ),
-    "another step later": (lambda: resampled(HULL, 0.25), "without a remainder"),
     "not a plant": (lambda: family_of(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "must be plants"),
     "sizes": (
         lambda: altered(
