@@ -41,11 +41,8 @@ class Box(UncertainSet):
         if not fits or len({*map(np.shape, ends)} - {()}) > 1:
             found = f"{shown(self.low)} and {shown(self.high)}"
             raise ValueError(f"a box needs two finite ends, numbers or vectors of one size, got {found}")
-        for name, end in zip(("low", "high"), np.array(np.broadcast_arrays(*ends)), strict=True):
-            object.__setattr__(self, name, end)
-        object.__setattr__(self, "middle", 0.5 * (self.high + self.low))
-        object.__setattr__(self, "size", self.half.size if self.half.ndim else None)
-        self._make_arrays_read_only()
+        low, high = np.array(np.broadcast_arrays(*ends))
+        self._set(low=low, high=high, middle=0.5 * (high + low), size=low.size if low.ndim else None)
         if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
             allowed = f"0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
             raise ValueError(
@@ -88,7 +85,7 @@ class Ball(UncertainSet):
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", as_number(self.radius, "the radius of a ball", low=0.0))
+        self._set(radius=as_number(self.radius, "the radius of a ball", low=0.0))
         Box(-self.radius, self.radius)
 
     def sized(self, size: int) -> Any:  # noqa: D102
@@ -106,10 +103,9 @@ class Gaussian(UncertainSet):
     delta: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "covariance", as_covariance(self.covariance, None, "the covariance of a Gaussian"))
-        object.__setattr__(self, "delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
-        object.__setattr__(self, "size", len(self.covariance))
-        self._make_arrays_read_only()
+        covariance = as_covariance(self.covariance, None, "the covariance of a Gaussian")
+        delta = as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT)
+        self._set(covariance=covariance, delta=delta, size=len(covariance))
 
     @cached_property
     def noise(self) -> TruncatedGaussian:
@@ -135,15 +131,14 @@ class Through(UncertainSet):
     set: Any
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "E", as_matrix(self.E, (None, None), "E of a set through E"))
-        object.__setattr__(self, "set", as_set(self.set).sized(self.E.shape[1]))
-        if isinstance(self.set, Gaussian) or (isinstance(self.set, Sum) and self.set.gaussian):
+        E = as_matrix(self.E, (None, None), "E of a set through E")
+        own = as_set(self.set).sized(E.shape[1])
+        parts = Sum((own,)).parts
+        if any(isinstance(each, Gaussian) for each in parts):
             raise ValueError("a Gaussian through E is a Gaussian of covariance E P E': give that one")
-        if any(each.is_left_out for each in getattr(self.set, "parts", (self.set,))):
+        if any(each.is_left_out for each in parts):
             raise ValueError("what a model leaves out is not taken through E: give the remainder of the states itself")
-        object.__setattr__(self, "size", len(self.E))
-        object.__setattr__(self, "middle", self.E @ np.broadcast_to(self.set.middle, self.E.shape[1]))
-        self._make_arrays_read_only()
+        self._set(E=E, set=own, size=len(E), middle=E @ np.broadcast_to(own.middle, E.shape[1]))
         self.ellipsoid()
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
@@ -169,9 +164,8 @@ class Sum(UncertainSet):
         parts = [part for each in given for part in (each.parts if isinstance(each, Sum) else [each])]
         if sum(isinstance(each, Gaussian) for each in parts) > 1:
             raise ValueError("a sum may have one Gaussian: add the covariances")
-        object.__setattr__(self, "parts", tuple(parts))
-        object.__setattr__(self, "size", next((each.size for each in parts if each.size), None))
-        object.__setattr__(self, "middle", sum(each.middle for each in self.sized(self.size or 1).parts))
+        self._set(parts=tuple(parts), size=next((each.size for each in parts if each.size), None))
+        self._set(middle=sum(each.middle for each in self.sized(self.size or 1).parts))
 
     @property
     def gaussian(self) -> Any:

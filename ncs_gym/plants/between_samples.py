@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.model import zero_order_hold
 from ncs_gym.plants.hard_bounds import HardBounds
-from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.validation import read_only, setting, shown
 
 # A and B of a plant are those of its model in continuous time up to this, relative to the largest entry in units of the

@@ -9,7 +9,7 @@ from experiments.baselines import CONTROLLERS, RegulatorWeights, controller
 from experiments.baselines.controllers import equilibrium
 from ncs_gym import Channel, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.model import zero_order_hold
 from shields.certificate import Fallback
 from tests.plants import small
 from tests.product import linear_plant, loop_env

@@ -7,9 +7,9 @@ from scipy.linalg import expm
 
 from ncs_gym import ChannelContract, Ellipsoid, contract_of
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.model import zero_order_hold
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
-from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.plants.stirred_tank import stirred_tank
 from shields import Infeasible, certificate_for, verify
 from tests.product import altered, synthesize
