@@ -92,6 +92,16 @@ class Deviations(NamedTuple):
     lacking: np.ndarray
     past: int = 0
 
+    def around(self, x: np.ndarray, u: np.ndarray) -> Deviations:
+        """Returns the same plant counted from another point, which is (x, u) from here: its ends move."""
+        box, mixed = self.box.around(x), self.mixed.around(np.concatenate([x, u]))
+        return self._replace(box=box, inputs=self.inputs - u, mixed=mixed, state=self.state + x, input=self.input + u)
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the point is strictly within the limits."""
+        return all(((low < 0.0) & (high > 0.0)).all() for low, high in (self.box[1:], self.inputs, self.mixed[1:]))
+
 
 def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""

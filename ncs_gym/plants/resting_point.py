@@ -40,28 +40,20 @@ def at_rest(own: Deviations, disturbance: Any) -> Deviations:
         return own
     E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
     x, u, missing = _resting(own, E, middle)
-    state, applied = own.state + x, own.input + u
-    box, inputs, mixed = own.box.around(x), own.inputs - u, own.mixed.around(np.concatenate([x, u]))
-    if not all(((low < 0.0) & (high > 0.0)).all() for low, high in (box[1:], inputs, mixed[1:])):
+    rest = own.around(x, u)
+    state, applied = ([float(f"{each:.6g}") for each in point] for point in (rest.state, rest.input))
+    if not rest.is_within:
         raise ValueError(
-            f"the middle of this disturbance moves the operating point to {shown(state.tolist())} with input "
-            f"{shown(applied.tolist())}, which is not strictly within the limits"
+            f"the middle of this disturbance moves the operating point to {shown(state)} with input {shown(applied)}, "
+            "which is not strictly within the limits"
         )
-    shown_point = [[float(f"{each:.6g}") for each in around] for around in (state, applied)]
     warn_caller(
-        "deviations are counted from the state {} and the input {}, where the middle of the disturbance rests "
-        "(plant.operating_state)".format(*map(shown, shown_point)),
+        f"deviations are counted from the state {shown(state)} and the input {shown(applied)}, where the middle of "
+        "the disturbance rests (plant.operating_state)",
         MovedOperatingPointWarning,
     )
-    return own._replace(
-        box=box,
-        inputs=inputs,
-        mixed=mixed,
-        state=state,
-        input=applied,
-        step_offset=own.step_offset + exact.product(np.abs(E), np.abs(middle)),
-        lacking=np.abs(missing) + own.lacking,
-    )
+    step_offset = own.step_offset + exact.product(np.abs(E), np.abs(middle))
+    return rest._replace(step_offset=step_offset, lacking=np.abs(missing) + own.lacking)
 
 
 def _resting(own: Deviations, E: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
