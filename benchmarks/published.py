@@ -20,7 +20,7 @@ from scipy.optimize import linprog
 from benchmarks.commands import run, table
 from experiments.commands.attack import attacked, channels_of, worst_case
 from ncs_gym import Bounds, Box, Channel, ChannelContract, Limits, LinearPlant, Model, NCSVectorEnv, Through
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.model import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, Infeasible, VectorSafetyShield, reach_of, synthesize, verify
 from shields.synthesis.invariant_polytope import points_of_box

@@ -5,8 +5,8 @@ A number or a vector stands for half-widths per entry. Ellipsoids around sets ar
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -41,11 +41,8 @@ class Box(UncertainSet):
         if not fits or len({*map(np.shape, ends)} - {()}) > 1:
             found = f"{shown(self.low)} and {shown(self.high)}"
             raise ValueError(f"a box needs two finite ends, numbers or vectors of one size, got {found}")
-        for name, end in zip(("low", "high"), np.array(np.broadcast_arrays(*ends)), strict=True):
-            object.__setattr__(self, name, end)
-        object.__setattr__(self, "middle", 0.5 * (self.high + self.low))
-        object.__setattr__(self, "size", self.half.size if self.half.ndim else None)
-        self._make_arrays_read_only()
+        low, high = np.array(np.broadcast_arrays(*ends))
+        self._set(low=low, high=high, middle=0.5 * (high + low), size=low.size if low.ndim else None)
         if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
             allowed = f"0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
             raise ValueError(
@@ -88,7 +85,7 @@ class Ball(UncertainSet):
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radius", as_number(self.radius, "the radius of a ball", low=0.0))
+        self._set(radius=as_number(self.radius, "the radius of a ball", low=0.0))
         Box(-self.radius, self.radius)
 
     def sized(self, size: int) -> Any:  # noqa: D102
@@ -106,10 +103,9 @@ class Gaussian(UncertainSet):
     delta: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "covariance", as_covariance(self.covariance, None, "the covariance of a Gaussian"))
-        object.__setattr__(self, "delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
-        object.__setattr__(self, "size", len(self.covariance))
-        self._make_arrays_read_only()
+        covariance = as_covariance(self.covariance, None, "the covariance of a Gaussian")
+        delta = as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT)
+        self._set(covariance=covariance, delta=delta, size=len(covariance))
 
     @cached_property
     def noise(self) -> TruncatedGaussian:
@@ -135,15 +131,14 @@ class Through(UncertainSet):
     set: Any
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "E", as_matrix(self.E, (None, None), "E of a set through E"))
-        object.__setattr__(self, "set", as_set(self.set).sized(self.E.shape[1]))
-        if isinstance(self.set, Gaussian) or (isinstance(self.set, Sum) and self.set.gaussian):
+        E = as_matrix(self.E, (None, None), "E of a set through E")
+        own = as_set(self.set).sized(E.shape[1])
+        parts = Sum((own,)).parts
+        if any(isinstance(each, Gaussian) for each in parts):
             raise ValueError("a Gaussian through E is a Gaussian of covariance E P E': give that one")
-        if any(each.is_left_out for each in getattr(self.set, "parts", (self.set,))):
+        if any(each.is_left_out for each in parts):
             raise ValueError("what a model leaves out is not taken through E: give the remainder of the states itself")
-        object.__setattr__(self, "size", len(self.E))
-        object.__setattr__(self, "middle", self.E @ np.broadcast_to(self.set.middle, self.E.shape[1]))
-        self._make_arrays_read_only()
+        self._set(E=E, set=own, size=len(E), middle=E @ np.broadcast_to(own.middle, E.shape[1]))
         self.ellipsoid()
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
@@ -169,30 +164,18 @@ class Sum(UncertainSet):
         parts = [part for each in given for part in (each.parts if isinstance(each, Sum) else [each])]
         if sum(isinstance(each, Gaussian) for each in parts) > 1:
             raise ValueError("a sum may have one Gaussian: add the covariances")
-        object.__setattr__(self, "parts", tuple(parts))
-        object.__setattr__(self, "size", next((each.size for each in parts if each.size), None))
-        object.__setattr__(self, "middle", sum(each.middle for each in self.sized(self.size or 1).parts))
+        self._set(parts=tuple(parts), size=next((each.size for each in parts if each.size), None))
+        self._set(middle=sum(each.middle for each in self.sized(self.size or 1).parts))
 
     @property
     def gaussian(self) -> Any:
         """The part that is a Gaussian; None if there is none."""
         return next((each for each in self.parts if isinstance(each, Gaussian)), None)
 
-    def without(self, others: Sequence[Any]) -> Sum:
-        """Returns the sum of the parts that are not among others."""
-        return Sum(tuple(each for each in self.parts if not any(each is other for other in others)))
-
-    def as_one(self, weight: np.ndarray) -> Any:
-        """Returns the only part, or else the ellipsoid of the smallest tr(W P), which must be about zero.
-
-        Raises:
-            ValueError: If one of several parts has two different ends.
-        """
-        if len(self.parts) == 1:
-            return self.parts[0]
-        if pushes_of(self):
-            raise ValueError("a set with two different ends is not added to others: give the sum as Through(E, Box)")
-        return self.ellipsoid(weight)
+    @property
+    def declared(self) -> Sum:
+        """The sum of all but what a model leaves out."""
+        return Sum(tuple(each for each in self.parts if not each.is_left_out))
 
     def sized(self, size: int) -> Any:  # noqa: D102
         sized = tuple(each.sized(size) for each in self.parts)
@@ -268,29 +251,38 @@ class Bounds(ReadOnlyArrays):
     first_error: Any
 
     def __post_init__(self) -> None:
-        self._put(lambda value, _: as_set(value), (0, 0))
-        for name in ("sensor", "first_error"):
-            if np.any(middle := getattr(self, name).middle):
+        for name in ("disturbance", "sensor", "first_error"):
+            with _naming(name):
+                self._set(**{name: as_set(getattr(self, name))})
+            if name != "disturbance" and np.any(middle := getattr(self, name).middle):
                 found = shown(np.asarray(middle).tolist())
                 raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {found}")
 
-    def sized(self, n: int, p: int) -> Bounds:
-        """Returns the bounds of a plant with n states and p outputs, each of which is a sum of sets.
+    def sums(self, n: int, p: int) -> list[Sum]:
+        """Returns the three sets as sums, checked to be those of a plant with n states and p outputs.
 
         Raises:
-            ValueError: If one is a set in another dimension.
+            ValueError: If one is a set in another dimension, or they are not allowed beside each other.
         """
-        bounds = Bounds(self.disturbance, self.sensor, self.first_error)
-        bounds._put(lambda each, size: Sum((each,)).sized(size), (n, p))
-        return bounds
+        sums = [Sum((each,)) for each in (self.disturbance, self.sensor, self.first_error)]
+        left_out = [sum(part.is_left_out for part in each.parts) for each in sums]
+        if left_out[0] > 1 or any(left_out[1:]):
+            raise ValueError("Bounds of disturbances may have one remainder, and others none")
+        if len(deltas := {each.gaussian.delta for each in sums if each.gaussian}) > 1:
+            raise ValueError(f"all Gaussians of a plant must have the same delta, got {shown(sorted(deltas))}")
+        for name, each, size in zip(("disturbance", "sensor", "first_error"), sums, (n, p, n), strict=True):
+            with _naming(name):
+                each.sized(size)
+        return sums
 
-    def _put(self, made: Any, sizes: tuple[int, int]) -> None:
-        n, p = sizes
-        for name, size in (("disturbance", n), ("sensor", p), ("first_error", n)):
-            try:
-                object.__setattr__(self, name, made(getattr(self, name), size))
-            except ValueError as error:
-                raise ValueError(f"Bounds({name}=...): {error}") from error
+
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """Says in what is refused which of the bounds it is."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"Bounds({name}=...): {error}") from error
 
 
 def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:

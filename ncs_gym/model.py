@@ -8,8 +8,6 @@ from typing import Any, Self
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.limits import as_point
-from ncs_gym.plants.statespace import SAME_STEP, zero_order_hold
 from ncs_gym.validation import (
     SMALLEST_NUMBER,
     ReadOnlyArrays,
@@ -23,8 +21,41 @@ from ncs_gym.validation import (
 )
 
 LONGEST_INPUT_DELAY = 100
+# Durations of steps that differ by less than this are the same.
+SAME_STEP = 1e-9
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
 EQUILIBRIUM_PRECISION = 1e-12
+
+
+def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the matrices of x+ = A x + B u for x' = A x + B u with u held constant over each step.
+
+    Every entry is rounded once, so that it is the same on every machine.
+
+    Args:
+        A: Continuous-time state matrix, shape (n, n) [1/s].
+        B: Continuous-time input matrix, shape (n, m).
+        dt: Duration of a step [s].
+
+    Raises:
+        ValueError: If an entry is too large for a float64.
+    """
+    n, m = B.shape
+    try:
+        sampled = exact.exponential(np.block([[A, B], [np.zeros((m, n + m))]]), dt)
+    except OverflowError as error:
+        raise ValueError(f"the model grows beyond all numbers within a step of {dt:g} s: give a smaller dt") from error
+    return sampled[:n, :n], sampled[:n, n:]
+
+
+def as_point(value: Any, size: int, name: str) -> np.ndarray:
+    """Returns a vector, shape (size,); a number stands for a vector of one entry.
+
+    Raises:
+        ValueError: If it is no finite vector of this size.
+    """
+    numbers = as_numbers(value)
+    return as_vector([value] if size == 1 and numbers is not None and numbers.ndim == 0 else value, size, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +97,9 @@ class Model(ReadOnlyArrays):
     step_offset: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        A = as_matrix(self.A, (None, None), "A")
+        A = _square(self.A)
         n = len(A)
-        A, B = as_matrix(A, (n, n), "A"), as_matrix(self.B, (n, None), "B")
+        B = as_matrix(self.B, (n, None), "B")
         H = np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H")
         if (np.abs(H).max(axis=1) < SMALLEST_NUMBER).any():
             raise ValueError(f"every row of H must measure something, got {shown(H.tolist())}")
@@ -80,31 +111,20 @@ class Model(ReadOnlyArrays):
             np.zeros(size) if of is None else as_point(of, size, f"the {name} in at=(state, input)")
             for name, of, size in named
         )
-        made = {
-            "at": as_given(self.at),
-            "A": A,
-            "B": B,
-            "H": H,
-            "dt": as_number(self.dt, "dt", low=0.0, low_open=True),
-            "state": x,
-            "input": u,
-        }
-        made |= {"lacking": np.zeros(n), "step_offset": np.zeros(n), "is_given": tuple(each is not None for each in at)}
+        dt = as_number(self.dt, "dt", low=0.0, low_open=True)
+        self._set(at=as_given(self.at), A=A, B=B, H=H, dt=dt, state=x, input=u)
+        self._set(is_given=tuple(each is not None for each in at), lacking=np.zeros(n), step_offset=np.zeros(n))
         if self.offset is not None:
-            made["offset"] = offset = as_vector(self.offset, n, "offset")
-            made |= {"lacking": _residual(A, B, offset, x, u), "step_offset": np.abs(offset)}
+            c = as_vector(self.offset, n, "offset")
+            self._set(offset=c, lacking=_lacking(A, B, c, x, u), step_offset=np.abs(c))
         if self.continuous is not None:
-            made["continuous"] = as_matrix(self.continuous, (n, n + m), "continuous")
-        made["delays"] = as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY)
-        for name, value in made.items():
-            object.__setattr__(self, name, value)
-        self._make_arrays_read_only()
+            self._set(continuous=as_matrix(self.continuous, (n, n + m), "continuous"))
+        self._set(delays=as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY))
 
     @classmethod
     def sampled(cls, A: Any, B: Any, C: Any, dt: float, at: Any = None) -> Self:
         """Returns the exact zero-order hold of x' = A x + B u, y = C x; C is the identity if None."""
-        A = as_matrix(A, (None, None), "A")
-        A = as_matrix(A, (len(A), len(A)), "A")
+        A = _square(A)
         B = as_matrix(B, (len(A), None), "B")
         C = None if C is None else as_matrix(C, (None, len(A)), "C")
         dt = as_number(dt, "dt", low=0.0, low_open=True)
@@ -123,16 +143,12 @@ class Model(ReadOnlyArrays):
         Raises:
             ValueError: If it is no such model, D is not zero, or dt is missing or another than the model's.
         """
-        *matrices, own = _matrices_of(system)
-        A = as_matrix(matrices[0], (None, None), "A of the model")
-        A = as_matrix(A, (len(A), len(A)), "A of the model")
-        B = as_matrix(matrices[1], (len(A), None), "B of the model")
-        H = as_matrix(matrices[2], (None, len(A)), "C of the model")
-        D = as_numbers(0.0 if matrices[3] is None else matrices[3])
-        if D is None or D.any():
+        A, B, C, D, own = _matrices_of(system)
+        given = as_numbers(0.0 if D is None else D)
+        if given is None or given.any():
             raise ValueError(
                 "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is "
-                f"known, from what is measured and give D = 0, got {shown(matrices[3] if D is None else D.tolist())}"
+                f"known, from what is measured and give D = 0, got {shown(D if given is None else given.tolist())}"
             )
         is_continuous = own is not True and own == 0
         if dt is None:
@@ -141,10 +157,10 @@ class Model(ReadOnlyArrays):
             dt = own
         dt = as_number(dt, "dt", low=0.0, low_open=True)
         if is_continuous:
-            return cls.sampled(A, B, H, dt, at)
+            return cls.sampled(A, B, C, dt, at)
         if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
             raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
-        return cls(A, B, H, dt, at)
+        return cls(A, B, C, dt, at)
 
     def held(self, E: Any) -> np.ndarray:
         """Returns what w' = E w held constant over a step does to the state, shape (n, q), for E of shape (n, q).
@@ -164,12 +180,25 @@ class Model(ReadOnlyArrays):
         return replace(self, delays=steps)
 
 
-def _residual(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarray, applied: np.ndarray) -> np.ndarray:
-    """Returns A x0 + B u0 + c - x0, rounded once, shape (n,); raises ValueError if it is more than rounding."""
+def _square(A: Any) -> np.ndarray:
+    A = as_matrix(A, (None, None), "A")
+    return as_matrix(A, (len(A), len(A)), "A")
+
+
+def residual(
+    A: np.ndarray, B: np.ndarray, E: np.ndarray, x: np.ndarray, u: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """Returns A x + B u + E w - x, rounded once, shape (n,), and whether that is rounding alone."""
+    missing = exact.product(np.hstack([A, B, E, -np.eye(len(A))]), np.concatenate([x, u, w, x]))
+    terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(w) + np.abs(x)
+    return missing, bool((np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all())
+
+
+def _lacking(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarray, applied: np.ndarray) -> np.ndarray:
+    """Returns A x0 + B u0 + c - x0, shape (n,); raises ValueError if it is more than rounding."""
     eye = np.eye(len(A))
-    missing = exact.product(np.hstack([A, B, eye, -eye]), np.concatenate([state, applied, offset, state]))
-    terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)
-    if (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
+    missing, rests = residual(A, B, eye, state, applied, offset)
+    if rests:
         return missing
     remedy = "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
     if exact.rank(rest := eye - A) == len(A):
@@ -183,31 +212,27 @@ def _residual(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarra
 def _matrices_of(system: Any) -> tuple[Any, Any, Any, Any, Any]:
     """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
     if isinstance(system, (tuple, list)) and len(system) in (4, 5):
-        A, B, C, D, own = (*system, 0)[:5]
-        return A, B, C, D, _sampling_time(system, own)
-    model: Any = system
-    if not hasattr(model, "A") and (hasattr(model, "to_ss") or hasattr(model, "num")):
+        *matrices, own = (*system, 0)[:5]
+    elif not hasattr(system, "A") and (hasattr(system, "to_ss") or hasattr(system, "num")):
         raise ValueError(
             f"{shown(system)} is a transfer function, whose states would be nobody's: limits and names are of states, "
             "so give a state-space model with states of yours"
         )
-    if not all(hasattr(model, name) for name in "ABCD"):
+    elif not all(hasattr(system, name) for name in "ABCD"):
         raise ValueError(
             "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
             f"(A, B, C, D) or (A, B, C, D, dt), got {shown(system)}"
         )
-    return model.A, model.B, model.C, model.D, _sampling_time(model, getattr(model, "dt", None))
-
-
-def _sampling_time(model: Any, own: Any) -> Any:
-    """Returns the sampling time of a model; raises ValueError if it leaves open whether there is one."""
+    else:
+        *matrices, own = (getattr(system, name, None) for name in ("A", "B", "C", "D", "dt"))
     if own is None:
         from scipy.signal import lti  # takes long to import, and is there if the model is scipy's
 
-        if isinstance(model, lti):
-            return 0
-        raise ValueError(
-            "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with dt=0 "
-            "or with its sampling time in seconds"
-        )
-    return own
+        if not isinstance(system, lti):
+            raise ValueError(
+                "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with "
+                "dt=0 or with its sampling time in seconds"
+            )
+        own = 0
+    A, B, C, D = matrices
+    return A, B, C, D, own

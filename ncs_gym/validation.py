@@ -48,9 +48,13 @@ class ReadOnlyArrays:
     """
 
     def _make_arrays_read_only(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray) or type(value) is tuple:
-                object.__setattr__(self, name, frozen_inside(value))
+        self._set(**vars(self))
+
+    def _set(self, **values: Any) -> None:
+        """Puts values in place of fields, with arrays read-only."""
+        for name, value in values.items():
+            held = isinstance(value, np.ndarray) or type(value) is tuple
+            object.__setattr__(self, name, frozen_inside(value) if held else value)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

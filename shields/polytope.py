@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.limits import sides
-from ncs_gym.plants.between_samples import MOST_POINTS
+from ncs_gym.limits import MOST_POINTS, sides
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     ReadOnlyArrays,
@@ -171,7 +170,7 @@ def _ends_of(low: Any, high: Any, rows: int) -> np.ndarray:
         [infinity if each is None else each for each in side] if isinstance(side, list) else side
         for side, infinity in ((low, -np.inf), (high, np.inf))
     )
-    ends = np.stack(sides(given, rows, "the ends of the polytope"))
+    ends = sides(given, rows, "the ends of the polytope")
     if not np.isfinite(ends).any(axis=0).all():
         raise ValueError(f"one of the ends of the polytope must be finite for each row, got {shown(given)}")
     return ends

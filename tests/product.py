@@ -260,11 +260,6 @@ def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
     return ncs_gym.family(members, ranges, **settings)
 
 
-def resampled(plant: LinearPlant, dt: float) -> LinearPlant:
-    """The plant with steps of another duration."""
-    return plant.resampled(dt)
-
-
 def rate_limited(plant: LinearPlant, largest: Any, per: str = "step") -> LinearPlant:
     """The plant whose inputs change by so much from one step to the next, or per second, at most."""
     rate = np.asarray(largest) * (plant.dt if per == "second" else 1.0)

@@ -69,8 +69,8 @@ RUNS = {
     "servo_requirements.py": (
         [],
         [
-            "a step of 0.005 s: the newest sample may be 3 steps old",
-            "a step of 0.02 s: the newest sample may be 0 steps old",
+            "a step of 0.005 s: max_age = 6",
+            "a step of 0.02 s: max_age = 1",
         ],
     ),
     "sb3_ten_lines.py": (

@@ -10,6 +10,7 @@ import tarfile
 import tomllib
 import zipfile
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,11 @@ def test_packages_import_only_from_those_to_their_left(package):
     later = set(ORDER[ORDER.index(package) + 1 :])
     for path in (ROOT / package).rglob("*.py"):
         assert not imports_of(path, later), path
+
+
+def test_no_circle_of_imports_makes_a_plant():
+    modules = {name_of(path): imports(path) & NAMES for path in MODULES}
+    TopologicalSorter({name: used for name, used in modules.items() if name.startswith("ncs_gym.")}).prepare()
 
 
 @pytest.mark.parametrize("package", ORDER)

@@ -16,7 +16,6 @@ OWN_REFUSALS = {
     ),  # plants from values
 }
 CLASSES = {"LinearPlant", "NCSEnv", "NCSVectorEnv", "SafetyShield", "VectorSafetyShield", "SafetyFilter", "SafeLoop"}
-METHODS = {"resampled"}
 FUNCTIONS = {"synthesize", "linear_model", "family"}
 OF_PLANTS = {*inspect.signature(LinearPlant).parameters}
 
@@ -36,7 +35,6 @@ def makes(node):
     given = {each.arg for each in node.keywords}
     return (
         name in CLASSES
-        or (owner and name in METHODS)
         or (owner in (["ncs_gym"], ["shields"], ["shields", "paper"]) and name in FUNCTIONS)
         or (name == "replace" and given & OF_PLANTS)
         or (owner == ["gym"] and "plant" in given and "LinearNCS" in ast.unparse(node.args[0]))
@@ -50,7 +48,7 @@ def test_nothing_but_refusals_goes_past_the_door():
 
 
 def test_every_way_past_the_door_is_found():
-    ways = """LinearPlant(**given); ncs_gym.NCSEnv(plant); partial(SafetyShield, env); plant.resampled(0.1)
+    ways = """LinearPlant(**given); ncs_gym.NCSEnv(plant); partial(SafetyShield, env)
         from shields.paper import synthesize as own; shields.synthesize(plant); ncs_gym.family(plants)
         replace(plant, limits=limits); gym.make("ncs_gym/LinearNCS-v0", plant=plant)"""
     assert all(past_the_door(way.strip()) for line in ways.splitlines() for way in line.split(";"))

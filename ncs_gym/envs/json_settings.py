@@ -136,14 +136,14 @@ def read_plant(given: Any) -> Any:
         ValueError: If it is that of no plant.
     """
     if not isinstance(given, Mapping):
-        return LinearPlant.read(given) if isinstance(given, str | os.PathLike) else given
+        return LinearPlant.load(given) if isinstance(given, str | os.PathLike) else given
     try:
         key = _key(given)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"the document of a plant must be JSON values: {error}") from error
     plant = _plants.get(key)
     if plant is None:
-        plant = _plants[key] = LinearPlant.read(given)
+        plant = _plants[key] = LinearPlant.load(given)
     return plant
 
 

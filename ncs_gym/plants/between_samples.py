@@ -6,15 +6,16 @@ G = [[Ac, Bc], [0, 0]] of the model x' = Ac x + Bc u + w in continuous time.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.plants.statespace import zero_order_hold
-from ncs_gym.validation import read_only
+from ncs_gym.model import zero_order_hold
+from ncs_gym.plants.hard_bounds import HardBounds
+from ncs_gym.validation import read_only, setting, shown
 
-MOST_POINTS = 64
 # A and B of a plant are those of its model in continuous time up to this, relative to the largest entry in units of the
 # limits.
 SAME_MODEL = 1e-9
@@ -38,126 +39,117 @@ class GridRows(NamedTuple):
     remainder: np.ndarray
 
 
-def generator(model: np.ndarray) -> np.ndarray:
-    """Returns G = [[Ac, Bc], [0, 0]], shape (n + m, n + m), of [Ac, Bc], shape (n, n + m)."""
-    n, size = model.shape
-    return np.concatenate([model, np.zeros((size - n, size))])
+class BetweenSamples(HardBounds):
+    """What the limits say of times between samples.
 
-
-def widest(box: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Returns bounds of |x_i| in the safe box, shape (n,): x = (C'C)^-1 C' (C x) for the rows C that have two ends.
-
-    Args:
-        box: All rows, shape (k, n).
-        ends: Their low and high ends, shape (2, k).
-
-    Raises:
-        ZeroDivisionError: If the box does not bound every state.
+    Attributes:
+        continuous_model: [Ac, Bc] that A and B were sampled from, shape (n, n + m); None if unknown.
+        between_samples: Number of times per step at which the box counts; None for the sampling instants alone.
     """
-    bounded = np.isfinite(ends).all(axis=0)
-    rows, sizes = box[bounded], np.abs(ends[:, bounded]).max(axis=0)
-    gram = exact.product(rows.T, rows)
-    return (np.abs(exact.product(exact.inverse(gram), rows.T)) * sizes).sum(axis=1)
+
+    continuous_model = setting("continuous_model", "model.continuous")
+    between_samples = setting("between_samples", "limits.between_samples")
+
+    @cached_property
+    def grid_rows(self) -> GridRows | None:
+        """What the box says of states and inputs between samples; None if only the sampling instants count.
+
+        Every number is the same on every machine. Between two grid points a function leaves its linear interpolation by
+        at most h^2/8 times its largest second derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W =
+        sum |q_j| W_j, with W the largest |x_j| and |u_j|, that grows from one grid point to the next by at most
+        exp(h m), m the logarithmic norm of G.
+
+        Raises:
+            OverflowError: If it is out of reach of float64, which the message says.
+        """
+        model, points = self.continuous_model, self.between_samples
+        if points is None:
+            return None
+        G, h = np.concatenate([model, np.zeros((self.m, self.n + self.m))]), self.dt / points
+        rows, W = np.pad(self.box, ((0, 0), (0, self.m))), np.concatenate([self._widest(), self.largest_input])
+        try:
+            times = [self.dt * i / points for i in range(1, points)]
+            onward = [rows, *(exact.product(rows, exact.exponential(G, time)) for time in times)]
+            bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
+            sizes = [exact.product(np.abs(each), W) for each in onward]
+            growth = float(exact.exponential(np.array([[_logarithmic_norm(G, W)]]), h)[0, 0])
+        except OverflowError as error:
+            raise OverflowError(
+                "the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
+            ) from error
+        remainder = (1.0 + MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0) + ROUNDING * np.max(sizes, axis=0)
+        state, applied = np.split(np.array(onward), [self.n], axis=2)
+        return GridRows(read_only(state), read_only(applied), read_only(remainder))
+
+    @cached_property
+    def _rows_within_step(self) -> np.ndarray | None:
+        """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m); None as of `grid_rows`.
+
+        What a disturbance did to the step, d = x+ - A x - B u, has come in proportion to the time: d_tau = (tau / dt)
+        d, which lies in E(D) as d does.
+        """
+        if (rows := self.grid_rows) is None:
+            return None
+        shares = (np.arange(1, len(rows.state)) / len(rows.state))[:, None, None]
+        moved, pushed = rows.state[1:] - shares * (self.box @ self.A), rows.input[1:] - shares * (self.box @ self.B)
+        return np.concatenate([moved, pushed, shares * self.box], axis=2).reshape(-1, 2 * self.n + self.m)
+
+    def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
+        """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
+
+        Shape (k + q,) or (k + q, N). With `between_samples` at these times of the step, what moved x+ away from A x + B
+        u in proportion to the time; else at its end alone.
+
+        Args:
+            state: x at the beginning, shape (n,) or (n, N).
+            u: Input that was held, shape (m,) or (m, N).
+            x_next: x+, of the shape of x.
+        """
+        values, rows = self.constraint_values(x_next), self._rows_within_step
+        if rows is not None:
+            reached = rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
+            low, high = self.box_ends if values.ndim == 1 else self.box_ends[:, :, None]
+            values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
+        return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
+
+    def _check_between_samples(self) -> None:
+        """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
+        continuous, model = self.continuous_model, self.model
+        if continuous is not None:
+            n, widths = len(model.A), np.concatenate([self.half_widths[: len(model.A)], self.input_half])
+            sampled = np.hstack(zero_order_hold(continuous[:, :n], continuous[:, n:], self.dt))
+            sampled, given = (each * widths / widths[:n, None] for each in (sampled, np.hstack([model.A, model.B])))
+            if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
+                raise ValueError(
+                    "continuous of the Model is not the one that A and B were sampled from: make it by Model.sampled, "
+                    "or give continuous=None"
+                )
+        if self.between_samples is None:
+            return
+        if continuous is None:
+            raise ValueError(
+                "between_samples needs a model that was sampled from one in continuous time (Model.sampled); plants "
+                "that model another process have none"
+            )
+        if self.past:
+            raise ValueError("between_samples is for plants without delays and without limits of rates")
+        if any(each.is_left_out for each in self.bounds.disturbance.parts):
+            raise ValueError(
+                "between_samples is for a plant without a remainder, which says nothing of the times between samples"
+            )
+        if self.step_offset.any():
+            raise ValueError(
+                "between_samples is for an operating point that rests without a constant disturbance: how much of "
+                f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
+            )
+        if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
+            raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
 
 
-def grid_rows(
-    model: np.ndarray, box: tuple[np.ndarray, np.ndarray], largest_input: np.ndarray, dt: float, points: int
-) -> GridRows:
-    """Returns the rows on the grid; every number is the same on every machine.
-
-    Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
-    derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
-    |u_j|, that grows from one grid point to the next by at most exp(h m), m the logarithmic norm of G.
-
-    Args:
-        model: [Ac, Bc], shape (n, n + m).
-        box: c, shape (k, n), and its ends, shape (2, k).
-        largest_input: Largest |u_i| within the limits, shape (m,).
-        dt: Duration of a step [s].
-        points: N.
-
-    Raises:
-        ZeroDivisionError: If the box does not bound every state.
-        OverflowError: If a number of them is out of reach of float64.
-    """
-    try:
-        return _grid_rows(model, box, largest_input, dt, points)
-    except OverflowError as error:
-        raise OverflowError(
-            "the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
-        ) from error
-
-
-def _grid_rows(
-    model: np.ndarray, box: tuple[np.ndarray, np.ndarray], largest_input: np.ndarray, dt: float, points: int
-) -> GridRows:
-    G, (k, n), h = generator(model), box[0].shape, dt / points
-    W = np.concatenate([widest(*box), largest_input])
-    rows = np.concatenate([box[0], np.zeros((k, len(largest_input)))], axis=1)
-    onward = [rows] + [exact.product(rows, exact.exponential(G, dt * i / points)) for i in range(1, points)]
-    bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
-    sizes = [exact.product(np.abs(each), W) for each in onward]
-    growth = float(exact.exponential(np.array([[logarithmic_norm(G, W)]]), h)[0, 0])
-    remainder = (1.0 + MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0) + ROUNDING * np.max(sizes, axis=0)
-    stacked = np.array(onward)
-    return GridRows(read_only(stacked[..., :n]), read_only(stacked[..., n:]), read_only(remainder))
-
-
-def logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
+def _logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
     """Returns m = max_i (G_ii + sum_{j != i} |G_ij| W_j / W_i), at least 0.
 
     In the norm max |z_j| / W_j of columns, and so in |q|_W of rows, |exp(G s)| <= exp(s m).
     """
     off = np.abs(G) * (1.0 - np.eye(len(G)))
     return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)
-
-
-def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float, widths: np.ndarray) -> None:
-    """Raises ValueError unless A and B are those of [Ac, Bc], shape (n, n + m), with the input held over a step.
-
-    Entries are compared in units of the limits, `widths` of shape (n + m,).
-    """
-    n = len(A)
-    sampled = np.concatenate(zero_order_hold(model[:, :n], model[:, n:], dt), axis=1)
-    sampled, given = (each * widths / widths[:n, None] for each in (sampled, np.concatenate([A, B], axis=1)))
-    if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
-        raise ValueError(
-            "continuous of the Model is not the one that A and B were sampled from: make it by Model.sampled, or give "
-            "continuous=None"
-        )
-
-
-class GridValues:
-    """The constraint values at the grid points within a step of a simulation, given its two ends.
-
-    What a disturbance did to the step, d = x+ - A x - B u, has come in proportion to the time: d_tau = (tau / dt) d,
-    which lies in E(D) as d does. So c x(tau_i) is a sum of products with x, u and x+.
-
-    Args:
-        rows: Of the plant.
-        box: c, shape (k, n), and its ends, shape (2, k).
-        A, B: Of the plant.
-    """
-
-    def __init__(self, rows: GridRows, box: tuple[np.ndarray, np.ndarray], A: np.ndarray, B: np.ndarray) -> None:
-        points, k, _ = rows.state.shape
-        box_rows, self._ends = box
-        shares = (np.arange(1, points) / points)[:, None, None]
-        moved = rows.state[1:] - shares * (box_rows @ A)
-        pushed = rows.input[1:] - shares * (box_rows @ B)
-        joint = np.concatenate([moved, pushed, shares * box_rows], axis=2)
-        self._shape, self._joint = (points - 1, k), np.ascontiguousarray(joint.reshape((points - 1) * k, -1))
-
-    def worst(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns the largest values since the last sample, shape (k,) or (k, N); never below those at the end.
-
-        Args:
-            state: x, shape (n,) or (n, N).
-            u: Applied input, shape (m,) or (m, N).
-            x_next: x+, of the shape of x.
-            values: Those of x+, shape (k,) or (k, N).
-        """
-        reached = self._joint.dot(np.concatenate([state, u, x_next])).reshape(*self._shape, *values.shape[1:])
-        low, high = self._ends if values.ndim == 1 else self._ends[:, :, None]
-        beyond = np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0))
-        return np.maximum(beyond, values)

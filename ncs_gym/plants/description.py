@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ncs_gym.plants.between_samples import BetweenSamples
+from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.validation import counted
-
-if TYPE_CHECKING:
-    from ncs_gym.plants.linear_plant import LinearPlant
 
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
@@ -19,40 +16,39 @@ _INDENT, _WIDTH = 16, 80
 _ZERO = 1e-12
 # Stands for a space at which no line ends.
 _UNBROKEN = "\N{NO-BREAK SPACE}"
-# What a plant without each kind of uncertainty assumes.
+# What a plant without each kind of uncertainty assumes, and what its Gaussian noise is called.
 _WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noise", "the first estimate is exact")
+_NOISES = ("disturbances", "sensor noise", "the first error")
 
 
-def described(plant: LinearPlant) -> str:
+def described(plant: BetweenSamples) -> str:
     """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
-    counts = ((plant.n, "state"), (plant.m, "input"), (plant.p, "output"))
-    sizes = ", ".join(counted(count, name) for count, name in counts)
+    sizes = ", ".join(counted(*each) for each in ((plant.n, "state"), (plant.m, "input"), (plant.p, "output")))
     radius = f"spectral radius {plant.spectral_radius:.6g}"
-    stable = f"stable ({radius})"
     unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
-    own = plant.n - plant.past  # past inputs are known, and their rows limit nothing: inputs have limits
-    states = plant.state_names[:own], plant.state_units[:own]
-    extents = {
-        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix))[:own], *states),
-        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *outputs_of(plant)),
-        "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix))[:own], *states),
-    }
+    k, together = len(plant.box), len(plant.box) + plant.m
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
-        "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
+        "dynamics": [f"stable ({radius})" if plant.spectral_radius < 1.0 else unstable],
         "safe box": [row_limit(plant, j) for j in np.flatnonzero(~plant.is_past_row).tolist()],
-        "input limits": [input_limit(plant, i) for i in range(plant.m)],
+        "input limits": [row_limit(plant, j) for j in range(k, together)],
+        "both together": [row_limit(plant, j) for j in range(together, together + len(plant.mixed_rows))],
     }
     if plant.model.delays:
         lines["input limits"].append(f"inputs take effect {counted(plant.model.delays, 'step')} later")
-    if len(plant.mixed_rows):
-        lines["both together"] = [mixed_limit(plant, j) for j in range(len(plant.mixed_rows))]
     if plant.between_samples is not None:
         lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
-    for title, (sizes_of, names, units) in extents.items():
-        parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
-        lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]
-    lines["assumptions"] = list(plant.assumptions)
+    own = plant.n - plant.past  # past inputs are known, and their rows limit nothing: inputs have limits
+    states = plant.state_names[:own], plant.state_units[:own]
+    for title, bound, (names, units) in (
+        ("disturbance", plant.disturbance, states),
+        ("sensor noise", plant.sensor_error, outputs_of(plant)),
+        ("first error", plant.initial_error, states),
+    ):
+        extents = zip(names, np.sqrt(np.diag(bound.shape_matrix)), units, strict=False)
+        parts = [f"{name} up to {_sized(size, unit)}".replace(" ", _UNBROKEN) for name, size, unit in extents]
+        lines[title] = [", ".join(parts)]
+    lines["assumptions"] = [*assumptions_of(plant)]
     shown_lines = (
         fill(text, _WIDTH, initial_indent=f"{title if number == 0 else '':<{_INDENT}}", subsequent_indent=" " * _INDENT)
         for title, texts in lines.items()
@@ -61,21 +57,13 @@ def described(plant: LinearPlant) -> str:
     return "\n".join(shown_lines).replace(_UNBROKEN, " ")
 
 
-def assumptions_of(plant: LinearPlant) -> tuple[str, ...]:
+def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
     """Returns what is assumed of everything uncertain about a plant."""
-    first = [plant.initial_cov, *([] if plant.initial_bound is None else [plant.initial_bound.shape_matrix])]
-    zero = (
-        not np.any(plant.nominal_disturbance.shape_matrix),
-        not np.any(plant.nominal_sensor_error.shape_matrix),
-        not any(np.any(part) for part in first),
-    )
-    assumed = [f"It is assumed that {text}." for text, is_zero in zip(_WITHOUT, zero, strict=True) if is_zero]
-    noises = {
-        "disturbances": plant.process_noise_cov,
-        "sensor noise": plant.measurement_noise_cov,
-        "the first error": plant.initial_cov,
-    }
-    if truncated := [name for name, covariance in noises.items() if np.any(covariance)]:
+    held = plant.nominal_disturbance, plant.nominal_sensor_error, plant.nominal_initial_error
+    without = zip(_WITHOUT, held, strict=True)
+    assumed = [f"It is assumed that {text}." for text, each in without if not each.shape_matrix.any()]
+    noises = zip(_NOISES, (plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov), strict=True)
+    if truncated := [name for name, covariance in noises if covariance.any()]:
         kept = f"{100.0 * (1.0 - plant.delta):.6g} % (delta = {plant.delta:g}) of {', '.join(truncated)}"
         assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
     if plant.remainder is not None:
@@ -85,8 +73,25 @@ def assumptions_of(plant: LinearPlant) -> tuple[str, ...]:
     return tuple(assumed)
 
 
-def _sized(size: float, unit: str) -> str:
-    return f"{size:.4g} {unit}".rstrip()
+def row_limit(plant: LimitValues, j: int) -> str:
+    """Returns what limit j says: of those of the safe box, of the inputs, and of both together.
+
+    That of a sum is in units of its largest entry.
+    """
+    n, m = plant.n, plant.m
+    rows = [np.pad(plant.box, ((0, 0), (m, 0))), np.eye(m, m + n), np.roll(plant.mixed_rows, m, axis=1)]
+    ends = np.concatenate([plant.box_ends, plant.input_ends, plant.mixed_ends], axis=1)
+    row, names = np.concatenate(rows)[j], plant.input_names + plant.state_names
+    limited, center = np.flatnonzero(row).tolist(), np.concatenate([plant.operating_input, plant.operating_state])
+    if len(limited) == 1:
+        size, name, unit = row[limited[0]], names[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
+    else:
+        size, unit = np.abs(row).max(), ""
+        terms = [f"{'-' if row[i] < 0.0 else '+'} {_factor(abs(row[i]) / size)}{names[i]}" for i in limited]
+        name = " ".join(terms).removeprefix("+ ")
+        name = f"-{name[2:]}" if name.startswith("- ") else name
+    low, high = sorted((ends[:, j] / size).tolist())
+    return _between(name, low, high, float(row @ center / size), unit)
 
 
 def _between(name: str, low: float, high: float, center: float, unit: str) -> str:
@@ -104,49 +109,15 @@ def _between(name: str, low: float, high: float, center: float, unit: str) -> st
     return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
 
 
-def row_limit(plant: LinearPlant, j: int) -> str:
-    """Returns what row j of the safe box limits."""
-    row, low, high = plant.box[j], float(plant.box_low[j]), float(plant.box_high[j])
-    limited = np.flatnonzero(row).tolist()
-    if len(limited) == 1:
-        i = limited[0]
-        low, high = sorted([low / float(row[i]), high / float(row[i])])
-        return _between(plant.state_names[i], low, high, float(plant.operating_state[i]), plant.state_units[i])
-    return _sum_between(row, low, high, plant.operating_state, plant.state_names)
-
-
-def input_limit(plant: LinearPlant, i: int) -> str:
-    """Returns between what input i is."""
-    low, high, center = float(plant.input_low[i]), float(plant.input_high[i]), float(plant.operating_input[i])
-    return _between(plant.input_names[i], low, high, center, plant.input_units[i])
-
-
-def mixed_limit(plant: LinearPlant, j: int) -> str:
-    """Returns what row j of the limits of states and inputs together limits."""
-    low, high = plant.mixed_ends[:, j].tolist()
-    row, center = np.roll(plant.mixed_rows[j], plant.m), np.concatenate([plant.operating_input, plant.operating_state])
-    return _sum_between(row, low, high, center, plant.input_names + plant.state_names)
-
-
-def _sum_between(row: np.ndarray, low: float, high: float, center: np.ndarray, names: Sequence[str]) -> str:
-    """Returns the limits of a row of several quantities, given its ends from the operating point, in its own units.
-
-    Those are units of its largest entry.
-    """
-    size = float(np.abs(row).max())
-    terms = "".join(
-        f" {'-' if row[i] < 0.0 else '+'} {_factor(abs(float(row[i])) / size)}{names[i]}"
-        for i in np.flatnonzero(row).tolist()
-    )
-    terms = terms.removeprefix(" + ") if terms.startswith(" + ") else f"-{terms[3:]}"
-    return _between(terms, low / size, high / size, float(row @ center) / size, "")
+def _sized(size: float, unit: str) -> str:
+    return f"{size:.4g} {unit}".rstrip()
 
 
 def _factor(size: float) -> str:
     return "" if size == 1.0 else f"{size:.4g} "
 
 
-def outputs_of(plant: LinearPlant) -> tuple[list[str], list[str]]:
+def outputs_of(plant: LimitValues) -> tuple[list[str], list[str]]:
     """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
     names, units = [], []
     for j, row in enumerate(plant.H):

@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.bounds import DELTA, Ball, Sum
+from ncs_gym.bounds import DELTA, Ball, Sum, pushes_of
+from ncs_gym.limits import FREE_REACH, reach_in_steps
+from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
-from ncs_gym.validation import ReadOnlyArrays, read_only
+from ncs_gym.validation import read_only, setting
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
 INFLATION = 1.0 + 1e-9
@@ -24,8 +26,6 @@ FLAT_INFLATION = 1e-12
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
-# A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
-FREE_REACH = 100.0
 
 
 class Source(NamedTuple):
@@ -41,10 +41,43 @@ class Source(NamedTuple):
     noise: TruncatedGaussian
     bound: Ellipsoid | None
 
-    def ellipsoids(self) -> list[Ellipsoid]:
-        """Returns the bounds that add up to the whole one, in dimension n."""
+    @classmethod
+    def of(cls, declared: Sum, weight: np.ndarray, past: int = 0, *, keeps_ball: bool = False) -> Source:
+        """Returns what a sum of sets declares of the own states of a plant, or of its outputs.
+
+        Args:
+            declared: The sum.
+            weight: W, by which a sum of several sets becomes one ellipsoid.
+            past: How many past inputs follow, of which nothing is uncertain.
+            keeps_ball: Whether a `Ball` stands for itself, which it cannot beside past inputs.
+
+        Raises:
+            ValueError: If a set is in another dimension, or one with two different ends is added to others.
+        """
+        size, gaussian = len(weight), declared.gaussian
+        covariance, delta = (gaussian.covariance, gaussian.delta) if gaussian else (np.zeros((size, size)), DELTA)
+        noise = TruncatedGaussian(np.pad(covariance, (0, past)), truncation_energy(delta, size), past)
+        balls = [each for each in declared.parts if isinstance(each, Ball) and keeps_ball and not past]
+        others = Sum(tuple(each for each in declared.parts if each is not gaussian and each not in balls)).sized(size)
+        if len(others.parts) > 1 and pushes_of(others):
+            raise ValueError("a set with two different ends is not added to others: give the sum as Through(E, Box)")
+        shape = others.ellipsoid(weight).shape_matrix if others.parts else None
+        bound = None if shape is None else Ellipsoid(np.pad(shape, (0, past)))
+        return cls(float(np.square(sum(each.radius for each in balls))), noise, bound)
+
+    def bounded(self) -> list[Ellipsoid]:
+        """Returns the bounds of all but the noise, in dimension n."""
         ball = Ellipsoid(self.ball * np.eye(len(self.noise.covariance)))
-        return [ball, self.noise.bound, *([] if self.bound is None else [self.bound])]
+        return [ball, *([] if self.bound is None else [self.bound])]
+
+    def around(self, weight: np.ndarray, *others: Ellipsoid | None) -> Ellipsoid:
+        """Returns an ellipsoid around the sum of all and of others, of the smallest tr(W P)."""
+        ball, *rest = self.bounded()
+        return ellipsoid_around_sum(weight, ball, self.noise.bound, *rest, *others)
+
+    def covariance(self, divisor: float) -> np.ndarray:
+        """Returns the covariance of the noise, plus the shapes of the other bounds over a divisor."""
+        return np.sum([self.noise.covariance, *(each.shape_matrix / divisor for each in self.bounded())], axis=0)
 
     def drawn(self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True) -> np.ndarray:
         """Returns noise, truncated or not, plus a uniform point of the bound unless that is one, (n,) or (count, n)."""
@@ -54,86 +87,40 @@ class Source(NamedTuple):
         return samples + self.bound.sample(rng, count)
 
 
-def source_of(declared: Any, weight: np.ndarray, past: int = 0, *, keeps_ball: bool = False) -> Source:
-    """Returns what a sum of sets declares of the own states of a plant, or of its outputs.
+class HardBounds(LimitValues):
+    """The bounds of disturbances, sensor noise and first estimates of a plant, by what is declared of them.
 
-    Args:
-        declared: The sum.
-        weight: W, by which a sum of several sets becomes one ellipsoid.
-        past: How many past inputs follow, of which nothing is uncertain.
-        keeps_ball: Whether a `Ball` stands for itself, which it cannot beside past inputs.
-
-    Raises:
-        ValueError: If a set is in another dimension, or one with two different ends is added to others.
+    Attributes:
+        of_disturbance, of_sensor, of_first_error: What is declared of each.
+        remainder: What the model leaves out of the process that really moves; None if nothing.
+        delta: Probability that Gaussian noise is truncated at.
+        gamma: Squared radius of the ball that disturbances add.
+        process_noise, sensor_noise, initial_noise: The truncated Gaussians, to which what lies in the next ones is
+            added.
+        disturbance_bound, sensor_bound, initial_bound: What holds the rest of each; None if there is no other set.
+        process_noise_cov, measurement_noise_cov, initial_cov: Q, R and P0 of the Gaussians; zero where there is none.
     """
-    size, gaussian = len(weight), declared.gaussian
-    covariance, delta = (np.zeros((size, size)), DELTA) if gaussian is None else (gaussian.covariance, gaussian.delta)
-    noise = TruncatedGaussian(np.pad(covariance, (0, past)), truncation_energy(delta, size), past)
-    others = [each for each in declared.parts if each is not gaussian]
-    balls = [each for each in others if isinstance(each, Ball)] if keeps_ball and not past else []
-    others = tuple(each for each in others if each not in balls)
-    bound = Sum(others).sized(size).as_one(weight).ellipsoid() if others else None
-    if bound is not None and past:
-        bound = Ellipsoid(np.pad(bound.shape_matrix, (0, past)))
-    return Source(float(np.square(sum(each.radius for each in balls))), noise, bound)
 
-
-class HardBounds(ReadOnlyArrays):
-    """The bounds of disturbances, sensor noise and first estimates of a `LinearPlant`, by what is declared of them."""
-
-    A: np.ndarray
-    B: np.ndarray
-    box: np.ndarray
-    n: int
-    m: int
-    p: int
-    past: int
-    largest_input: np.ndarray
     of_disturbance: Source
     of_sensor: Source
     of_first_error: Source
     remainder: Any
-
-    @property
-    def gamma(self) -> float:
-        """Squared radius of the ball that disturbances add."""
-        return self.of_disturbance.ball
-
-    @property
-    def process_noise_cov(self) -> np.ndarray:
-        """Q, shape (n, n); zero where no Gaussian is declared."""
-        return self.of_disturbance.noise.covariance
-
-    @property
-    def measurement_noise_cov(self) -> np.ndarray:
-        """R, shape (p, p), alike."""
-        return self.of_sensor.noise.covariance
-
-    @property
-    def initial_cov(self) -> np.ndarray:
-        """P0, shape (n, n), alike."""
-        return self.of_first_error.noise.covariance
-
-    @property
-    def disturbance_bound(self) -> Ellipsoid | None:
-        """What holds the other disturbances; None if no other set is declared."""
-        return self.of_disturbance.bound
-
-    @property
-    def sensor_bound(self) -> Ellipsoid | None:
-        """What holds other sensor noise, alike."""
-        return self.of_sensor.bound
-
-    @property
-    def initial_bound(self) -> Ellipsoid | None:
-        """What holds another error of the first estimate, alike."""
-        return self.of_first_error.bound
+    delta: float
+    gamma = setting("gamma", "of_disturbance.ball")
+    process_noise = setting("process_noise", "of_disturbance.noise")
+    sensor_noise = setting("sensor_noise", "of_sensor.noise")
+    initial_noise = setting("initial_noise", "of_first_error.noise")
+    disturbance_bound = setting("disturbance_bound", "of_disturbance.bound")
+    sensor_bound = setting("sensor_bound", "of_sensor.bound")
+    initial_bound = setting("initial_bound", "of_first_error.bound")
+    process_noise_cov = setting("process_noise_cov", "of_disturbance.noise.covariance")
+    measurement_noise_cov = setting("measurement_noise_cov", "of_sensor.noise.covariance")
+    initial_cov = setting("initial_cov", "of_first_error.noise.covariance")
 
     @cached_property
     def remainder_bound(self) -> Ellipsoid | None:
         """What holds the remainder of a model, shape (n, n); None if there is none."""
-        bound = None if self.remainder is None else self.remainder.bound
-        return bound if bound is None or not self.past else Ellipsoid(np.pad(bound.shape_matrix, (0, self.past)))
+        return self.remainder and Ellipsoid(np.pad(self.remainder.bound.shape_matrix, (0, self.past)))
 
     @cached_property
     def weight(self) -> np.ndarray:
@@ -144,9 +131,8 @@ class HardBounds(ReadOnlyArrays):
     def reach_from_rest(self) -> np.ndarray:
         """How far inputs take each state in n steps at most, from about as far as noise does in one, shape (n,)."""
         sources = self.of_disturbance, self.of_first_error
-        bounded = [ball_or for each in sources for ball_or in each.ellipsoids() if ball_or is not each.noise.bound]
-        shapes = [*(each.noise.covariance for each in sources), *(each.shape_matrix for each in bounded)]
-        noise = [np.diag(each) for each in shapes]
+        bounded = [each.shape_matrix for source in sources for each in source.bounded()]
+        noise = [np.diag(each) for each in [*(source.noise.covariance for source in sources), *bounded]]
         reach = np.sqrt(np.sum(noise, axis=0))
         return read_only(reach_in_steps(self.A, self.B, self.largest_input, reach))
 
@@ -164,21 +150,6 @@ class HardBounds(ReadOnlyArrays):
     def half_widths(self) -> np.ndarray:
         """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
         return read_only(np.sqrt(np.diag(self._box_shape)))
-
-    @cached_property
-    def process_noise(self) -> TruncatedGaussian:
-        """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
-        return self.of_disturbance.noise
-
-    @cached_property
-    def sensor_noise(self) -> TruncatedGaussian:
-        """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
-        return self.of_sensor.noise
-
-    @cached_property
-    def initial_noise(self) -> TruncatedGaussian:
-        """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
-        return self.of_first_error.noise
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
@@ -206,13 +177,12 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
-        W = self.relative_weight
-        return ellipsoid_around_sum(W, *self.of_disturbance.ellipsoids(), self.remainder_bound)
+        return self.of_disturbance.around(self.relative_weight, self.remainder_bound)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return ellipsoid_around_sum(np.eye(self.p), *self.of_sensor.ellipsoids())
+        return self.of_sensor.around(np.eye(self.p))
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -254,22 +224,9 @@ class HardBounds(ReadOnlyArrays):
         Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
         noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
         """
-
-        def summed(source: Source, divisor: float) -> np.ndarray:
-            shapes = [each.shape_matrix / divisor for each in source.ellipsoids() if each is not source.noise.bound]
-            return np.sum([source.noise.covariance, *shapes], axis=0)
-
-        Q, R = summed(self.of_disturbance, 1.0), summed(self.of_sensor, self.p + 2)
-        P0 = summed(self.of_first_error, self.n + 2)
+        Q, R = self.of_disturbance.covariance(1.0), self.of_sensor.covariance(self.p + 2)
         Q = Q if self.remainder_bound is None else Q + self.remainder_bound.shape_matrix
-        return read_only(Q), read_only(R), read_only(P0)
-
-
-def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""
-    for _ in range(len(A)):
-        reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
-    return reach
+        return read_only(Q), read_only(R), read_only(self.of_first_error.covariance(self.n + 2))
 
 
 def inflated(shape: np.ndarray) -> np.ndarray:

@@ -4,74 +4,104 @@ from __future__ import annotations
 
 from contextlib import suppress
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from ncs_gym.plants import between_samples
+from ncs_gym import exact
+from ncs_gym.bounds import Bounds
+from ncs_gym.limits import Deviations, Limits
+from ncs_gym.model import Model
+from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.validation import ReadOnlyArrays, read_only
 
 
 class LimitValues(ReadOnlyArrays):
-    """What follows from the limits that `LinearPlant` is declared with."""
+    """The equations and the limits of a plant, counted from where it rests; past inputs are the last states.
 
-    A: np.ndarray
-    B: np.ndarray
-    box: np.ndarray
-    box_ends: np.ndarray
-    input_ends: np.ndarray
-    mixed_rows: np.ndarray
-    mixed_ends: np.ndarray
-    dt: float
+    Attributes:
+        model, limits, bounds: What they follow from.
+        n, m, p: Number of states, inputs and outputs.
+        A: State matrix, shape (n, n), past inputs included.
+        B: Input matrix, shape (n, m).
+        H: Output matrix, shape (p, n).
+        dt: Duration of a step [s].
+        past: How many of the last states are past inputs, the newest ones last.
+        box: Rows c_j of the safe box, shape (k, n), in units of half the range that is allowed; where one end is open,
+            the other one is 1 unit away.
+        box_ends: The low and the high ends of c_j x, shape (2, k); -1 and 1 where limits are symmetric, infinite where
+            there is none. Also as box_low and box_high.
+        is_past_row: Which rows limit past inputs, which nothing ever takes there, shape (k,).
+        mixed_rows: Rows of limits on (x, u) at the beginning of a step, shape (q, n + m), in units as those of `box`.
+        mixed_ends: Their low and high ends, shape (2, q).
+        input_ends: The low and the high ends of the inputs, shape (2, m); also as input_low and input_high.
+        input_middle: The input that action 0 stands for, shape (m,): the middle of the limits.
+        input_half: Half the range of each input, shape (m,): input_middle +- input_half is within the limits, as floats
+            add.
+        input_scales: `input_middle` and `input_half` of each input as numbers.
+        largest_input: The largest |u_i| within the limits, shape (m,).
+        operating_state: State that deviations are counted from, shape (n,); for conversion and text.
+        operating_input: Input that deviations are counted from, shape (m,).
+        step_offset: Sizes of what the operating point rests under in every step beside A and B, shape (n,), which do
+            not cancel: |offset|, and |E| |middle| of a disturbance with two ends.
+        state_names, state_units, input_names, input_units: The labels, with defaults.
+    """
+
+    model: Model
+    limits: Limits
+    bounds: Bounds
     n: int
     m: int
+    p: int
+    A: np.ndarray
+    B: np.ndarray
+    H: np.ndarray
+    dt: float
     past: int
-    continuous_model: np.ndarray | None
-    between_samples: int | None
+    box: np.ndarray
+    box_ends: np.ndarray
+    box_low: np.ndarray
+    box_high: np.ndarray
+    is_past_row: np.ndarray
+    mixed_rows: np.ndarray
+    mixed_ends: np.ndarray
+    input_ends: np.ndarray
+    input_low: np.ndarray
+    input_high: np.ndarray
+    input_middle: np.ndarray
+    input_half: np.ndarray
+    input_scales: tuple[tuple[float, float], ...]
+    largest_input: np.ndarray
+    operating_state: np.ndarray
+    operating_input: np.ndarray
+    step_offset: np.ndarray
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
 
-    @property
-    def box_low(self) -> np.ndarray:
-        """The low ends of c_j x, shape (k,); infinite where there is none."""
-        return self.box_ends[0]
-
-    @property
-    def box_high(self) -> np.ndarray:
-        """The high ends of c_j x, shape (k,); infinite where there is none."""
-        return self.box_ends[1]
-
-    @cached_property
-    def input_low(self) -> np.ndarray:
-        """The low ends of the inputs, shape (m,)."""
-        return read_only(self.input_ends[0])
-
-    @cached_property
-    def input_high(self) -> np.ndarray:
-        """The high ends of the inputs, shape (m,)."""
-        return read_only(self.input_ends[1])
-
-    @cached_property
-    def input_middle(self) -> np.ndarray:
-        """The input that action 0 stands for, shape (m,): the middle of the limits."""
-        return read_only(0.5 * (self.input_low + self.input_high))
-
-    @cached_property
-    def input_half(self) -> np.ndarray:
-        """Half the range of each input, shape (m,): input_middle +- input_half is within the limits, as floats add."""
-        half = 0.5 * (self.input_high - self.input_low)
-        while True:
-            beyond = (self.input_middle + half > self.input_high) | (self.input_middle - half < self.input_low)
-            if not beyond.any():
-                return read_only(half)
+    def _take(self, rest: Deviations) -> None:
+        """Keeps what follows from the plant of its own states, counted from where it rests."""
+        low, high = rest.inputs
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        while (beyond := (middle + half > high) | (middle - half < low)).any():
             half = np.where(beyond, np.nextafter(half, 0.0), half)
+        whole = with_past_inputs(rest, self.model.delays, half, self.limits.change_within(half))
+        number = np.arange(len(whole.box.rows)) - len(rest.box.rows)
+        self._set(A=whole.A, B=whole.B, H=whole.H, dt=self.model.dt, past=whole.past)
+        self._set(n=len(whole.A), m=len(half), p=len(whole.H))
+        self._set(box=whole.box.rows, box_low=whole.box.low, box_high=whole.box.high, box_ends=np.stack(whole.box[1:]))
+        self._set(is_past_row=(number >= 0) & (number < whole.past))
+        self._set(mixed_rows=whole.mixed.rows, mixed_ends=np.stack(whole.mixed[1:]))
+        self._set(input_ends=whole.inputs, input_low=low, input_high=high, input_middle=middle, input_half=half)
+        self._set(input_scales=tuple(zip(middle.tolist(), half.tolist(), strict=True)))
+        self._set(largest_input=np.maximum(-low, high), step_offset=whole.step_offset)
+        self._set(operating_state=whole.state, operating_input=whole.input)
 
     @cached_property
-    def input_scales(self) -> tuple[tuple[float, float], ...]:
-        """`input_middle` and `input_half` of each input as numbers."""
-        return tuple(zip(self.input_middle.tolist(), self.input_half.tolist(), strict=True))
-
-    @cached_property
-    def largest_input(self) -> np.ndarray:
-        """The largest |u_i| within the limits, shape (m,)."""
-        return read_only(np.maximum(-self.input_low, self.input_high))
+    def spectral_radius(self) -> float:
+        """Largest absolute eigenvalue of A; below 1 exactly when the plant is Schur stable."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     @cached_property
     def own_limits(self) -> np.ndarray:
@@ -93,47 +123,36 @@ class LimitValues(ReadOnlyArrays):
         two_ends = np.isfinite(self.box_ends).all(axis=0)
         limited, reach = self.box[two_ends].any(axis=0), np.full(self.n, np.inf)
         with suppress(ZeroDivisionError):  # rows that limit a sum alone
-            reach[limited] = between_samples.widest(self.box[:, limited], self.box_ends)
+            reach[limited] = self._widest(limited)
         reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
         reach[self.n - self.past :] = np.tile(self.largest_input, self.past // self.m)
         return read_only(np.concatenate([reach, self.largest_input]))
 
-    @cached_property
-    def grid_rows(self) -> between_samples.GridRows | None:
-        """What the box says of states and inputs between samples; None if only the sampling instants count.
+    def _widest(self, states: Any = slice(None)) -> np.ndarray:
+        """Returns bounds of some |x_i| in the safe box: x = (C'C)^-1 C' (C x) for the rows C that have two ends.
 
         Raises:
-            OverflowError: If it is out of reach of float64, which the message says.
+            ZeroDivisionError: If the box does not bound each of these.
         """
-        if self.between_samples is None or self.continuous_model is None:
-            return None
-        return between_samples.grid_rows(
-            self.continuous_model, (self.box, self.box_ends), self.largest_input, self.dt, self.between_samples
-        )
+        bounded = np.isfinite(self.box_ends).all(axis=0)
+        rows, sizes = self.box[:, states][bounded], np.abs(self.box_ends[:, bounded]).max(axis=0)
+        gram = exact.product(rows.T, rows)
+        return (np.abs(exact.product(exact.inverse(gram), rows.T)) * sizes).sum(axis=1)
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns how far c_j x is beyond the nearer end, in units of half the range, for each row of the safe box.
 
         Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
         """
-        values = self.box.dot(state)
-        low, high = self._ends[values.ndim - 1]
-        return np.maximum(values - high, low - values)
-
-    @cached_property
-    def _ends(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """The low and the high ends, shape (k,), and as columns, (k, 1)."""
-        low, high = read_only(self.box_low), read_only(self.box_high)
-        return (low, high), (low[:, None], high[:, None])
+        return _beyond(self.box.dot(state), self.box_ends)
 
     def mixed_values(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns how far the rows of `mixed_rows` are beyond the nearer end, in units of half their range.
 
         Shape (q,) or (q, N), for states of shape (n,) or (n, N) and inputs of shape (m,) or (m, N).
         """
-        values = self.mixed_rows[:, : self.n].dot(state) + self.mixed_rows[:, self.n :].dot(u)
-        low, high = self.mixed_ends if values.ndim == 1 else self.mixed_ends[:, :, None]
-        return np.maximum(values - high, low - values)
+        rows = self.mixed_rows
+        return _beyond(rows[:, : self.n].dot(state) + rows[:, self.n :].dot(u), self.mixed_ends)
 
     def values_at_start(self, state: np.ndarray) -> np.ndarray:
         """Returns `worst_constraint_values` where no step has been: those of a state at which the operating input acts.
@@ -145,22 +164,8 @@ class LimitValues(ReadOnlyArrays):
             return values
         return np.concatenate([values, self.mixed_values(state, np.zeros((self.m, *state.shape[1:])))])
 
-    @cached_property
-    def _grid_values(self) -> between_samples.GridValues | None:
-        rows = self.grid_rows
-        return None if rows is None else between_samples.GridValues(rows, (self.box, self.box_ends), self.A, self.B)
 
-    def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
-        """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
-
-        Shape (k + q,) or (k + q, N). With `between_samples` at these times of the step, what moved x+ away from A x + B
-        u in proportion to the time; else at its end alone.
-
-        Args:
-            state: x at the beginning, shape (n,) or (n, N).
-            u: Input that was held, shape (m,) or (m, N).
-            x_next: x+, of the shape of x.
-        """
-        values, grid = self.constraint_values(x_next), self._grid_values
-        values = values if grid is None else grid.worst(state, u, x_next, values)
-        return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
+def _beyond(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Returns how far values, shape (k,) or (k, N), are beyond the nearer of their ends, shape (2, k)."""
+    low, high = ends if values.ndim == 1 else ends[:, :, None]
+    return np.maximum(values - high, low - values)

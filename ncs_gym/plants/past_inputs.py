@@ -2,63 +2,54 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from ncs_gym.limits import Rows, joined
-from ncs_gym.model import Model
+from ncs_gym.limits import Deviations, Rows
 
 # Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
 # bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
 STORED_INPUT_REACH = 4.0
 
 
-class Larger(NamedTuple):
-    """The model and the rows of a plant of which so many last states are past inputs, the oldest input first."""
-
-    A: np.ndarray
-    B: np.ndarray
-    H: np.ndarray
-    box: Rows
-    mixed: Rows
-    past: int
-
-
-def with_past_inputs(
-    model: Model, box: Rows, mixed: Rows, inputs: tuple[np.ndarray, np.ndarray], change: np.ndarray | None
-) -> Larger:
+def with_past_inputs(own: Deviations, delay: int, half: np.ndarray, change: np.ndarray | None) -> Deviations:
     """Returns the plant with the inputs that it has to remember as further states: x, u_{k-d}, .., u_{k-1}.
 
     Args:
-        model: Of its own states; its delays are d.
-        box: Rows of its own states.
-        mixed: Rows of states and inputs together.
-        inputs: The ends of the inputs, shape (2, m), and half their range, (m,).
+        own: The plant of its own states.
+        delay: d, the steps after which an input takes effect.
+        half: Half the range of the inputs, shape (m,).
         change: Largest change of each input from one step to the next, shape (m,); None for any.
     """
-    (n, m), delay, (input_ends, half) = model.B.shape, model.delays, inputs
+    n, m = own.B.shape
     stored = m * (delay or int(change is not None))
     if not stored:
-        return Larger(model.A, model.B, model.H, box, mixed, 0)
+        return own
     A, B = np.zeros((n + stored, n + stored)), np.zeros((n + stored, m))
-    A[:n, :n], A[n:-m, n + m :] = model.A, np.eye(stored - m)
+    A[:n, :n], A[n:-m, n + m :] = own.A, np.eye(stored - m)
     if delay:
-        A[:n, n : n + m] = model.B
+        A[:n, n : n + m] = own.B
     else:
-        B[:n] = model.B
+        B[:n] = own.B
     B[-m:] = np.eye(m)
     past = np.hstack([np.zeros((stored, n)), np.diag(np.tile(1.0 / (STORED_INPUT_REACH * half), stored // m))])
-    rows = [Rows(np.pad(box.rows, ((0, 0), (0, stored))), box.low, box.high)]
-    rows += [Rows(past, *np.tile(input_ends / half, stored // m))]
+    box = [Rows(np.pad(own.box.rows, ((0, 0), (0, stored))), *own.box[1:])]
+    box += [Rows(past, *np.tile(own.inputs / half, stored // m))]
     # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
-    of_state, of_input = mixed.rows[:, :n], mixed.rows[:, n:]
+    of_state, of_input = own.mixed.rows[:, :n], own.mixed.rows[:, n:]
     others = np.zeros((len(of_state), stored + (0 if delay else m)))
     others[:, slice(m) if delay else slice(stored, None)] = of_input
-    coupled = Rows(np.hstack([of_state, others]), mixed.low, mixed.high)
-    if delay:
-        rows, coupled = [*rows, coupled], Rows(np.empty((0, n + stored + m)), np.empty(0), np.empty(0))
+    coupled, mixed = Rows(np.hstack([of_state, others]), *own.mixed[1:]), []
+    (box if delay else mixed).append(coupled)
     if change is not None:
         rates = np.hstack([np.zeros((m, n + stored - m)), -np.eye(m), np.eye(m)]) / change[:, None]
-        coupled = joined([coupled, Rows(rates, *np.array([[-1.0], [1.0]]) * np.ones(m))])
-    return Larger(A, B, np.pad(model.H, ((0, 0), (0, stored))), joined(rows), coupled, stored)
+        mixed.append(Rows(rates, -np.ones(m), np.ones(m)))
+    return own._replace(
+        A=A,
+        B=B,
+        H=np.pad(own.H, ((0, 0), (0, stored))),
+        box=Rows.joined(box, n + stored),
+        mixed=Rows.joined(mixed, n + stored + m),
+        state=np.concatenate([own.state, np.tile(own.input, stored // m)]),
+        step_offset=np.pad(own.step_offset, (0, stored)),
+        past=stored,
+    )

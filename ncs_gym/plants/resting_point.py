@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import pushes_of
-from ncs_gym.limits import Rows, Within
-from ncs_gym.model import EQUILIBRIUM_PRECISION, Model
+from ncs_gym.limits import Deviations
+from ncs_gym.model import residual
 from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
@@ -23,66 +23,40 @@ class MovedOperatingPointWarning(UserWarning):
     """A disturbance with two different ends moves the point that deviations are counted from."""
 
 
-class Rest(NamedTuple):
-    """Where deviations are counted from, and the limits from there.
-
-    Attributes:
-        within: The limits in deviations.
-        state, input: The point, shapes (n,) and (m,).
-        step_offset: Sizes of the constant that it rests under, shape (n,).
-        lacking: What it lacks of an equilibrium by rounding, in size, shape (n,).
-    """
-
-    within: Within
-    state: np.ndarray
-    input: np.ndarray
-    step_offset: np.ndarray
-    lacking: np.ndarray
-
-
-def at_rest(model: Model, within: Within, disturbance: Any) -> Rest:
-    """Returns where a plant rests: at the point of its model, moved to where the middle of the disturbance does.
+def at_rest(own: Deviations, disturbance: Any) -> Deviations:
+    """Returns a plant counted from where it rests: the point of its model, moved by the middle of a disturbance.
 
     Where that middle, E w, is not zero, this is an (x, u) with x = A x + B u + E w, of such points that nearest to the
     model's in units of the limits.
 
     Args:
-        model: The model.
-        within: Limits in deviations from its point.
+        own: The plant, counted from the point of its model.
         disturbance: A set in the dimension of the state.
 
     Raises:
         ValueError: If no such point lies within the limits.
     """
-    (box, inputs, mixed), lacking = within, np.abs(model.lacking)
     if not (pushes := pushes_of(disturbance)):
-        return Rest(within, model.state, model.input, model.step_offset, lacking)
+        return own
     E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
-    x, u, missing = _resting(model, within, E, middle)
-    state, applied = model.state + x, model.input + u
-    moved = Within(
-        Rows(box.rows, *(np.stack(box[1:]) - exact.product(box.rows, x))),
-        inputs - u[None],
-        Rows(mixed.rows, *(np.stack(mixed[1:]) - exact.product(mixed.rows, np.concatenate([x, u])))),
-    )
-    if not all(((each[0] < 0.0) & (each[1] > 0.0)).all() for each in (moved.box[1:], moved.inputs, moved.mixed[1:])):
+    x, u, missing = _resting(own, E, middle)
+    rest = own.around(x, u)
+    state, applied = ([float(f"{each:.6g}") for each in point] for point in (rest.state, rest.input))
+    if not rest.is_within:
         raise ValueError(
-            f"the middle of this disturbance moves the operating point to {shown(state.tolist())} with input "
-            f"{shown(applied.tolist())}, which is not strictly within the limits"
+            f"the middle of this disturbance moves the operating point to {shown(state)} with input {shown(applied)}, "
+            "which is not strictly within the limits"
         )
-    shown_point = [[float(f"{each:.6g}") for each in around] for around in (state, applied)]
     warn_caller(
-        "deviations are counted from the state {} and the input {}, where the middle of the disturbance rests "
-        "(plant.operating_state)".format(*map(shown, shown_point)),
+        f"deviations are counted from the state {shown(state)} and the input {shown(applied)}, where the middle of "
+        "the disturbance rests (plant.operating_state)",
         MovedOperatingPointWarning,
     )
-    step_offset = model.step_offset + exact.product(np.abs(E), np.abs(middle))
-    return Rest(moved, state, applied, step_offset, np.abs(missing) + lacking)
+    step_offset = own.step_offset + exact.product(np.abs(E), np.abs(middle))
+    return rest._replace(step_offset=step_offset, lacking=np.abs(missing) + own.lacking)
 
 
-def _resting(
-    model: Model, within: Within, E: np.ndarray, middle: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _resting(own: Deviations, E: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns x, u, in deviations from the model's point, and A x + B u + E w - x there, which is rounding.
 
     Raises:
@@ -90,8 +64,8 @@ def _resting(
     """
     from scipy.linalg import null_space  # takes long to import
 
-    (n, m), A, B, rows = model.B.shape, model.A, model.B, within.box.rows
-    reach = 0.5 * (within.inputs[1] - within.inputs[0])
+    (n, m), A, B, rows = own.B.shape, own.A, own.B, own.box.rows
+    reach = 0.5 * (own.inputs[1] - own.inputs[0])
     widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
     balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
     found = np.linalg.lstsq(balance, E @ middle / widths)[0]
@@ -99,18 +73,13 @@ def _resting(
     sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.hstack([np.zeros((m, n)), np.eye(m)])])
     found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
     x, u = widths * found[:n], reach * found[n:]
-
-    def missing_at(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return exact.product(np.hstack([A, B, E, -np.eye(n)]), np.concatenate([x, u, middle, x]))
-
-    terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(middle) + np.abs(x)
-    if not (np.abs(missing_at(x, u)) <= EQUILIBRIUM_PRECISION * terms).all():
+    if not residual(A, B, E, x, u, middle)[1]:
         raise ValueError(
             f"no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} per "
             "step, whatever the input: give symmetric ends around zero"
         )
     x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
-    return x, u, missing_at(x, u)
+    return x, u, residual(A, B, E, x, u, middle)[0]
 
 
 def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ncs_gym.bounds import Bounds
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.past_inputs import opened_for
-from ncs_gym.processes.process import LinearProcess, Process, own_process
+from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
 from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import guarded, read_only
@@ -78,7 +79,10 @@ class PlantSimulation:
         process: Process | None = None,
     ) -> None:
         given = own_process(plant) if process is None else process
-        self.process, self._is_linear = opened_for(given, plant, size), isinstance(given, LinearProcess)
+        # The plant's own equations move all states; any other process has its past inputs kept beside it.
+        self._is_linear, moves_all = isinstance(given, LinearProcess), isinstance(given, LinearProcess | FamilyProcess)
+        self._moved = plant if moves_all or not plant.past else _without_past_inputs(plant)
+        self.process = given.opened(self._moved, size)
         self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
         self.disturbance, self.size = disturbance, size
         self._truncated, self._is_extreme = noise != "gaussian", noise == "extreme"
@@ -178,7 +182,7 @@ class PlantSimulation:
         """
         self._require_written(initial)
         self.process.choose(rng, None, fixed)
-        started = self.process.start(rng, state, None)
+        started = self._of_moved(lambda x: self.process.start(rng, x, None), state)
         self.alarm = False
         if initial is not None and (started is state or initial.contains(started)):
             return started, initial
@@ -202,8 +206,9 @@ class PlantSimulation:
             ValueError: If the process cannot start at given states.
         """
         self._require_written(initial)
-        self.process.choose(rng, np.flatnonzero(mask), fixed)
-        started = self.process.start(rng, states, np.flatnonzero(mask))
+        chosen = np.flatnonzero(mask)
+        self.process.choose(rng, chosen, fixed)
+        started = self._of_moved(lambda x: self.process.start(rng, x, chosen), states)
         self.alarm = self.alarm & ~mask
         known = started.T.copy()
         if initial is not None:
@@ -238,14 +243,23 @@ class PlantSimulation:
             x_next = self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
             return self._watched(x_next, nominal) if self._may_leave else x_next
         step = self.process.step if self.size is None else self.process.step_many
-        x_next = np.array(step(self._model, guarded(state), u))  # which others may write over
+        x, past = state[: self._moved.n], state[self._moved.n :]
+        acting = past[: len(u)] if len(past) and self._model.model.delays else u
+        x_next = np.array(step(self._moved, guarded(x), acting))  # which others may write over
+        if len(past):
+            x_next = np.concatenate([x_next, past[len(u) :], u])
         if self._is_disturbed:
             x_next = x_next + self.draw_disturbance(rng, x_next, steps, memory)
         if self.process.is_written:
             x_next = self._limited(x_next)
         if self._is_disturbed:
-            x_next = self.process.write(x_next)
+            x_next = self._of_moved(self.process.write, x_next)
         return self._watched(x_next, nominal)
+
+    def _of_moved(self, change: Callable[[np.ndarray], np.ndarray], state: np.ndarray) -> np.ndarray:
+        """Returns a state of which a process changes all but the past inputs that are kept beside it."""
+        n = self._moved.n
+        return change(state) if len(state) == n else np.concatenate([change(state[:n]), state[n:]])
 
     def _watched(self, x_next: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Returns x+, and raises the alarm where x+ - A x - B u lies outside E(D)."""
@@ -274,3 +288,11 @@ class PlantSimulation:
     def measure(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
         """Returns y = H x + v, shape (p,) or (p, size)."""
         return self.plant.H.dot(state) + self.sensor_noise.next(rng)
+
+
+def _without_past_inputs(plant: LinearPlant) -> LinearPlant:
+    """Returns the plant of the own states alone, of which nothing uncertain is declared."""
+    point = plant.operating_state[: plant.n - plant.past], plant.operating_input
+    model = replace(plant.model, at=point, offset=None, delays=0)
+    limits = replace(plant.limits.absolute(plant.model), rate=None)
+    return LinearPlant(model, limits, Bounds(disturbance=0.0, sensor=0.0, first_error=0.0), plant.labels)

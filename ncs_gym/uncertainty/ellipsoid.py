@@ -42,7 +42,6 @@ class UncertainSet(ReadOnlyArrays, ABC):
     size: int | None = None
     middle: Any = 0.0
     is_left_out: ClassVar[bool] = False
-    __array_ufunc__ = None  # an array plus a set is a sum
     kinds: ClassVar[dict[str, type[UncertainSet]]] = {}
     __array_ufunc__ = None  # numpy would add a set to each entry of an array, and not to the box of half-widths
 
@@ -124,9 +123,8 @@ class Ellipsoid(UncertainSet):
     shape_matrix: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "shape_matrix", as_covariance(self.shape_matrix, None, "shape_matrix"))
-        object.__setattr__(self, "size", len(self.shape_matrix))
-        self._make_arrays_read_only()
+        shape = as_covariance(self.shape_matrix, None, "shape_matrix")
+        self._set(shape_matrix=shape, size=len(shape))
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
         return self

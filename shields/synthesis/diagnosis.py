@@ -12,8 +12,8 @@ from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.estimation.error_bound import unseen_state
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.estimation.error_sets import ErrorSetError
-from ncs_gym.plants.description import input_limit, mixed_limit, row_limit
-from ncs_gym.plants.hard_bounds import FREE_REACH
+from ncs_gym.limits import FREE_REACH
+from ncs_gym.plants.description import row_limit
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
@@ -80,7 +80,7 @@ def infeasibility(
     else:
         inputs_bind = len(binding) > 0 and all(k <= j < k + m for j in binding)
         missing = "polytope within the limits"
-    named = f" (those that bind: {', '.join(_limit(plant, j) for j in binding)})" if binding else ""
+    named = f" (those that bind: {', '.join(row_limit(plant, j) for j in binding)})" if binding else ""
     what = (
         "(U) no gain was found that keeps the input limits"
         if inputs_bind
@@ -107,14 +107,6 @@ def _once(fraction: float) -> str:
         "a quick search finds one once disturbance and error radii shrink to "
         f"{100.0 * fraction:.{_SHOWN_DIGITS}g}% of those given"
     )
-
-
-def _limit(plant: LinearPlant, j: int) -> str:
-    """Returns limit j of those of states, of inputs and of both together."""
-    k, m = len(plant.box), plant.m
-    if j < k:
-        return row_limit(plant, j)
-    return input_limit(plant, j - k) if j < k + m else mixed_limit(plant, j - k - m)
 
 
 def with_age_that_helps(

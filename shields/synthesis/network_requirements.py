@@ -101,7 +101,7 @@ def requirements(
     tried, and one that promises more has at least the share of the others.
 
     Args:
-        plant: The plant with its bounds; `LinearPlant.resampled` gives it at another sampling period.
+        plant: The plant with its bounds.
         ages: Largest ages of the newest sample [steps]; the steps by which inputs are late count, too.
         resolutions: Quantization steps, in the units of y; 0 for none.
         progress: Called with a line of text now and then.

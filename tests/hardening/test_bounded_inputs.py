@@ -137,7 +137,7 @@ def test_texts_of_plants_are_short_and_mean_nothing_to_a_terminal(text):
     for labels, name in (({"x": "m", text: "m"}, "names"), ({"x": "m", "y": text}, "units")):
         changed = document | {"labels": {"states": labels}}
         with pytest.raises(ValueError, match=f"{name} of states must be printable text of at most 1000 letters"):
-            LinearPlant.read(changed)
+            LinearPlant.load(changed)
     with pytest.raises(ValueError, match="the basis of a remainder must be printable text"):
         Remainder(Ellipsoid(np.eye(2)), proved=False, basis=text)
 

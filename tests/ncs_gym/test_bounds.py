@@ -112,7 +112,7 @@ def test_arrays_of_sets_cannot_be_written_to():
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
         (lambda: small(np.eye(2), sensor_bound=Box(0.0, 0.2)), "must have its middle at zero"),
         (
-            lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sized(3, 1),
+            lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1),
             r"Bounds\(first_error=...\): a set in dimension 3 is needed",
         ),
     ],

@@ -9,7 +9,7 @@ from flint import arb
 from scipy.linalg import expm
 
 from ncs_gym import exact
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.model import zero_order_hold
 
 RNG = np.random.default_rng(0)
 

@@ -53,7 +53,7 @@ from ncs_gym import (
 )
 from ncs_gym.bounds import as_set
 from ncs_gym.envs.env import RenderModeError, ncs_env
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.model import zero_order_hold
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from shields import SafetyShield

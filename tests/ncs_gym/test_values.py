@@ -151,7 +151,7 @@ PLANTS = {
 def test_document_of_a_plant_makes_it_again(name):
     plant = PLANTS[name]()
     document = json.loads(json.dumps(plant.document, allow_nan=False))
-    again = LinearPlant.read(document)
+    again = LinearPlant.load(document)
     assert again.fingerprint == plant.fingerprint
     assert again.document == plant.document
     assert replace(plant).fingerprint == plant.fingerprint
@@ -174,7 +174,7 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
     for each in (low, at, row):
         each[0] = 0.5
     assert replace(plant, model=replace(model)).fingerprint == plant.fingerprint
-    assert LinearPlant.read(json.loads(json.dumps(plant.document))).fingerprint == plant.fingerprint
+    assert LinearPlant.load(json.loads(json.dumps(plant.document))).fingerprint == plant.fingerprint
 
 
 def test_sets_of_a_plant_hold_the_sum_of_all_that_is_declared():

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import LinearPlant
-from ncs_gym.plants.between_samples import MOST_POINTS
+from ncs_gym.limits import MOST_POINTS
 from shields import Certificate, CertificateError, Infeasible, verify
 from shields.polytope import MOST_MULTIPLIERS, MOST_ROWS, Polytope
 from shields.synthesis import invariant_polytope

@@ -9,9 +9,10 @@ from experiments.baselines import CONTROLLERS, RegulatorWeights, controller
 from experiments.baselines.controllers import equilibrium
 from ncs_gym import Channel, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.model import zero_order_hold
 from shields.certificate import Fallback
 from tests.plants import small
-from tests.product import altered, linear_plant, loop_env, resampled
+from tests.product import linear_plant, loop_env
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
 
@@ -131,14 +132,14 @@ def nominal(env, name, weights, steps=150, times=1):
     Looked at that many times per step.
     """
     policy, plant = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), env.plant
-    part = plant if times == 1 else resampled(altered(plant, between_samples=None), plant.dt / times)
+    A, B = zero_order_hold(*np.split(plant.continuous_model, [plant.n], axis=1), plant.dt / times)
     x, applied, reached = np.zeros(plant.n), [np.zeros(plant.m)], 0.0
     targets = np.full(1 + env.task.preview, env.task.reach)
     for _ in range(steps):
         observed = np.concatenate([x, targets, applied[-1] if env.task.change_price else []])
         applied.append(plant.u_max * policy(observed[None], {"estimate": x[None]})[0])
         for _ in range(times):
-            x = part.A @ x + part.B @ applied[-1]
+            x = A @ x + B @ applied[-1]
             reached = max(reached, float(np.abs(plant.box_rows @ x).max()))
     return reached, np.array(applied)
 

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from ncs_gym import Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
 from ncs_gym.uncertainty.family import Family
 from tests.plants import varying_cart_pole, varying_truck
-from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, resampled, sampled_plant
+from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, sampled_plant
 
 MASSES = {"mass": (3800.0, 4200.0)}
 POLE = {"pole_mass": (0.098, 0.102), "length": (0.49, 0.51)}
@@ -322,7 +322,7 @@ def test_other_members_are_another_plant(tmp_path):
 def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_from():
     document = json.loads(json.dumps(HULL.document))
     family_in(document)["members"][2][1][2] *= 3.0  # a stronger input
-    read = LinearPlant.read(document)
+    read = LinearPlant.load(document)
     assert largest_gauge(read, read.members.members, (2.0, 2.0, 4.0)) <= 1
     assert read.remainder.bound.shape_matrix[1, 1] > 4.0 * HULL.remainder.bound.shape_matrix[1, 1]
     smaller = Remainder(Ellipsoid(np.zeros((2, 2))), True, "nothing is left out", HULL.members)
@@ -335,11 +335,11 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
     document = json.loads(json.dumps(TRUCK.document))
     family_in(document)["interval"] = None
     with pytest.raises(ValueError, match="needs the interval of its entries"):
-        LinearPlant.read(document)
+        LinearPlant.load(document)
     document = json.loads(json.dumps(TRUCK.document))
     family_in(document)["members"][0][1][2] *= 3.0
     with pytest.raises(ValueError, match="must lie in its interval"):
-        LinearPlant.read(document)
+        LinearPlant.load(document)
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ def test_balls_count_once_where_inputs_are_under_way():
 
 
 def read_back(plant):
-    return LinearPlant.read(json.loads(json.dumps(plant.document)))
+    return LinearPlant.load(json.loads(json.dumps(plant.document)))
 
 
 @pytest.mark.parametrize("known", [lambda plant: plant, read_back], ids=["made", "read"])
@@ -474,7 +474,6 @@ REFUSED = {
         lambda: rate_limited(family_of(two(B=[[0.0], [0.4]])), 0.5),
         r"must be \[A, B, s\] of shape \(3, 5\)",
     ),
-    "another step later": (lambda: resampled(HULL, 0.25), "without a remainder"),
     "not a plant": (lambda: family_of(partial(dict, a=1), {"b": (0, 1)}, monotone=True), "must be plants"),
     "sizes": (
         lambda: altered(

@@ -58,6 +58,6 @@ def test_sparse_matrix_that_is_too_large_is_not_expanded():
     too_large = {"A": sparse.identity(size, format="csr"), "B": np.ones((size, 1)), "box": np.ones(size)}
     with pytest.raises(ValueError, match=f"A is a sparse matrix of {size} x {size} entries, which is not expanded"):
         linear_plant(**too_large, u_max=1.0, dt=0.1)
-    with pytest.raises(ValueError, match=r"A of the model is a sparse matrix of .* reduce the model"):
+    with pytest.raises(ValueError, match=r"A is a sparse matrix of .* reduce the model"):
         sampled_plant((sparse.eye(size), sparse.eye(size), sparse.eye(size), 0.0), 0.1, **REST)
     assert as_numbers(sparse.coo_array((10**9, 10**9))) is None

@@ -19,7 +19,6 @@ from tests.product import (
     gym_vector_env,
     linear_plant,
     rate_limited,
-    resampled,
     safe_loop,
     safety_shield,
     sampled_plant,
@@ -277,9 +276,3 @@ def test_limits_count_beside_times_between_samples():
         assert info["shield_guaranteed"]
         assert info["cost"] == 0.0
         assert len(info["worst_constraint_values"]) == len(plant.box) + 1
-
-
-@pytest.mark.parametrize("name", ["rates", "rates of a late input"])
-def test_plant_of_past_inputs_says_why_it_has_no_other_step(name):
-    with pytest.raises(ValueError, match=r"belong to their step: make the plant anew with dt=0.05"):
-        resampled(PLANTS[name], 0.05)

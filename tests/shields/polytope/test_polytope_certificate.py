@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import cart_pole
+from ncs_gym.model import zero_order_hold
 from ncs_gym.network.contract import ChannelContract, contract_of
-from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import CART_POLE_CHANNEL
 from shields import verify
 from shields.errors import Infeasible, SynthesisInterrupted

@@ -14,7 +14,7 @@ from shields.synthesis import network_requirements
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.network_requirements import share_of
 from tests import plants
-from tests.product import altered, linear_plant, resampled, synthesize
+from tests.product import altered, linear_plant, synthesize
 
 
 def servo(**changes):
@@ -75,20 +75,6 @@ def test_less_than_what_was_refused_is_not_tried_and_more_than_what_is_certified
 @pytest.mark.slow
 def test_known_age_of_the_pendulum():
     assert requirements(pendulum(), ages=[8]).largest_age() == 8
-
-
-def test_resampled_plant_is_the_model_sampled_at_that_period():
-    direct = servo(dt=0.02)
-    sampled = resampled(servo(), 0.02)
-    assert np.array_equal(sampled.A, direct.A)
-    assert np.array_equal(sampled.B, direct.B)
-    # A disturbance that is constant for two short steps is that of one long step.
-    step, d = servo(), np.array([0.0, 0.5])
-    twice = step.A @ d + d
-    assert sampled.nominal_disturbance.contains(twice * (1.0 - 1e-9))
-    assert not sampled.nominal_disturbance.contains(twice * 1.001)
-    assert resampled(servo(), 0.01) is not None
-    assert resampled(servo(), 0.01).fingerprint == servo().fingerprint
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6))])
