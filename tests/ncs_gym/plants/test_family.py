@@ -24,12 +24,6 @@ QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 SMALL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 2.0], "u_max": 3.0, "dt": 0.1} | QUIET
 
 
-@pytest.fixture
-def few_points(monkeypatch):
-    """Entries are looked at in few points, where it is not about them."""
-    monkeypatch.setattr("ncs_gym.plants.family.grid_size", lambda parameters: 9)
-
-
 def exact(matrix):
     return [[Fraction(entry) for entry in row] for row in np.atleast_2d(matrix).tolist()]
 
@@ -110,7 +104,7 @@ def test_members_inside_the_hull_leave_out_less_than_its_vertices():
     assert largest_gauge(HULL, beyond, (2.0, 2.0, 4.0)) > 1
 
 
-def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end(few_points):
+def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
     def of(gain, **more):
         limits = {"state_limits": ([-1.0, -2.0], [0.5, 2.0]), "input_limits": (-1.0, 3.0)}
         model = (SMALL["A"], [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1)
@@ -227,7 +221,7 @@ def tank(k, delay=0, level=None, **more):
 
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("kind", ["function", "plants"])
-def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay, few_points):
+def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay):
     def of(k):
         return tank(k, delay, offset=[0.0])
 
@@ -259,7 +253,7 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
         np.testing.assert_allclose(plant.from_deviation(info["state"])[0], 0.4 / k, atol=2e-3)
 
 
-def test_members_are_at_rest_where_somebody_says_so(few_points):
+def test_members_are_at_rest_where_somebody_says_so():
     def at_two(k):
         return tank(k, level=2.0)
 
@@ -278,7 +272,7 @@ def test_members_are_at_rest_where_somebody_says_so(few_points):
 
 
 @pytest.mark.parametrize("more", [{}, {"input_delay": 2}, {"du_max": 0.5}, {"input_delay": 1, "du_max": 0.4}])
-def test_members_may_rest_with_other_inputs(more, few_points):
+def test_members_may_rest_with_other_inputs(more):
     def cart(mass):
         model = ([[0.0, 1.0], [0.0, -0.5 / mass]], [[0.0], [1.0 / mass]], [[1.0, 0.0]], [[0.0]])
         limits = {"state_limits": ([0.0, -2.0], [2.0, 2.0]), "input_limits": (-2.0, 2.0)}
@@ -294,7 +288,7 @@ def test_members_may_rest_with_other_inputs(more, few_points):
     np.testing.assert_allclose(moves, [0.05 * 0.3 * 0.00495, 0.05 * 0.3 * 0.0976], rtol=0.1)
 
 
-def test_rounding_of_operating_points_is_no_step(few_points):
+def test_rounding_of_operating_points_is_no_step():
     def pushed(k):
         decay = np.exp(-0.5 * k)
         model = {"A": [[decay, 0.0], [0.0, 1.0]], "B": [[0.5 * (1.0 - decay) / k], [0.1]], "dt": 0.5}
@@ -366,7 +360,7 @@ def test_what_members_share_is_compared_inside_the_ranges(changed, name):
         env.reset(options={"parameters": {"angle": 0.0}})
 
 
-def test_two_ended_disturbances_move_each_member(few_points):
+def test_two_ended_disturbances_move_each_member():
     def pushed(k):
         return tank(k, disturbance_bound=([[1.0]], [-0.01], [0.03]))
 
@@ -417,7 +411,7 @@ def test_members_belong_to_the_point_that_they_are_in_deviations_from(known):
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
-def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low, few_points):
+def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low):
     def of(a):
         model = {"A": [[a]], "B": [[0.5]], "dt": 1.0, "box": [1.0], "u_max": 0.9, "sensor_bound": 0.01}
         return linear_plant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))
@@ -442,7 +436,7 @@ def test_entries_that_are_not_monotone_are_found_on_the_grid_or_when_they_are_dr
         family_of(bent, {"mass": (0.0, 1.0)}, monotone=True)
     half = family_of(bent, {"mass": (0.0, 0.5)}, monotone=True)
     assert half.remainder.bound.shape_matrix[1, 1] > 0.0
-    env = loop_env(family_of(spiked, {"mass": (0.0, 1.0)}, monotone=True))
+    env = loop_env(family_of(spiked, {"mass": (0.0, 1.0)}, monotone=True, all_points=True))
     env.reset(options={"parameters": {"mass": 1.0 / 255}})
     with pytest.raises(ValueError, match=r"B\[1, 0\] at .* is not between those at the ends"):
         env.reset(options={"parameters": {"mass": 0.5 / 255}})

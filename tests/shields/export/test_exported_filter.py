@@ -120,7 +120,7 @@ def test_what_passes_on_a_board_passes_the_filter_with_the_error_set_of_its_age(
     assert passed.min() > 20
 
 
-def attacked(folder, name, steps, seed=0, count=50, outages=False):
+def attacked(folder, name, steps, seed=0, count=100, outages=False):
     """Attacks N filters for so many steps: guaranteed steps, those outside the set, and errors outside their sets.
 
     With outages packets break the contract now and then, and what was held up arrives together.
