@@ -156,11 +156,6 @@ def test_nothing_that_compiles_at_first_use_is_imported_or_pinned():
     assert not pinned & COMPILERS
 
 
-def test_every_folder_says_what_it_is_for():
-    for folder in {path.parent for path in MODULES}:
-        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
-
-
 def test_few_names_are_public_and_each_is_documented():
     public = set()
     for init in (path for path in MODULES if path.name == "__init__.py"):

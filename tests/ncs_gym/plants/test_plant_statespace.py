@@ -55,14 +55,6 @@ def test_model_that_leaves_open_whether_it_is_in_discrete_time_is_refused(model,
         sampled_plant(model, dt, **REST)
 
 
-@pytest.mark.parametrize("kind", [signal.TransferFunction, lambda num, den: SimpleNamespace(num=num, den=den)])
-def test_transfer_functions_are_refused_since_limits_are_of_states(kind):
-    with pytest.raises(ValueError, match="is a transfer function, whose states would be nobody's"):
-        sampled_plant(kind([100.0], [1.0, 5.0, 0.0]), dt=0.02, **REST)
-    with pytest.raises(ValueError, match="is a transfer function"):
-        sampled_plant(signal.ZerosPolesGain([], [0.0, -5.0], 100.0), dt=0.02, **REST)
-
-
 @pytest.mark.parametrize("name", DISCRETE)
 def test_discrete_model_is_taken_as_it_is(name):
     plant = sampled_plant(DISCRETE[name], dt=0.1, **REST)
@@ -82,14 +74,6 @@ def test_model_takes_limits_around_an_operating_point():
     np.testing.assert_allclose(plant.box_ends[:, 2] / plant.box[2, 2], [-8.0, 4.0])  # of the input under way
     np.testing.assert_allclose(plant.operating_state, [1.0, 0.0, 2.0])
     np.testing.assert_allclose(plant.A @ plant.operating_state + plant.B @ [2.0], plant.operating_state)
-
-
-def test_limits_without_an_operating_point_are_around_zero():
-    settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")} | {"dt": 0.1}
-    limits = {"state_limits": ([-0.5, -1.0], [3.0, 1.0]), "input_limits": (-2.0, 3.0)}
-    plant = sampled_plant((A, B, C, D), **limits, **settings)
-    np.testing.assert_array_equal(plant.own_limits, limits["state_limits"])
-    np.testing.assert_array_equal(plant.input_ends, [[-2.0], [3.0]])
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])

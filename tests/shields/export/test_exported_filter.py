@@ -64,7 +64,9 @@ def copied(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("*.so"))
 
 
-@pytest.mark.parametrize(("name", "single"), [*DOUBLE, ("CartPole", True), ("CSTR", True)])
+@pytest.mark.parametrize(
+    ("name", "single"), [*((name, False) for name in (*NAMES, "hill")), ("CartPole", True), ("CSTR", True)]
+)
 def test_c_does_what_its_python_reading_does(exported, name, single):
     """Random samples, stamps, episodes, proposals and applied inputs, also wrong ones: equal to the last bit."""
     (folder, table), (plant, certificate) = exported(name, single), example(name)
@@ -107,7 +109,7 @@ def test_what_passes_on_a_board_passes_the_filter_with_the_error_set_of_its_age(
     (_, table), (plant, certificate) = exported(name, single), example(name)
     shield, rng = safety_filter(certificate, plant, "switch"), np.random.default_rng(2)
     passed = np.zeros(len(table.limit), np.int64)
-    for _ in range(1500):
+    for _ in range(700):
         direction = boundary(set_of(certificate), plant.half_widths, rng, 1)[:, 0]
         board = BoardFilter(table, 0, rng.uniform(0.5, 1.0) * direction)
         board.age = age = int(rng.integers(len(table.limit)))

@@ -207,15 +207,6 @@ def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
     np.testing.assert_array_less([0.999, 0.01], found.polytope.support(np.eye(2)))
 
 
-@pytest.mark.slow
-def test_chain_that_needs_too_many_rows_says_so_within_a_minute_and_keeps_the_ellipsoid():
-    begin = time.process_time()
-    narrow = synthesize(chain(4, 0.5), contract=ChannelContract(1))
-    assert time.process_time() - begin < 60.0
-    assert "more than 400 rows, fewer with longer steps or less disturbance" in narrow.provenance["no_polytope"]
-    assert narrow.safe_set is narrow.ellipsoid
-
-
 def test_errors_that_leave_a_face_alone_leave_no_polytope():
     plant = random_plant(3, 2, 1)
     certificate = certificate_of(plant)
