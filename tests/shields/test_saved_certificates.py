@@ -53,7 +53,7 @@ def test_search_ends_with_no_more_rows_than_a_polytope_may_have(monkeypatch):
 sizes = st.floats(-75.0, 75.0).map(lambda power: 10.0**power) | st.sampled_from([1e-75, 1e-37, 1e37, np.inf])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(box=st.lists(sizes, min_size=2, max_size=2), u_max=sizes, bounds=st.lists(sizes, min_size=3, max_size=3))
 def test_every_plant_that_can_be_made_is_read_again(box, u_max, bounds, tmp_path_factory):
     names = ("disturbance_bound", "sensor_bound", "initial_bound")

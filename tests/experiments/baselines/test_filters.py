@@ -172,7 +172,7 @@ def test_predictive_filter_keeps_limits_with_two_ends_and_of_states_and_inputs_t
         np.zeros(plant.n),
     )
     state, reached, alone = np.zeros(plant.n), [], []
-    for k in range(240):
+    for k in range(160):
         if k % 20 == 0:
             proposed = np.where(rng.random(plant.m) < 0.5, *plant.input_ends)
         u = predictive(state[None], proposed[None], np.array([k == 0]))[0]

@@ -99,7 +99,7 @@ TEXTS = {
 BREAKOUTS = (ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>")
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("text", [" ".join(BREAKOUTS), *BREAKOUTS])
 def test_a_text_anywhere_in_a_summary_stays_text(text):
     summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})

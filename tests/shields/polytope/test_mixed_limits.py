@@ -165,7 +165,7 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     both = replace(CONTRACT, max_age=CONTRACT.max_age + contract_of(downlink).max_age)
     shield = safety_shield(env, certificate_of(plant, both, "polytope"), mode)
     rng, guaranteed = np.random.default_rng(0), 0
-    for seed in range(5):
+    for seed in range(3):
         _, info = shield.reset(seed=seed)
         for _ in range(60):
             before = info["input"]
@@ -174,7 +174,7 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
                 assert info["cost"] == 0.0
                 assert np.abs(info["input"] - before).max() <= 0.3
             guaranteed += info["shield_guaranteed"]
-    assert guaranteed > 200
+    assert guaranteed > 120
 
 
 @pytest.mark.parametrize("name", ["rates", "rates of a late input"])
