@@ -163,16 +163,6 @@ def test_returns_and_differences_have_students_and_the_bootstraps_interval():
     assert reader.tables["Paired differences"][1][1:4] == ["+0.0", "[+0.0, +0.0]", "[+0.0, +0.0]"]
 
 
-def test_one_run_has_no_interval_and_the_page_says_so():
-    page = comparison("unshielded", "shielded", runs=1)
-    assert "none: one run" in page
-    assert "1 run</td>" in page
-    assert "1 runs" not in page
-    assert "how training varies is unknown" in page
-    assert "bootstrap over" not in page
-    assert "Paired differences" not in comparison("shielded")
-
-
 def test_every_condition_has_a_table_and_every_arm_an_explanation():
     change = {"scenarios": {"gaussian": run("shielded", violations=(3, 0)).episodes}}
     page = Reader(comparison("shielded", "trusting", "lagrangian", "lqr+psf", "shield at test", change=change))

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from ncs_gym import Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
 from ncs_gym.uncertainty.family import Family
@@ -66,20 +65,6 @@ def between(function, ranges, count, seed=0):
     points = [*itertools.product(*ends), *([rng.uniform(*end) for end in ends] for _ in range(count))]
     plants = [function(**dict(zip(ranges, map(float, point), strict=True))) for point in points]
     return [np.hstack([each.A, each.B]) for each in plants]
-
-
-def test_states_of_many_environments_are_moved_to_the_operating_point_and_back():
-    plant = linear_plant(
-        A=[[0.9]], B=[[0.1]], dt=0.1, state_limits=(1.0, 3.0), input_limits=(0.0, 1.0),
-        operating_state=2.0, operating_input=0.4,
-        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-    )  # fmt: skip
-    many = np.array([[0.5], [-0.25], [0.0]])
-    np.testing.assert_array_equal(plant.from_deviation(many), [[2.5], [1.75], [2.0]])
-    np.testing.assert_array_equal(plant.to_deviation(plant.from_deviation(many, "input"), "input"), many)
-    np.testing.assert_array_equal(plant.from_deviation([0.5]), [2.5])
-    with pytest.raises(ValueError, match=r"the state must have shape \(1,\)"):
-        plant.from_deviation(np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize(
@@ -200,14 +185,6 @@ def _contract(plant):
     from ncs_gym import ChannelContract
 
     return {} if plant.spectral_radius < 1.0 else {"contract": ChannelContract(3)}
-
-
-def test_members_are_those_of_the_continuous_model():
-    for mass in (3800.0, 3931.7, 4200.0):
-        model = np.array([[0.0, 1.0, 0.0], [-4500.0 / mass, -4600.0 / mass, 1.0], [0.0, 0.0, 0.0]])
-        member = TRUCK.remainder.family.member(np.array([mass]))
-        np.testing.assert_allclose(member[:, :3], expm(0.5 * model)[:2], rtol=1e-12)
-        assert not member[:, 3].any()
 
 
 def tank(k, delay=0, level=None, **more):

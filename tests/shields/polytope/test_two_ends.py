@@ -388,20 +388,6 @@ def test_resting_state_is_taken_where_it_is_one():
         synthesize(within_symmetric(plant), contract=CONTRACT, resting_state=[0.05, 0.0], safe_set="ellipsoid")
 
 
-@pytest.mark.slow
-def test_share_of_the_largest_ellipsoid_is_said_of_boxes_with_a_center_alone():
-    quiet = {"u_max": 1.0, "dt": 1.0, "disturbance_bound": 0.001, "sensor_bound": 0.002, "initial_bound": 0.005}
-    one, two = {"A": [[0.9]], "B": [[0.1]]} | quiet, {"A": np.diag([0.9, 0.8]), "B": 0.2 * np.eye(2)} | quiet
-    for plant in (
-        linear_plant(**one, state_limits=(-0.7, np.inf)),
-        linear_plant(**two, state_limits=(-1.0, 1.0), output_limits=[([1.0, 1.0], -1.9, 0.1)]),
-    ):
-        assert "volume_of_box_ellipsoid" not in synthesize(plant).provenance
-    aside = synthesize(linear_plant(**one, state_limits=(-0.7, 2.1)))
-    half = np.sqrt(aside.L[0, 0])  # of the largest ellipsoid, an interval, 1.4
-    assert aside.provenance["volume_of_box_ellipsoid"] == pytest.approx(half / 1.4, rel=1e-3)
-
-
 def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monkeypatch):
     def failing(*arguments):
         raise np.linalg.LinAlgError("Matrix is not positive definite")

@@ -13,7 +13,7 @@ from benchmarks.published import contract_of_plant, plant_of
 from ncs_gym import ChannelContract, ErrorSetError, certified_error_set
 from shields import Infeasible
 from tests.certificates import feasible_age_not_sought
-from tests.plants import servo, with_radii
+from tests.plants import with_radii
 from tests.product import linear_plant, rate_limited, sampled_plant, synthesize
 from tests.verdicts import verified
 
@@ -26,32 +26,6 @@ PENDULUM = {
 }  # fmt: skip
 ANGLE = {"A": [[1.0, 0.1], [-0.045, 0.9]], "B": [[0.0], [0.1]], "dt": 0.1}
 ROOM = {"A": [[0.98]], "B": [[0.05]], "dt": 60.0, "operating_state": 22.0, "operating_input": 8.0}
-
-
-def tanks(**changes):
-    given = {
-        "state_limits": ([0.0, 0.0], [16.0, 8.0]),
-        "input_limits": ([0.0, 0.0], [10.0, 8.0]),
-        "operating_state": [12.4, 5.0],
-        "operating_input": [7.0, 3.0],
-        "disturbance_bound": 1.5,
-    }
-    return sampled_plant(
-        ([[-0.1, 0.05], [0.0, -0.2]], [[0.1, 0.02], [0.03, 0.2]], np.eye(2), 0), 1.0, **QUIET | given | changes
-    )
-
-
-def platoon(disturbance):
-    """Three cars, each with its spacing, speed difference and acceleration."""
-    A, B = np.zeros((9, 9)), np.zeros((9, 3))
-    for i in range(3):
-        A[3 * i, 3 * i + 1], A[3 * i + 1, 3 * i + 2], A[3 * i + 2, 3 * i + 2], B[3 * i + 2, i] = 1.0, -1.0, -2.0, 2.0
-        if i:
-            A[3 * i + 1, 3 * i - 1] = 1.0
-    return sampled_plant(
-        (A, B, np.eye(9), 0), 0.1, box=np.tile([5.0, 3.0, 3.0], 3), u_max=3.0,
-        disturbance_bound=np.tile([0.0, disturbance, 0.001], 3), sensor_bound=0.02, initial_bound=0.02,
-    )  # fmt: skip
 
 
 # Refused plants, and the age that their network promises.
@@ -74,20 +48,6 @@ QUICK = {
     ),
 }  # fmt: skip
 SLOW = {"room": pytest.mark.slow, "one end": pytest.mark.slow, "angle with a rate": pytest.mark.slow}
-LONG = {
-    "sensor": (lambda: linear_plant(**PENDULUM | {"disturbance_bound": 1e-3, "sensor_bound": 0.2}), 0),
-    "age": (lambda: linear_plant(**PENDULUM | {"disturbance_bound": 1e-3}), 25),
-    "servo": (lambda: servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.5], u_max=0.5), 0),
-    "servo between samples": (lambda: servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.48], between_samples=4), 2),
-    "tanks": (tanks, 2),
-    "tanks with coupled valves": (lambda: tanks(mixed_limits=[([0.0, 0.0], [1.0, 1.0], 9.0, 11.0)]), 2),
-    "platoon far off": (lambda: platoon(0.15), 2),
-    "platoon nearly": (lambda: platoon(0.045), 2),
-    **{
-        name: (lambda name=name: plant_of(name), contract_of_plant(name).max_age)
-        for name in ("ctms_suspension", "double_integrator", "afti16")
-    },
-}
 
 
 def made(given):
@@ -123,16 +83,6 @@ def test_radii_that_a_refusal_names_have_a_certificate(name):
     told = refusal(plant, contract)
     assert 0.0 < told.details["share_of_radii"] < 1.0
     assert f"shrink to {100.0 * told.details['share_of_radii']:.3g}% of those given" in str(told)
-    require_hints_that_certify(plant, contract, told)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LONG)
-def test_what_refusals_of_more_plants_name_has_a_certificate(name):
-    make, age = LONG[name]
-    plant, contract = make(), ChannelContract(age)
-    told = refusal(plant, contract)
-    assert told.details
     require_hints_that_certify(plant, contract, told)
 
 
