@@ -20,7 +20,6 @@ from benchmarks.study import (
     comparisons_table,
     difference,
     environment,
-    impairments_table,
     margins_table,
     network_table,
     prices_table,
@@ -146,17 +145,6 @@ def test_margins_are_the_smallest_without_a_violation(made):
     assert cells(made[0]) == ["10", "%", "20", "%", "-1.5", "-2.0"]  # a tube is no margin
     never = study(**{"lqr+psf:20": (12.0, 0.0, 1.0)})
     assert cells(never[0]) == ["10", "%", ">", "20", "%", "-0.5", "-1.0"]
-
-
-def test_impairments_alone_are_a_row_per_arm():
-    table = impairments_table({"Plant-v0": switches(), "Other-v0": switches()}).splitlines()
-    assert table[0].split()[3:] == ["ideal", "loss", "delay", "rate", "rounding", "all", "four"]
-    assert table[2].split() == ["Plant-v0", "lqr", "0", "25", "25", "25", "25", "100"]
-    assert [line.split()[:2] for line in table[3:]] == [
-        ["Plant-v0", "lookahead"],
-        ["Other-v0", "lqr"],
-        ["Other-v0", "lookahead"],
-    ]
 
 
 def test_tables_have_every_arm_and_no_negative_zero(made):

@@ -201,14 +201,6 @@ def test_first_errors_attain_the_declared_bound(bound, use):
     assert np.ptp(errors, axis=0).min() > 0.0
 
 
-def test_first_errors_attain_the_bound_of_a_covariance_and_of_what_is_declared_besides():
-    covariance = 1e-5 * np.eye(2)
-    alone, both = (plant_with(initial_cov=covariance, initial_bound=bound) for bound in (0.0, 0.02))
-    radius = np.sqrt(alone.initial_radius_squared)
-    np.testing.assert_allclose(np.linalg.norm(first_errors(alone), axis=1), radius, rtol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(first_errors(both), axis=1), radius + 0.02, rtol=1e-6)
-
-
 def assert_safe(counts):
     assert counts["outside S"] == counts["outside box"] == counts["no claim"] == counts["lost"] == 0
     assert counts["overridden"] > 0

@@ -3,7 +3,6 @@ import json
 import re
 from html.parser import HTMLParser
 
-import pytest
 from jinja2 import UndefinedError
 
 from experiments.report.html import comparison_report
@@ -95,27 +94,23 @@ TEXTS = {
 }
 
 
-# Each leaves another place of a page; one text with all of them is put everywhere, each alone where texts are shown.
-BREAKOUTS = (ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>")
+# Each part leaves another place of a page.
+BREAKOUTS = " ".join((ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>"))
 
 
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("text", [" ".join(BREAKOUTS), *BREAKOUTS])
-def test_a_text_anywhere_in_a_summary_stays_text(text):
+def test_a_text_anywhere_in_a_summary_stays_text():
     summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})
     summary["references"] = {"zero input": summary["arms"]["unshielded"] | {"train_steps": 0}}
     summary = json.loads(json.dumps(summary))
     honest = tags_of(comparison_report(summary, VERIFIED, {"a": ("A. B.", PNG)}, []))
     shown = set()
-    for path, change in attacked(summary, text):
-        if text in BREAKOUTS and path not in TEXTS:
-            continue
+    for path, change in attacked(summary, BREAKOUTS):
         try:
             page = comparison_report(change, VERIFIED, {"a": ("A. B.", PNG)}, [])
         except (AttributeError, IndexError, KeyError, TypeError, ValueError, UndefinedError):
             continue  # no page is as good as a harmless one
         assert tags_of(page) <= honest, path
-        if text in "".join(Reader(page).text):
+        if BREAKOUTS in "".join(Reader(page).text):
             shown.add(path)
     assert shown >= TEXTS
 

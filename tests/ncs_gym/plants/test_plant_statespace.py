@@ -7,7 +7,6 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from tests.product import sampled_plant
 
@@ -121,13 +120,3 @@ def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():
     plain, plant = (sampled_plant((A, B, C, D), dt=0.1, input_delay=d, **(REST | noise)) for d in (0, 1))
     for direction in np.random.default_rng(0).standard_normal((100, 2)):
         assert plant.disturbance.support([*direction, 0.0]) >= (1 - 1e-9) * plain.disturbance.support(direction)
-
-
-def test_model_of_the_truck_is_the_registered_plant():
-    rate = np.array([[0.0, 1.0], [-4.5, -4.6]])
-    truck = truck_trailer()
-    plant = sampled_plant(
-        (rate, B, np.eye(2), np.zeros((2, 1))), dt=0.5, box=[2.0, 2.0], u_max=4.0, gamma=5e-4,
-        **{name: 1e-4 * np.eye(2) for name in ("process_noise_cov", "measurement_noise_cov", "initial_cov")},
-    )  # fmt: skip
-    assert plant.fingerprint == truck.fingerprint
