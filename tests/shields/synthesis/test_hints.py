@@ -143,11 +143,3 @@ def test_a_contract_is_named_where_a_stable_plant_has_none():
     with pytest.raises(Infeasible, match=r"of the channel promises \(contract=ChannelContract\(32\)\)") as refused:
         synthesize(plant)
     assert verified(synthesize(plant, contract=ChannelContract(refused.value.details["max_age"])), plant).valid
-
-
-def test_less_age_is_named_where_it_helps():
-    plant = linear_plant(**PENDULUM | {"A": [[2.0, 0.1], [0.1, 1.0]], "disturbance_bound": 1e-5})
-    told = refusal(plant, ChannelContract(400))
-    assert "promise less age" in str(told)
-    assert f"there is a certificate for max_age = {told.details['max_age']} (asked: max_age = 400)" in str(told)
-    require_hints_that_certify(plant, ChannelContract(400), told)
