@@ -100,7 +100,8 @@ def named(name: str) -> tuple[LinearPlant, ChannelContract | None]:
 
 def with_radii(plant: LinearPlant, factor: float) -> LinearPlant:
     """The plant with the radii of its declared disturbances, sensor noise and first errors multiplied."""
-    names = ("disturbance_bound", "sensor_bound", "initial_bound")
-    given = {name: bound for name in names if (bound := getattr(plant, name)) is not None}
-    scaled = {name: Ellipsoid(factor**2 * bound.shape_matrix) for name, bound in given.items()}
+    own = plant.n - plant.past
+    sizes = {"disturbance_bound": own, "sensor_bound": plant.p, "initial_bound": own}
+    given = {name: bound.shape_matrix for name in sizes if (bound := getattr(plant, name)) is not None}
+    scaled = {name: Ellipsoid(factor**2 * D[: sizes[name], : sizes[name]]) for name, D in given.items()}
     return altered(plant, gamma=factor**2 * plant.gamma, **scaled)

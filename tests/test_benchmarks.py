@@ -68,12 +68,12 @@ def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(mo
 
 def test_table_of_regulators_pairs_them_with_the_packaged_agent(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(learning, "grid", lambda arm: [{"effort": 0.03, "state": 0.003}])
-    given = {"env": ("ncs_gym/CSTR-v0",), "regulators": ("lqr", "lqr:observer"), "tuning_episodes": 1}
+    given = {"env": ("ncs_gym/CSTR-v0",), "regulators": ("lqr:observer",), "tuning_episodes": 1}
     learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
     first = capsys.readouterr().out
-    agent, lqr, observer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in first.splitlines()[2:])
-    assert [agent[1], lqr[1], observer[1]] == ["agent", "lqr", "lqr:observer"]
-    assert agent[5] == lqr[5] == observer[5] == "0 of 16"
+    agent, observer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in first.splitlines()[2:])
+    assert [agent[1], observer[1]] == ["agent", "lqr:observer"]
+    assert agent[5] == observer[5] == "0 of 16"
     gain, returns = float(observer[6].split()[0]), [float(row[4].split()[0]) for row in (agent, observer)]
     assert gain == pytest.approx(returns[1] - returns[0], abs=0.11)
     assert gain > 2.0

@@ -31,7 +31,10 @@ def makes(node):
         return of_product and FUNCTIONS & {each.name for each in node.names}
     if not isinstance(node, ast.Call):
         return False
-    *owner, name = ast.unparse(node.args[0] if ast.unparse(node.func) == "partial" else node.func).split(".")
+    called = node.args[0] if getattr(node.func, "id", "") == "partial" else node.func
+    name, owner = getattr(called, "attr", getattr(called, "id", "")), []
+    if name in FUNCTIONS | {"make", "make_vec"} and isinstance(called, ast.Attribute):
+        owner = ast.unparse(called.value).split(".")
     given = {each.arg for each in node.keywords}
     return (
         name in CLASSES

@@ -20,14 +20,12 @@ from benchmarks.study import (
     comparisons_table,
     difference,
     environment,
-    impairments_table,
     margins_table,
     network_table,
     prices_table,
     quotable,
     switched,
 )
-from benchmarks.study_figures import study_figures
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.runs.loops import changed_channel
@@ -149,23 +147,6 @@ def test_margins_are_the_smallest_without_a_violation(made):
     assert cells(never[0]) == ["10", "%", ">", "20", "%", "-0.5", "-1.0"]
 
 
-def test_effect_of_the_network_is_shown_of_the_filter_that_trusts_its_estimate_and_of_the_proof(made):
-    trusting, sound = [line.split() for line in network_table(made[0]).splitlines()[3:]]
-    assert trusting[:5] == ["Plant-v0", "trusting:20", "0.0", "0.0", "25.0"]
-    assert sound[:5] == ["Plant-v0", "lookahead", "0.0", "0.0", "0.0"]
-
-
-def test_impairments_alone_are_a_row_per_arm():
-    table = impairments_table({"Plant-v0": switches(), "Other-v0": switches()}).splitlines()
-    assert table[0].split()[3:] == ["ideal", "loss", "delay", "rate", "rounding", "all", "four"]
-    assert table[2].split() == ["Plant-v0", "lqr", "0", "25", "25", "25", "25", "100"]
-    assert [line.split()[:2] for line in table[3:]] == [
-        ["Plant-v0", "lookahead"],
-        ["Other-v0", "lqr"],
-        ["Other-v0", "lookahead"],
-    ]
-
-
 def test_tables_have_every_arm_and_no_negative_zero(made):
     tiny = study(**{"lookahead": (-2.0, 0.0, 0.0), "trusting:20": (-2.0 + 1e-9, 0.0, 0.5)})[0]
     for summary in (made[0], tiny):
@@ -174,12 +155,6 @@ def test_tables_have_every_arm_and_no_negative_zero(made):
         assert not re.search(r"(?<![\d.])-0(\.0+)?(?![\d.])", text)
         assert max(map(len, text.splitlines())) <= 80
     assert quotable(json.loads(json.dumps(made[0]))) == quotable(made[0])
-
-
-def test_figures_show_every_arm_and_every_run(made):
-    figures = study_figures(made[0])
-    assert figures.keys() == {"return", "runs", "training"}
-    assert all(png.startswith(b"\x89PNG") for png in figures.values())
 
 
 @pytest.mark.parametrize("env_id", [*ENVS, "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CartPole-v0"])

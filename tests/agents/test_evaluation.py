@@ -123,7 +123,7 @@ def test_steps_that_were_proved_are_counted_where_the_contract_breaks():
     channel = Channel(loss=0.8, max_consecutive_losses=30)
     env = gym.make("ncs_gym/CartPole-v0").unwrapped
     shield = ShieldSettings(certificate_for(env.plant, env.certificate_contract), **settings)
-    loop = LoopConfig(env="ncs_gym/CartPole-v0", kwargs={"channel": channel}, shield=shield)
+    loop = LoopConfig(env="ncs_gym/CartPole-v0", kwargs={"channel": channel, "max_episode_steps": 80}, shield=shield)
 
     def noting(observations, info):
         infos.append(info)

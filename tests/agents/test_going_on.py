@@ -50,11 +50,11 @@ class Interrupting(BaseCallback):
 
 
 def test_training_goes_on_from_an_agent(loop):
-    first = train(loop, 512, 0, hyperparams=SMALL).agent
+    first = train(loop, 256, 0, hyperparams=SMALL).agent
     observations = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     still = train(loop, 128, 1, hyperparams=SMALL | {"learning_rate": 1e-12}, start=first).agent
     np.testing.assert_allclose(still.act(observations), first.act(observations), atol=0.05)
-    moved = train(loop, 512, 1, hyperparams=SMALL, start=first).agent
+    moved = train(loop, 256, 1, hyperparams=SMALL, start=first).agent
     assert moved.checksum != first.checksum
     other = train(loop, 128, 1, hyperparams=SMALL | {"learning_rate": 1e-12}).agent
     assert np.abs(other.act(observations) - first.act(observations)).max() > 0.05
@@ -144,11 +144,11 @@ def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
             return True
 
     keeping, limit = Keeping(), truck_trailer().u_max
-    agent = train(loop, 240, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
+    agent = train(loop, 120, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
     stored = agent.model.replay_buffer
     actions = stored.actions[: stored.pos].reshape(-1, 1)
     np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
-    proposed = train(loop, 240, 0, algorithm, REPLAY).agent.model.replay_buffer
+    proposed = train(loop, 120, 0, algorithm, REPLAY).agent.model.replay_buffer
     assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
 
 

@@ -1,7 +1,6 @@
 """PPO-Lagrangian's price of a violation."""
 
 import gymnasium as gym
-import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -99,16 +98,3 @@ def test_multiplier_moves_at_every_rollout_although_all_episodes_end_in_the_same
     train(loop, 32 * 20 * 6, 0, hyperparams=short, callbacks=[prices])
     assert len(prices.noted) == 6  # 120 of an episode's 200 steps
     assert len(set(prices.noted)) > 3
-
-
-@pytest.mark.slow
-def test_training_raises_the_price_of_what_the_agent_violates():
-    prices, loop = Prices(), LoopConfig(env=CRUISE.env, lagrangian=LagrangianSettings(learning_rate=0.5))
-    result = train(loop, 1600, 0, hyperparams=TINY, callbacks=[prices])
-    assert result.violation_steps > 0
-    # Rollouts are as long as an episode, 200 steps in all.
-    violating = np.array([point.violation_steps for point in result.history])
-    np.testing.assert_allclose(prices.noted, 0.5 * violating, rtol=1e-12)
-    plain = train(CRUISE, 1600, 0, hyperparams=TINY)
-    observations = np.random.default_rng(0).standard_normal((20, 3))
-    assert (plain.agent.act(observations) != result.agent.act(observations)).any()

@@ -59,25 +59,6 @@ def test_agent_acts_as_the_model_did_by_its_statistics_or_without_any(cls, tmp_p
     assert_acts_as(load_sb3_zip(file, CRUISE, cls.__name__, None), model, OBSERVATIONS)
 
 
-@pytest.mark.parametrize("cls", [PPO, SAC])
-def test_noise_that_depends_on_the_state_is_taken_over(cls, tmp_path):
-    model = saved(tmp_path, cls, use_sde=True)
-    assert_acts_as(load_sb3_zip(tmp_path / "own.zip", CRUISE, cls.__name__, None), model, OBSERVATIONS)
-
-
-def test_statistics_of_rewards_alone_leave_observations_as_they_are(tmp_path):
-    model, _ = saved_with_statistics(tmp_path, norm_obs=False)
-    agent = load_sb3_zip(tmp_path / "own.zip", CRUISE, "PPO", tmp_path / "vecnormalize.pkl")
-    assert_acts_as(agent, model, OBSERVATIONS)
-
-
-def test_statistics_of_other_observations_are_refused(tmp_path):
-    saved(tmp_path)
-    VecNormalize(SB3VecEnv(LoopConfig(env="ncs_gym/CartPole-v0").vector(2))).save(str(tmp_path / "other.pkl"))
-    with pytest.raises(AgentError, match=r"does not load as an agent by PPO in .*shape"):
-        load_sb3_zip(tmp_path / "own.zip", CRUISE, "PPO", tmp_path / "other.pkl")
-
-
 class OwnPolicy(ActorCriticPolicy):
     pass
 

@@ -135,7 +135,7 @@ def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, dat
 
 
 @given(extra=st.dictionaries(st.text(max_size=5), st.none() | st.integers() | st.text(max_size=5), max_size=3))
-@examples(30)
+@examples(10)
 def test_documents_of_any_structure_are_refused(tmp_path_factory, extra):
     path = tmp_path_factory.getbasetemp() / "any.json"
     for document in (extra, [extra], {"format": "ncs-gym certificate 3"} | extra, {"certificate": extra, "sha256": ""}):

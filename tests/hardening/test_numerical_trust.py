@@ -60,13 +60,6 @@ def judged(plant, contract=None):
 
 
 @pytest.mark.slow
-@given(plant=plants(most_states=3, most_inputs=2, radius=(0.9, 0.9999)))
-@examples(12)
-def test_random_plants_get_a_certificate_or_a_reason(plant):
-    judged(plant)
-
-
-@pytest.mark.slow
 @given(plant=plants(radius=(0.5, 0.9999)))
 @examples(150, same=False)
 def test_many_random_plants_get_a_certificate_or_a_reason(plant):

@@ -19,21 +19,15 @@ import numpy as np
 import pytest
 
 import ncs_gym
-from agents import Agent
-from ncs_gym import ChannelContract
-from shields import Certificate, verify
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.certificates import ROOT, certificate_of
-from tests.product import altered, family_of, linear_plant, safety_filter, sampled_plant, synthesize
-from tests.second_verifier.verify import verify_again
+from tests.product import altered, family_of, linear_plant, safety_filter
 
 on_x86 = pytest.mark.skipif(
     platform.machine() not in ("x86_64", "AMD64"), reason="only x86 has kernels that can be chosen"
 )
 
-KERNELS = ("Haswell", "SkylakeX", "Sandybridge", "Nehalem", "Prescott")
 WIDE = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3"
-IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleNonlinear")
 
 
 @cache
@@ -42,29 +36,6 @@ def can_run(kernels: str) -> bool:
     product = "import numpy as np; np.ones((64, 64)) @ np.ones((64, 64)); np.linalg.inv(np.eye(64))"
     environment = os.environ | {"OPENBLAS_CORETYPE": kernels}
     return subprocess.run([sys.executable, "-c", product], env=environment, capture_output=True).returncode == 0
-
-
-def random_plant(index):
-    """Returns a plant, and a contract where it is unstable and for half of the others."""
-    rng = np.random.default_rng([7, index])
-    n, m = 2 + index % 5, 1 + index // 5 % 2
-    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
-    is_stable = index % 3 != 0
-    if is_stable:
-        A = A - 0.5 * float(np.abs(A).sum(axis=1).max()) * np.eye(n)
-    bounds = {"disturbance_bound": 0.004 * np.ones(n), "sensor_bound": 0.003 * np.ones(n), "initial_bound": 0.003}
-    model = (A, B, np.eye(n), np.zeros((n, m)))
-    plant = sampled_plant(model, 0.1, box=np.ones(n), u_max=np.full(m, 2.0), **bounds)
-    return plant, ChannelContract(1 + index % 3) if index % 2 or not is_stable else None
-
-
-def all_plants():
-    """Registered and random plants by name, with the contracts of their certificates."""
-    registered = {name: gym.make(f"ncs_gym/{name}-v0").unwrapped for name in IDS}
-    found = {name: (env.plant, env.certificate_contract) for name, env in registered.items()}
-    for index in range(50):
-        found[f"random plant {index}"] = random_plant(index)
-    return found
 
 
 def plants_around_points():
@@ -91,41 +62,6 @@ def print_points():
     print(json.dumps({name: plant.fingerprint for name, plant in plants_around_points().items()}))
 
 
-def derived(plant):
-    """Every number that a proof takes from a plant, as text."""
-    bounds = (plant.disturbance, plant.sensor_error_with(0.01), plant.initial_error)
-    numbers = [plant.fingerprint, *(bound.shape_matrix.tolist() for bound in bounds)]
-    return json.dumps([*numbers, plant.relative_weight.tolist(), plant.initial_radius_squared, plant.u_max.tolist()])
-
-
-def print_plants():
-    print(json.dumps({name: derived(plant) for name, (plant, _) in all_plants().items()}))
-
-
-def print_verdicts(folder):
-    """Prints which certificates in a folder verify, by both verifiers."""
-    plants = all_plants()
-    for file in sorted(Path(folder).glob("*.json")):
-        certificate, plant = Certificate.load(file), plants[file.stem][0]
-        print(file.stem, all(judge(certificate, plant).valid for judge in (verify, verify_again)))
-
-
-def print_plants_and_verdicts(folder):
-    print_plants()
-    print_verdicts(folder)
-
-
-def make_certificates(folder):
-    """Saves a certificate of every plant that has one."""
-    from shields import Infeasible
-
-    for name, (plant, contract) in all_plants().items():
-        try:
-            synthesize(plant, contract=contract).save(Path(folder) / f"{name}.json")
-        except Infeasible:
-            continue
-
-
 def under(kernels, *command, wide=True):
     """What a command prints in a process with other kernels, and without numpy's wide instructions unless `wide`."""
     if not can_run(kernels):
@@ -145,56 +81,12 @@ def call(function, *arguments):
 
 
 @on_x86
-@pytest.mark.parametrize(
-    ("kernels", "wide"),
-    [("Prescott", False), ("Haswell", True), ("SkylakeX", True)],
-)
-@pytest.mark.slow  # what proves runs on other kernels as a whole, too: `make test-other-processor`
-def test_plants_are_the_same_numbers_under_other_kernels_and_their_certificates_verify(kernels, wide, tmp_path):
-    for name in IDS:
-        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-        certificate_of(env.plant, env.certificate_contract).save(tmp_path / f"{name}.json")
-    numbers, *verdicts = under(kernels, *call(print_plants_and_verdicts, tmp_path), wide=wide).splitlines()
-    assert json.loads(numbers) == {name: derived(plant) for name, (plant, _) in all_plants().items()}
-    assert verdicts == [f"{name} True" for name in sorted(IDS)]
-
-
-@on_x86
 @pytest.mark.slow
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 def test_operating_points_that_are_found_are_the_same_under_other_kernels(wide):
     expected = {name: plant.fingerprint for name, plant in plants_around_points().items()}
     assert json.loads(under("Prescott", *call(print_points), wide=wide)) == expected
-
-
-@on_x86
-@pytest.mark.slow
-@pytest.mark.parametrize("maker", KERNELS)
-def test_certificates_of_every_plant_verify_under_all_kernels(tmp_path, maker):
-    under(maker, *call(make_certificates, tmp_path))
-    made = sorted(file.stem for file in tmp_path.glob("*.json"))
-    assert set(IDS) <= set(made)
-    assert len(made) >= 40
-    for judge in filter(can_run, KERNELS):
-        assert under(judge, *call(print_verdicts, tmp_path)) == "".join(f"{name} True\n" for name in made)
-
-
-@on_x86
-@pytest.mark.slow
-def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path):
-    compare = ("-m", "experiments", "compare", "--env", "ncs_gym/BatchReactor-v0", "--out", tmp_path, "--jobs", "1")
-    compare += ("--steps", "64", "--episodes", "2", "--seeds", "1", "--arms", "shielded", "--baselines", "lqr")
-    compare += ("--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")
-    under("Haswell", *compare)
-    files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("runs/*.json")}
-    assert files
-    under("Prescott", *compare, wide=False)
-    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("runs/*.json")} == files
-    (folder,) = {file.parent for file in tmp_path.rglob("model.zip")}
-    load = f"from agents import Agent; print(Agent.load({str(folder)!r}).env)"
-    assert under("Prescott", "-c", load) == "ncs_gym/BatchReactor-v0\n"
-    assert Agent.load(folder).env == "ncs_gym/BatchReactor-v0"
 
 
 @pytest.mark.parametrize(

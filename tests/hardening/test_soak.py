@@ -112,12 +112,6 @@ def test_long_runs_of_estimators_do_not_drift(loaded):
 
 
 @pytest.mark.slow
-def test_ten_million_steps_do_not_grow(loaded):
-    assert growth(vector_env(1024, plant=loaded, channel=CHANNEL, max_episode_steps=EPISODE), 9800, 2000) < MOST_GROWTH
-    assert growth(loop_env(loaded, CHANNEL), 1_000_000, 20_000) < MOST_GROWTH
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 256])
 def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, forgotten, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 4000)

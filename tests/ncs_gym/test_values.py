@@ -1,14 +1,12 @@
 """A plant of a model, limits and bounds: what follows from them, their documents, and what they refuse."""
 
 import json
-import warnings
 from array import array
 from collections import deque
 from dataclasses import replace
 from fractions import Fraction
 from typing import NamedTuple
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -16,39 +14,17 @@ from ncs_gym import (
     Ball,
     Bounds,
     Box,
-    Channel,
-    Ellipsoid,
     Gaussian,
     Limits,
     LinearPlant,
     Model,
-    MovedOperatingPointWarning,
-    Remainder,
-    Sum,
     Through,
     linear_model,
 )
-from shields import SafetyShield
 
-MOTOR = [[0.0, 1.0], [0.0, -20.0]], [[0.0], [40.0]], [[1.0, 0.0]]
 A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.5]])
 MODEL, ABOUT = Model(A, B, None, dt=0.1), Model(A, B, None, dt=0.1, at=([1.0, 2.0], 0.5))
 LIMITS, BOUNDS = Limits(state=[1.0, 2.0], input=1.0), Bounds([0.01, 0.02], 0.01, 0.02)
-
-
-def servo():
-    return LinearPlant(
-        Model.sampled([[0, 1], [0, -20]], [[0], [40]], [[1, 0]], dt=0.005),
-        Limits(state=[0.2, 4.0], input=12.0),
-        Bounds(disturbance=[0, 0.25], sensor=5e-4, first_error=[1e-3, 0.05]),
-    )
-
-
-def test_servo_is_shielded():
-    channel = Channel(loss=0.3, max_consecutive_losses=2)
-    env = SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=servo(), channel=channel))
-    env.reset(seed=0)
-    assert env.step(np.zeros(1, np.float32))[4]["shield_guaranteed"]
 
 
 def around_a_point():
@@ -100,16 +76,6 @@ def test_gaussian_noise_counts_own_states_alone():
         assert not samples[:, 2:].any()
 
 
-def test_disturbance_with_two_ends_moves_the_point():
-    model, ends = Model.sampled(*MOTOR, dt=0.005), ([-0.1], [0.3])
-    E = model.held([[0.0], [1.0]])
-    with pytest.warns(MovedOperatingPointWarning):
-        plant = LinearPlant(model, LIMITS, Bounds(Through(E, Box(*ends)), 0.01, 0.02))
-    x, u = plant.operating_state, plant.operating_input
-    np.testing.assert_allclose(plant.A @ x + plant.B @ u + E @ [0.1], x, atol=1e-12)
-    np.testing.assert_allclose(plant.disturbance_bound.shape_matrix, 0.04 * E @ E.T, rtol=1e-6, atol=1e-20)
-
-
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("seed", [3, 10, 18])
 def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
@@ -127,34 +93,6 @@ def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
     x, u = ([*map(Fraction, each.tolist())] for each in (plant.operating_state, plant.operating_input))
     terms = zip(times(plant.A, x), times(plant.B, u), push, x, strict=True)
     assert plant.disturbance.gauge([float(Ax + Bu + d - own) for Ax, Bu, d, own in terms]) <= 1.0
-
-
-PLANTS = {
-    "servo": servo,
-    "around a point": around_a_point,
-    "late": lambda: LinearPlant(MODEL.with_delays(2), Limits([1.0, 2.0], 1.0, rate=0.3), BOUNDS),
-    "at all times": lambda: LinearPlant(
-        Model.sampled(*MOTOR, dt=0.005), Limits([0.2, 4.0], 12.0, between_samples=4), Bounds([0.0, 0.25], 5e-4, 1e-3)
-    ),
-    "sums": lambda: LinearPlant(
-        MODEL,
-        LIMITS,
-        Bounds(Ball(0.01) + Gaussian(1e-6 * np.eye(2), 0.1), Ellipsoid(np.eye(2)), Through([[1], [2]], 0.1)),
-    ),
-    "remainder": lambda: LinearPlant(
-        MODEL, LIMITS, Bounds(Sum((0.01, Remainder(Ellipsoid(1e-4 * np.eye(2)), True, "inf"))), 0.0, 0.0)
-    ),
-}
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_document_of_a_plant_makes_it_again(name):
-    plant = PLANTS[name]()
-    document = json.loads(json.dumps(plant.document, allow_nan=False))
-    again = LinearPlant.load(document)
-    assert again.fingerprint == plant.fingerprint
-    assert again.document == plant.document
-    assert replace(plant).fingerprint == plant.fingerprint
 
 
 class Pair(NamedTuple):
@@ -183,13 +121,6 @@ def test_sets_of_a_plant_hold_the_sum_of_all_that_is_declared():
     directions = np.random.default_rng(0).standard_normal((100, 2))
     for around in (plant.disturbance, plant.sensor_error, plant.initial_error):
         assert (around.support(directions) >= both.sized(2).support(directions)).all()
-
-
-def test_zero_is_said_on_purpose_and_warns_of_nothing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        plant = LinearPlant(MODEL, LIMITS, Bounds(0, 0, 0))
-    assert len(plant.assumptions) == 3
 
 
 @pytest.mark.parametrize(

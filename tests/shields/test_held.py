@@ -80,7 +80,7 @@ def test_loop_rests_unchanged_just_inside_and_is_overridden_just_outside(name, k
             for end, x, u in zip(found.deviations, found.states, found.inputs, strict=True):
                 assert x[state] == pytest.approx(end, abs=1e-12)
                 x, u = (of + (1.0 - NEAR) * (at - of) for at, of in zip((x, u), middle, strict=True))
-                for _ in range(20):
+                for _ in range(8):
                     decision = shield.decide(x, shape, u)
                     assert decision.proved
                     assert not decision.intervened

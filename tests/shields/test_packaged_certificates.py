@@ -1,11 +1,8 @@
 """Certificates that come with the package: one for every registered plant and contract, and none for another."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -147,15 +144,3 @@ def test_what_has_verified_is_not_verified_again_and_what_is_changed_is(monkeypa
     object.__setattr__(worn, "box", 100.0 * worn.box)  # as nobody should, after the fingerprint was computed
     with pytest.raises(CertificateError):
         require_valid(certificate, worn)
-
-
-def test_first_shield_of_a_registered_environment_imports_no_optimizer():
-    code = """if True:
-        import sys
-        import gymnasium as gym
-        from shields import SafetyShield
-        SafetyShield(gym.make("ncs_gym:ncs_gym/CartPole-v0")).reset(seed=0)
-        assert "scipy.optimize" not in sys.modules
-        assert "cvxpy" not in sys.modules
-    """
-    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).resolve().parents[2], check=True)

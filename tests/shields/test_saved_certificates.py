@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import LinearPlant
-from ncs_gym.limits import MOST_POINTS
-from shields import Certificate, CertificateError, Infeasible, verify
+from shields import Certificate, CertificateError, Infeasible
 from shields.polytope import MOST_MULTIPLIERS, MOST_ROWS, Polytope
 from shields.synthesis import invariant_polytope
-from tests.product import altered, linear_plant, sampled_plant, synthesize
+from tests.product import altered, linear_plant
 
 
 def with_polytope(certificate, rows, multipliers, seed=0):
@@ -51,31 +50,10 @@ def test_search_ends_with_no_more_rows_than_a_polytope_may_have(monkeypatch):
         invariant_polytope.invariant_faces(faces, predecessor, 2)
 
 
-@pytest.mark.slow
-def test_certificate_of_a_box_of_many_rows_at_most_points_is_read_again(tmp_path):
-    angles = 0.05 + np.linspace(0.0, np.pi, 13, endpoint=False)
-    model = [[-0.5, 1.0], [-1.0, -0.5]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1))
-    plant = sampled_plant(
-        model,
-        0.1,
-        box=np.column_stack([np.cos(angles), np.sin(angles)]),
-        u_max=0.5,
-        disturbance_bound=0.001,
-        sensor_bound=0.001,
-        initial_bound=0.001,
-        between_samples=MOST_POINTS,
-    )
-    certificate = synthesize(plant)
-    assert len(certificate.polytope.multipliers) > 2 * MOST_ROWS
-    certificate.save(tmp_path / "c.json")
-    assert Certificate.load(tmp_path / "c.json") == certificate
-    assert verify(Certificate.load(tmp_path / "c.json"), plant).valid
-
-
 sizes = st.floats(-75.0, 75.0).map(lambda power: 10.0**power) | st.sampled_from([1e-75, 1e-37, 1e37, np.inf])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(box=st.lists(sizes, min_size=2, max_size=2), u_max=sizes, bounds=st.lists(sizes, min_size=3, max_size=3))
 def test_every_plant_that_can_be_made_is_read_again(box, u_max, bounds, tmp_path_factory):
     names = ("disturbance_bound", "sensor_bound", "initial_bound")
@@ -94,9 +72,3 @@ def test_every_plant_that_can_be_made_is_read_again(box, u_max, bounds, tmp_path
     plant.save(path)
     assert LinearPlant.load(path).fingerprint == plant.fingerprint
     assert altered(plant).fingerprint == plant.fingerprint
-
-
-def test_half_width_whose_row_is_out_of_range_is_refused_at_once():
-    """1 / 1e-75 is the largest number that rows may not have."""
-    with pytest.raises(ValueError, match="half-widths"):
-        linear_plant(A=[[0.5]], B=[[1.0]], box=1e-75, u_max=1.0, dt=1.0, disturbance_bound=0.0, sensor_bound=0.0)

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.site.hooks import site_hook
-
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -24,38 +22,9 @@ def formulas(page):
     return parts[1::2], blocks
 
 
-def test_proofs_have_formulas():
-    lines, blocks = formulas(ROOT / "docs" / "shield_proof.md")
-    assert len(lines) > 100
-    assert len(blocks) > 10
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_formulas_in_a_line_are_left_alone_by_markdown(page):
     for formula in formulas(page)[0]:
         assert formula == formula.strip() != "", formula
         assert not NOT_INLINE.search(formula), formula
         assert formula.count("{") == formula.count("}"), formula
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_formulas_become_mathml(page):
-    pytest.importorskip("math_core", reason="the extra [docs] is not installed")
-    hook = site_hook("mathml")
-    lines, blocks = formulas(page)
-    text = hook.on_page_markdown("".join(f"```math\n{block}```\n" for block in blocks))
-    assert text.count("$$") == 2 * len(blocks)
-    content = "".join(f'<span class="arithmatex">\\({each}\\)</span>' for each in lines)
-    content += "".join(f'<div class="arithmatex">\\[\n{each}\\]</div>' for each in blocks)
-    made = hook.on_page_content(content)
-    assert made.count("<math") == len(lines) + len(blocks)
-    assert made.count('<div class="formula">') == len(blocks)
-    assert "arithmatex" not in made
-
-
-def test_options_and_ids_stay_on_one_line():
-    hook = site_hook("unbroken")
-    block = "<pre><span></span><code>ncs train --seed 1</code></pre>"
-    made = hook.on_page_content(f"<p>a--b <code>ncs train --a2c.n-steps 1 ncs_gym/CartPole-v0</code></p>{block}")
-    kept = '<span class="unbroken">--a2c.n-steps</span> 1 <span class="unbroken">ncs_gym/CartPole-v0</span>'
-    assert made == f"<p>a--b <code>ncs train {kept}</code></p>{block}"

@@ -56,6 +56,7 @@ def test_finished_runs_are_kept_and_not_executed_again(tmp_path, capsys):
     assert "2 of 3 runs were finished before" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_first_failure_stops_the_others_is_named_and_keeps_what_is_finished(tmp_path):
     works = Small("a", "work", tmp_path)
     others = [Small("b", "wait", tmp_path), Small("c", "fail", tmp_path, awaits="b began")]
@@ -101,9 +102,8 @@ def command(folder):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sessions are POSIX's")
-@pytest.mark.parametrize(
-    ("send", "number"), [(os.killpg, signal.SIGINT), pytest.param(os.kill, signal.SIGTERM, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("send", "number"), [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM)])
 def test_stop_keeps_what_is_finished_and_is_one_line(send, number, tmp_path):
     process = command(tmp_path)
     send(process.pid, number)  # Ctrl-C reaches the whole group

@@ -165,31 +165,6 @@ def test_killed_driver_leaves_no_process_and_goes_on_where_it_was(local, tmp_pat
     assert_same(out, local)
 
 
-@pytest.mark.parametrize(
-    ("send", "number"),
-    [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM)],  # Ctrl-C reaches the whole group
-    ids=["Ctrl-C", "SIGTERM"],
-)
-def test_interrupted_driver_stops_everything_and_keeps_what_is_finished(tmp_path, send, number):
-    out = tmp_path / "out"
-    run = started("sweep", *GRID, "--engine", "ray", "--out", out)
-    until_stored(out, 1, run)
-    processes = descendants(run.pid)
-    send(run.pid, number)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode == 130
-    assert errors.strip().splitlines()[-1] == "ncs: interrupted"
-    assert "Traceback" not in errors
-    until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
-    assert 1 <= stored(out) < RUNS
-
-
-def test_error_of_a_run_is_not_retried_and_named(tmp_path):
-    run = Small("its-name", "fail", tmp_path)
-    with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1"):
-        results_of([run], tmp_path, BackendSettings(engine="ray"))
-
-
 def test_worker_that_always_dies_is_given_up_and_named(tmp_path):
     run = Small("its-name", "die", tmp_path)
     with pytest.raises(RunError, match="worker processes died in its-name"):

@@ -10,7 +10,6 @@ from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import FILTERS, EstimateFilterSettings, controller
 from experiments.baselines.filters import CertaintyEquivalentFilter, PredictiveFilter
-from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from tests.certificates import certificate_of
 from tests.plants import delayed
@@ -63,26 +62,11 @@ def tank(env_id="ncs_gym/CSTR-v0"):
 
 def violating(loop, certificate, name, episodes=40, **settings):
     """Violating episodes of a regulator behind a filter."""
-    if name in FILTERS:
-        loop = replace(loop, filter=EstimateFilterSettings(name, certificate))
-    elif name:
-        loop = replace(loop, shield=ShieldSettings(certificate, name, 0.0, None, "ignore"))
+    loop = replace(loop, filter=EstimateFilterSettings(name, certificate))
     policy = controller("lqr", ncs_env(loop.single()), certificate.fallback, 0)
     return sum(
         each.violation_steps > 0 for each in evaluate(loop.with_kwargs(**settings), policy, episodes, 7).episodes
     )
-
-
-@pytest.mark.slow
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("name", ["psf", "trusting"])
-def test_margins_keep_the_box_on_an_ideal_channel_and_larger_ones_keep_it_longer_on_the_real_one(name):
-    loop, env, certificate = tank()
-    attack = {"noise": "extreme", "disturbance": "adversarial"}
-    bursts = replace(env.channel, loss=1.0)
-    assert violating(loop, certificate, f"{name}:10", channel=Channel(), **attack) == 0
-    small, large = (violating(loop, certificate, f"{name}:{each}", channel=bursts, **attack) for each in (10, 40))
-    assert large < small - 5
 
 
 @pytest.mark.slow
@@ -146,7 +130,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(kind, cer
     rng, found = np.random.default_rng(3), 0
     first, second = (each.ravel()[:, None] for each in np.meshgrid(grid, grid, indexing="ij"))
     (low, high), widths = plant.own_limits, plant.half_widths
-    for _ in range(60):
+    for _ in range(40):
         estimate = rng.uniform(low - 0.3 * widths, high + 0.3 * widths)
         proposed = rng.uniform(*plant.input_ends)
         one = plant.A @ estimate + first @ plant.B.T
@@ -172,7 +156,7 @@ def test_predictive_filter_keeps_limits_with_two_ends_and_of_states_and_inputs_t
         np.zeros(plant.n),
     )
     state, reached, alone = np.zeros(plant.n), [], []
-    for k in range(240):
+    for k in range(160):
         if k % 20 == 0:
             proposed = np.where(rng.random(plant.m) < 0.5, *plant.input_ends)
         u = predictive(state[None], proposed[None], np.array([k == 0]))[0]

@@ -40,7 +40,7 @@ def fallback(env):
     return Fallback.of_gain(np.zeros((env.plant.m, env.plant.n)))
 
 
-def offset(env, name, steps=400):
+def offset(env, name, steps=250):
     """How far the output is from its target in the mean of the last steps, in units of the target's range."""
     policy, (observation, info) = controller(name, env, fallback(env), 0, WEIGHTS), env.reset(seed=0)
     errors = []
@@ -109,7 +109,7 @@ def test_without_gain_the_observer_changes_nothing(env_id):
     env, loop = ncs_env(gym.make(env_id)), LoopConfig(env=env_id)
     for name in ("lqr", "mpc"):
         nothing, observed, plain = (
-            [each.episode_return for each in evaluate(loop, controller(*made), 3, 0).episodes]
+            [each.episode_return for each in evaluate(loop, controller(*made), 2, 0).episodes]
             for made in (
                 (f"{name}:observer", env, fallback(env), 0, RegulatorWeights(disturbance=0.0)),
                 (f"{name}:observer", env, fallback(env), 0),

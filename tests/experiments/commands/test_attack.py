@@ -51,9 +51,7 @@ def test_table_has_every_channel_and_their_sum(tmp_path):
         assert rows[name.removeprefix("CartPole-v0, ")][5] == f"{counts['overridden'] / 1600:.1%}"
         assert counts["overridden"] > 0.25 * counts["steps"]
         assert counts["outside S"] == counts["guaranteed outside S"] == counts["lost"] == 0
-    again = succeeded("attack", "--env", CART, "--steps", 4_800)
-    other = succeeded("attack", "--env", CART, "--steps", 4_800, "--seed", 1)
-    assert rows_of(again) == rows != rows_of(other)
+    assert rows != rows_of(succeeded("attack", "--env", CART, "--steps", 4_800, "--seed", 1))
 
 
 def test_a_short_version_attacks_one_environment():
@@ -201,14 +199,6 @@ def test_first_errors_attain_the_declared_bound(bound, use):
     errors = first_errors(plant_with(initial_bound=bound))
     np.testing.assert_allclose(use(errors), 1.0, atol=1e-6)
     assert np.ptp(errors, axis=0).min() > 0.0
-
-
-def test_first_errors_attain_the_bound_of_a_covariance_and_of_what_is_declared_besides():
-    covariance = 1e-5 * np.eye(2)
-    alone, both = (plant_with(initial_cov=covariance, initial_bound=bound) for bound in (0.0, 0.02))
-    radius = np.sqrt(alone.initial_radius_squared)
-    np.testing.assert_allclose(np.linalg.norm(first_errors(alone), axis=1), radius, rtol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(first_errors(both), axis=1), radius + 0.02, rtol=1e-6)
 
 
 def assert_safe(counts):

@@ -1,14 +1,7 @@
 """Commands for a user's own plant: `--env module:id` and `--plant FILE`."""
 
 import json
-import os
-import pty
-import signal
-import subprocess
 import sys
-import termios
-import time
-from functools import partial
 
 import gymnasium as gym
 import pytest
@@ -16,8 +9,7 @@ import pytest
 from agents.hyperparams import complete_hyperparams
 from ncs_gym import truck_trailer
 from shields import Certificate
-from tests.command import assert_one_sentence, environment, ncs, succeeded, without_pictures
-from tests.plants import random_plant
+from tests.command import assert_one_sentence, ncs, succeeded, without_pictures
 from tests.verdicts import verified
 
 MODULE = """
@@ -162,36 +154,3 @@ def test_plant_of_a_file_is_no_environment(command, tmp_path, certificate):
     assert_one_sentence(missing, "cannot read the plant in ", "nowhere.json: No such file or directory")
     wrong = ncs(*command, "--plant", "certificate.json", cwd=tmp_path)
     assert_one_sentence(wrong, "certificate.json is not a plant of format")
-
-
-def read_until(terminal, words, seconds=120.0):
-    """What a terminal shows until it has shown some words, or nothing more comes."""
-    seen, start = "", time.monotonic()
-    while words not in seen and time.monotonic() - start < seconds:
-        try:
-            seen += os.read(terminal, 4096).decode()
-        except OSError:  # the other end is closed
-            break
-    return seen
-
-
-@pytest.mark.slow
-def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_path):
-    (tmp_path / "slow.py").write_text(
-        "from ncs_gym import register_plant\nfrom tests.plants import random_plant\n"
-        "register_plant('Plants/Slow-v0', random_plant(0, 12, 3))\n"
-    )
-    ours, theirs = pty.openpty()
-    termios.tcsetwinsize(theirs, (24, 110))
-    command = [sys.executable, "-m", "experiments", "synthesize", "--env", "slow:Plants/Slow-v0"]
-    listening = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # ignored by what a shell runs in the background
-    quiet = {"stderr": theirs, "stdout": subprocess.DEVNULL, "preexec_fn": listening}
-    process = subprocess.Popen(command, cwd=tmp_path, env=environment(), **quiet)
-    os.close(theirs)
-    read_until(ours, "of the box ellipsoid's volume [00:")
-    process.send_signal(signal.SIGINT)
-    end = read_until(ours, "certificate.json\r\n")
-    assert process.wait(60) == 130
-    assert "ncs: interrupted: the best certificate so far, which verifies (" in end
-    assert verified(Certificate.load(tmp_path / "certificate.json"), random_plant(0, 12, 3)).valid
-    os.close(ours)

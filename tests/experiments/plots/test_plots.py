@@ -1,12 +1,11 @@
 """Figures of a comparison: one test per figure and kind of data, of everything that it shows."""
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_hex
 
 from agents.results import TrainingPoint
 from experiments.analysis.episodes import episodes_table
@@ -18,18 +17,9 @@ from experiments.plots.comparison_figures import (
     comparison_figures,
     most_overridden,
 )
-from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, arm_styles, thousands
+from experiments.plots.figure_style import ArmStyle, arm_styles, thousands
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
-
-# Linear approximations of how the two common kinds of color blindness see (Machado, Oliveira and Fernandes 2009).
-DEUTERANOPIA = np.array(
-    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]]
-)
-PROTANOPIA = np.array(
-    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-)
-
 
 EPISODE = ShownEpisode(0, "as trained", 0, {"unshielded": trajectory(np.zeros((3, 2)))})
 
@@ -76,14 +66,6 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
     assert ArmStyle.of("shielded:switch+penalty").color == ArmStyle.of("shielded:switch").color
-
-
-@pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
-def test_color_blind_readers_can_tell_the_colors_apart(seen):
-    linear = {arm: np.power(to_rgb(color), 2.2) for arm, (color, _) in ARM_COLORS_AND_MARKERS.items()}
-    shown = {arm: np.power(np.clip(seen @ color, 0.0, 1.0), 1 / 2.2) for arm, color in linear.items()}
-    for one, other in combinations(shown, 2):
-        assert np.linalg.norm(shown[one] - shown[other]) > 0.1, (one, other)
 
 
 def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watching_arms():
@@ -196,7 +178,7 @@ def test_scatter_without_a_violation_shows_what_the_probability_is_at_most_and_o
 
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
-    shown = arms(*ALL_ARMS[:5])
+    shown = arms(*ALL_ARMS[:2])
     figures = comparison_figures(plant, summary_of(shown), shown, EPISODE)
     assert set(figures) == {"training", "scatter", "episode"}
     assert all(png.startswith(b"\x89PNG") for _, png in figures.values())

@@ -7,7 +7,7 @@ from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from benchmarks.study import ENVS, TRAINED
 from experiments.baselines import EstimateFilter, tuned_training
 from experiments.runs.arms import Arm, run_of_arm
-from experiments.runs.loops import certificate_of, loop_config
+from experiments.runs.loops import certificate_of
 from experiments.settings import CompareSettings
 from shields import VectorSafetyShield
 
@@ -109,19 +109,3 @@ def test_every_arm_plays(run_of, name):
     assert (result.arm, len(result.episodes)) == (name, 2)
     assert result.train_steps == (0 if name.startswith("lqr") else 256)
     assert (result.episodes[0].guaranteed, result.episodes[1].guaranteed) == (2 * (name[:6] == "shield",))
-
-
-@pytest.mark.slow
-def test_predictive_filter_acts_on_trained_agents_in_training_or_at_test_alone():
-    tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
-    settings, loop = CompareSettings(steps=512, episodes=2, hyperparams=tiny), loop_config("ncs_gym/BatchReactor-v0")
-    certificate = certificate_of(loop)
-    unshielded, filtered, at_test = (
-        run_of_arm(settings, loop, certificate, name, 0).execute(lambda steps: None)
-        for name in ("unshielded", "psf", "psf at test")
-    )
-    assert [each.train_interventions > 0 for each in (unshielded, filtered, at_test)] == [False, True, False]
-    assert at_test.history == unshielded.history != filtered.history
-    overridden = [sum(episode.interventions for episode in each.episodes) for each in (unshielded, filtered, at_test)]
-    assert [count > 0 for count in overridden] == [False, True, True]
-    assert not any(episode.guaranteed for each in (filtered, at_test) for episode in each.episodes)  # it proves nothing

@@ -77,7 +77,7 @@ def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
 )
 def test_mean_loss_is_the_share_that_is_lost_in_the_long_run(loss, period, most):
     channel, rng = Channel(loss=loss, send_period=period, max_consecutive_losses=most), np.random.default_rng(0)
-    size, steps = 2000, 600
+    size, steps = 1000, 400
     state, sent, lost = packet_loss_and_delay.first_loss_state(channel, rng, size), 0, 0
     for k in range(steps):
         state, delays = packet_loss_and_delay.transmit(channel, rng, state, np.full(size, k % period == 0))

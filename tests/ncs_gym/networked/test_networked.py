@@ -567,7 +567,7 @@ def test_pending_actions_are_all_that_the_newest_sample_usually_lacks(channel):
     assert channel.oldest_age is None  # no contract says how many
     envs = VectorNetworked(SyncVectorEnv([Counter] * 20), channel, observe="pending_actions")
     envs.reset(seed=0)
-    ages = np.array([envs.step(np.zeros((20, 1)))[-1]["measurement_age"] for _ in range(1200)][200:])
+    ages = np.array([envs.step(np.zeros((20, 1)))[-1]["measurement_age"] for _ in range(700)][200:])
     assert 0.005 < np.mean(ages > envs.pending) < 0.07
     assert np.mean(ages > envs.pending / 2) > 0.05  # no more of them than that takes
 

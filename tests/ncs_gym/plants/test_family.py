@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from ncs_gym import Ellipsoid, LinearPlant, Remainder, cart_pole, truck_trailer
 from ncs_gym.uncertainty.family import Family
@@ -22,12 +21,6 @@ TRUCKS = [truck_trailer(mass=mass) for mass in (3800.0, 4000.0, 4300.0)]
 HULL = family_of(TRUCKS)
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 SMALL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 2.0], "u_max": 3.0, "dt": 0.1} | QUIET
-
-
-@pytest.fixture
-def few_points(monkeypatch):
-    """Entries are looked at in few points, where it is not about them."""
-    monkeypatch.setattr("ncs_gym.plants.family.grid_size", lambda parameters: 9)
 
 
 def exact(matrix):
@@ -74,20 +67,6 @@ def between(function, ranges, count, seed=0):
     return [np.hstack([each.A, each.B]) for each in plants]
 
 
-def test_states_of_many_environments_are_moved_to_the_operating_point_and_back():
-    plant = linear_plant(
-        A=[[0.9]], B=[[0.1]], dt=0.1, state_limits=(1.0, 3.0), input_limits=(0.0, 1.0),
-        operating_state=2.0, operating_input=0.4,
-        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-    )  # fmt: skip
-    many = np.array([[0.5], [-0.25], [0.0]])
-    np.testing.assert_array_equal(plant.from_deviation(many), [[2.5], [1.75], [2.0]])
-    np.testing.assert_array_equal(plant.to_deviation(plant.from_deviation(many, "input"), "input"), many)
-    np.testing.assert_array_equal(plant.from_deviation([0.5]), [2.5])
-    with pytest.raises(ValueError, match=r"the state must have shape \(1,\)"):
-        plant.from_deviation(np.zeros((3, 2)))
-
-
 @pytest.mark.parametrize(
     ("plant", "members", "widths"),
     [
@@ -110,7 +89,7 @@ def test_members_inside_the_hull_leave_out_less_than_its_vertices():
     assert largest_gauge(HULL, beyond, (2.0, 2.0, 4.0)) > 1
 
 
-def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end(few_points):
+def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
     def of(gain, **more):
         limits = {"state_limits": ([-1.0, -2.0], [0.5, 2.0]), "input_limits": (-1.0, 3.0)}
         model = (SMALL["A"], [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1)
@@ -208,14 +187,6 @@ def _contract(plant):
     return {} if plant.spectral_radius < 1.0 else {"contract": ChannelContract(3)}
 
 
-def test_members_are_those_of_the_continuous_model():
-    for mass in (3800.0, 3931.7, 4200.0):
-        model = np.array([[0.0, 1.0, 0.0], [-4500.0 / mass, -4600.0 / mass, 1.0], [0.0, 0.0, 0.0]])
-        member = TRUCK.remainder.family.member(np.array([mass]))
-        np.testing.assert_allclose(member[:, :3], expm(0.5 * model)[:2], rtol=1e-12)
-        assert not member[:, 3].any()
-
-
 def tank(k, delay=0, level=None, **more):
     """h' = 0.5 q - k h, in absolute coordinates, at rest at 0.4 / k with q = 0.8; q may act later."""
     settings = {"state_limits": ([1.5], [2.5]), "input_limits": (0.0, 2.0), "input_delay": delay or None}
@@ -227,7 +198,7 @@ def tank(k, delay=0, level=None, **more):
 
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("kind", ["function", "plants"])
-def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay, few_points):
+def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay):
     def of(k):
         return tank(k, delay, offset=[0.0])
 
@@ -259,7 +230,7 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
         np.testing.assert_allclose(plant.from_deviation(info["state"])[0], 0.4 / k, atol=2e-3)
 
 
-def test_members_are_at_rest_where_somebody_says_so(few_points):
+def test_members_are_at_rest_where_somebody_says_so():
     def at_two(k):
         return tank(k, level=2.0)
 
@@ -278,7 +249,7 @@ def test_members_are_at_rest_where_somebody_says_so(few_points):
 
 
 @pytest.mark.parametrize("more", [{}, {"input_delay": 2}, {"du_max": 0.5}, {"input_delay": 1, "du_max": 0.4}])
-def test_members_may_rest_with_other_inputs(more, few_points):
+def test_members_may_rest_with_other_inputs(more):
     def cart(mass):
         model = ([[0.0, 1.0], [0.0, -0.5 / mass]], [[0.0], [1.0 / mass]], [[1.0, 0.0]], [[0.0]])
         limits = {"state_limits": ([0.0, -2.0], [2.0, 2.0]), "input_limits": (-2.0, 2.0)}
@@ -294,7 +265,7 @@ def test_members_may_rest_with_other_inputs(more, few_points):
     np.testing.assert_allclose(moves, [0.05 * 0.3 * 0.00495, 0.05 * 0.3 * 0.0976], rtol=0.1)
 
 
-def test_rounding_of_operating_points_is_no_step(few_points):
+def test_rounding_of_operating_points_is_no_step():
     def pushed(k):
         decay = np.exp(-0.5 * k)
         model = {"A": [[decay, 0.0], [0.0, 1.0]], "B": [[0.5 * (1.0 - decay) / k], [0.1]], "dt": 0.5}
@@ -366,7 +337,7 @@ def test_what_members_share_is_compared_inside_the_ranges(changed, name):
         env.reset(options={"parameters": {"angle": 0.0}})
 
 
-def test_two_ended_disturbances_move_each_member(few_points):
+def test_two_ended_disturbances_move_each_member():
     def pushed(k):
         return tank(k, disturbance_bound=([[1.0]], [-0.01], [0.03]))
 
@@ -417,13 +388,13 @@ def test_members_belong_to_the_point_that_they_are_in_deviations_from(known):
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
-def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low, few_points):
+def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low):
     def of(a):
         model = {"A": [[a]], "B": [[0.5]], "dt": 1.0, "box": [1.0], "u_max": 0.9, "sensor_bound": 0.01}
         return linear_plant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))
 
     family = family_of(of, {"a": (low, low + 0.25)}, monotone=True, at_rest=True).members
-    for value in np.linspace(low, low + 0.25, 77):
+    for value in np.linspace(low, low + 0.25, 25):
         assert family.member(np.array([value]))[0, 0] == value
 
 
@@ -442,7 +413,7 @@ def test_entries_that_are_not_monotone_are_found_on_the_grid_or_when_they_are_dr
         family_of(bent, {"mass": (0.0, 1.0)}, monotone=True)
     half = family_of(bent, {"mass": (0.0, 0.5)}, monotone=True)
     assert half.remainder.bound.shape_matrix[1, 1] > 0.0
-    env = loop_env(family_of(spiked, {"mass": (0.0, 1.0)}, monotone=True))
+    env = loop_env(family_of(spiked, {"mass": (0.0, 1.0)}, monotone=True, all_points=True))
     env.reset(options={"parameters": {"mass": 1.0 / 255}})
     with pytest.raises(ValueError, match=r"B\[1, 0\] at .* is not between those at the ends"):
         env.reset(options={"parameters": {"mass": 0.5 / 255}})

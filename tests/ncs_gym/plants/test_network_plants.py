@@ -1,21 +1,14 @@
 """The three plants at which the network decides: their equations, and certificates that are nearly used up."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import ChannelContract, Ellipsoid, contract_of
-from ncs_gym.envs.env import ncs_env
 from ncs_gym.model import zero_order_hold
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.stirred_tank import stirred_tank
-from shields import Infeasible, certificate_for, verify
-from tests.product import altered, synthesize
-from tests.second_verifier.verify import verify_again
-
-IDS = ("CSTR", "Convoy", "LaneKeeping")
+from tests.product import altered
 
 
 def test_tank_runs_away_at_the_rate_of_its_unstable_pole():
@@ -43,36 +36,3 @@ def test_their_model_in_continuous_time_is_the_one_that_was_sampled(plant):
     of_longer = zero_order_hold(*np.split(found.continuous_model, [found.n], axis=1), longer.dt)
     for own, other in zip(of_longer, (longer.A, longer.B), strict=True):
         np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", IDS)
-def test_certificate_at_all_times_exists_for_the_contract(name):
-    env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
-    plant = altered(env.plant, between_samples=4)
-    certificate = synthesize(plant, contract=env.contract)
-    assert certificate.polytope is not None
-    assert "in the safe box at all times" in str(certificate)
-    assert all(judge(certificate, plant).valid for judge in (verify, verify_again))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["LaneKeeping", *(pytest.param(each, marks=pytest.mark.slow) for each in IDS[:2])])
-def test_certificate_exists_for_the_contract_and_not_for_four_tenths_more_uncertainty(name):
-    env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
-    assert env.contract == contract_of(env.channel)
-    certificate = certificate_for(env.plant, env.contract)
-    assert verify(certificate, env.plant).valid
-
-    def grown(bound):
-        return Ellipsoid(1.4**2 * bound.shape_matrix)
-
-    plant = env.plant
-    more = altered(
-        plant,
-        disturbance_bound=grown(plant.disturbance_bound),
-        sensor_bound=grown(plant.sensor_bound),
-        initial_bound=grown(plant.initial_bound),
-    )
-    with pytest.raises(Infeasible):
-        synthesize(more, contract=ChannelContract(env.contract.max_age, 1.4 * env.contract.quantization_step))

@@ -24,19 +24,6 @@ def test_number_limits_every_state_alike_and_infinity_none():
     np.testing.assert_array_equal(linear_plant(**MODEL, box=[np.inf, 4.0]).box_rows, [[0.0, 0.25]])
 
 
-def test_rows_stay_what_they_are_when_a_plant_is_replaced():
-    plant = linear_plant(**MODEL, box=[2.0, 0.5])
-    np.testing.assert_array_equal(altered(plant, A=0.5 * np.eye(2)).box_rows, plant.box_rows)
-    np.testing.assert_array_equal(plant.box, plant.box_rows)
-
-
-def test_empty_lists_of_limits_are_none():
-    plain, empty = linear_plant(**MODEL, box=1.0), linear_plant(**MODEL, box=1.0, output_limits=[], mixed_limits=[])
-    assert plain.fingerprint == empty.fingerprint
-    with pytest.warns(ChosenLimitsWarning, match="no state has a limit"):
-        linear_plant(**MODEL, output_limits=[])
-
-
 def test_limits_around_an_operating_point_keep_both_ends():
     plant = linear_plant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
     np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-2.0, 5.0]])
@@ -79,22 +66,6 @@ def test_actions_reach_both_ends_and_never_beyond():
         assert high - 1e-15 * (high - low) <= (half * 1.0 + middle).item() <= high
 
 
-@pytest.mark.parametrize(
-    "rows",
-    [
-        [[0.5, 0.0], [0.0, 2.0]],
-        ([1, 1], [1, -1]),
-        [[1, 2], [3, 2]],
-        [[1, 2], [3, 4], [5, 6]],
-        np.array([[1.0, 2.0], [3.0, 4.0]]),
-        np.array([[-1.0, 1.0], [0.0, 2.0]]),
-        np.array([[-1.0, -2.0], [1.0, 3.0]]),
-    ],
-)
-def test_rows_of_two_states_that_cannot_be_limits_or_are_an_array_are_taken(rows):
-    np.testing.assert_array_equal(linear_plant(**MODEL, box=rows).box_rows, np.asarray(rows, dtype=np.float64))
-
-
 def test_a_number_stands_for_a_vector_of_one_entry():
     limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
     plant = linear_plant(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
@@ -107,35 +78,6 @@ def test_output_is_converted_by_the_output_matrix():
     plant = altered(linear_plant(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
     np.testing.assert_allclose(plant.to_deviation([41.0], "output"), [1.0])
     np.testing.assert_allclose(plant.from_deviation([1.0], "output"), [41.0])
-
-
-def test_deviations_obey_the_equations_of_the_plant():
-    plant = linear_plant(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
-    physical = plant.A @ [23.0] + plant.B @ [11.0]
-    moved = plant.A @ plant.to_deviation([23.0]) + plant.B @ plant.to_deviation([11.0], "input")
-    np.testing.assert_allclose(plant.from_deviation(moved), physical)
-
-
-def test_constant_of_the_model_makes_a_point_an_equilibrium():
-    settings = ROOM | {"operating_input": [4.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = linear_plant(**settings, offset=[1.2])
-    np.testing.assert_allclose(plant.input_ends, [[-4.0], [8.0]])
-
-
-def test_model_of_deviations_has_its_operating_point_wherever_it_was_linearized():
-    settings = ROOM | {"operating_state": [21.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = linear_plant(**settings)
-    np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-3.0, 4.0]])
-    np.testing.assert_allclose(plant.to_deviation([22.0]), [1.0])
-
-
-def test_one_sided_limits_leave_the_other_side_free():
-    settings = {"state_limits": ([0.0, -np.inf], [np.inf, 3.0]), "input_limits": (-1.0, 1.0)}
-    point = {"operating_state": [1.0, 1.0], "operating_input": [0.4]}
-    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
-    np.testing.assert_allclose(plant.box, [[1.0, 0.0], [0.0, 0.5]])
-    np.testing.assert_array_equal(plant.box_ends, [[-1.0, -np.inf], [np.inf, 1.0]])
-    np.testing.assert_allclose(plant.input_ends, [[-1.4], [0.6]])
 
 
 def test_own_limits_are_the_closest_of_each_state_alone():

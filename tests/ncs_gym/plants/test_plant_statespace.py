@@ -7,7 +7,6 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from tests.product import sampled_plant
 
@@ -55,14 +54,6 @@ def test_model_that_leaves_open_whether_it_is_in_discrete_time_is_refused(model,
         sampled_plant(model, dt, **REST)
 
 
-@pytest.mark.parametrize("kind", [signal.TransferFunction, lambda num, den: SimpleNamespace(num=num, den=den)])
-def test_transfer_functions_are_refused_since_limits_are_of_states(kind):
-    with pytest.raises(ValueError, match="is a transfer function, whose states would be nobody's"):
-        sampled_plant(kind([100.0], [1.0, 5.0, 0.0]), dt=0.02, **REST)
-    with pytest.raises(ValueError, match="is a transfer function"):
-        sampled_plant(signal.ZerosPolesGain([], [0.0, -5.0], 100.0), dt=0.02, **REST)
-
-
 @pytest.mark.parametrize("name", DISCRETE)
 def test_discrete_model_is_taken_as_it_is(name):
     plant = sampled_plant(DISCRETE[name], dt=0.1, **REST)
@@ -82,14 +73,6 @@ def test_model_takes_limits_around_an_operating_point():
     np.testing.assert_allclose(plant.box_ends[:, 2] / plant.box[2, 2], [-8.0, 4.0])  # of the input under way
     np.testing.assert_allclose(plant.operating_state, [1.0, 0.0, 2.0])
     np.testing.assert_allclose(plant.A @ plant.operating_state + plant.B @ [2.0], plant.operating_state)
-
-
-def test_limits_without_an_operating_point_are_around_zero():
-    settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")} | {"dt": 0.1}
-    limits = {"state_limits": ([-0.5, -1.0], [3.0, 1.0]), "input_limits": (-2.0, 3.0)}
-    plant = sampled_plant((A, B, C, D), **limits, **settings)
-    np.testing.assert_array_equal(plant.own_limits, limits["state_limits"])
-    np.testing.assert_array_equal(plant.input_ends, [[-2.0], [3.0]])
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])
@@ -137,13 +120,3 @@ def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():
     plain, plant = (sampled_plant((A, B, C, D), dt=0.1, input_delay=d, **(REST | noise)) for d in (0, 1))
     for direction in np.random.default_rng(0).standard_normal((100, 2)):
         assert plant.disturbance.support([*direction, 0.0]) >= (1 - 1e-9) * plain.disturbance.support(direction)
-
-
-def test_model_of_the_truck_is_the_registered_plant():
-    rate = np.array([[0.0, 1.0], [-4.5, -4.6]])
-    truck = truck_trailer()
-    plant = sampled_plant(
-        (rate, B, np.eye(2), np.zeros((2, 1))), dt=0.5, box=[2.0, 2.0], u_max=4.0, gamma=5e-4,
-        **{name: 1e-4 * np.eye(2) for name in ("process_noise_cov", "measurement_noise_cov", "initial_cov")},
-    )  # fmt: skip
-    assert plant.fingerprint == truck.fingerprint

@@ -5,7 +5,7 @@ import pytest
 from scipy import signal, sparse
 
 from ncs_gym import Ellipsoid, Regulation
-from ncs_gym.validation import MOST_EXPANDED, as_numbers, as_setting
+from ncs_gym.validation import MOST_EXPANDED, as_numbers
 from tests.product import linear_plant, sampled_plant
 
 A, B, C, D = np.array([[0.0, 1.0], [-2.0, -1.0]]), np.array([[0.0], [1.0]]), np.eye(2), np.zeros((2, 1))
@@ -30,13 +30,6 @@ def test_sparse_state_space_model_is_the_dense_one(kind):
     assert made.fingerprint == sampled_plant((*discrete, 0.1), **REST).fingerprint
 
 
-def test_sparse_feedthrough_is_told_of():
-    with pytest.raises(ValueError, match=r"D of the model must be zero.* got \[\[0.0\], \[1.0\]\]"):
-        sampled_plant((A, B, C, sparse.csr_matrix([[0.0], [1.0]])), 0.1, **REST)
-    with pytest.raises(ValueError, match=r"D of the model must be zero.* got 'no'"):
-        sampled_plant((A, B, C, "no"), 0.1, **REST)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_matrix_of_a_plant_may_be_sparse(kind):
     rows, covariance = np.array([[1.0, 0.0], [0.5, 1.0]]), np.diag([1e-4, 2e-4])
@@ -46,11 +39,6 @@ def test_every_matrix_of_a_plant_may_be_sparse(kind):
     assert made.fingerprint == linear_plant(**given, **rest).fingerprint
     np.testing.assert_array_equal(Ellipsoid(kind(covariance)).shape_matrix, covariance)
     np.testing.assert_array_equal(Regulation(state_cost=kind(covariance)).state_cost, covariance)
-
-
-def test_sparse_truth_values_and_complex_numbers_are_no_settings():
-    assert as_setting(sparse.csr_matrix([[True]])) is None
-    assert as_numbers(sparse.csr_matrix([[1j]])) is None
 
 
 def test_sparse_matrix_that_is_too_large_is_not_expanded():

@@ -191,7 +191,7 @@ def test_other_modes_keep_no_plan(mode, certificate, loaded):
 def test_horizon_of_one_is_mode_project(name):
     shield, rng = shield_of(name, 1), np.random.default_rng(3)
     project = safety_filter(shield.certificate, shield.plant, "project")
-    for x_hat, shape, proposed in zip(*situations(shield, rng, 200), strict=True):
+    for x_hat, shape, proposed in zip(*situations(shield, rng, 100), strict=True):
         decision, other = shield.decide(x_hat, shape, proposed), project.decide(x_hat, shape, proposed)
         np.testing.assert_allclose(decision.input, other.input, rtol=2.0**-23)
         assert decision.reason == other.reason
@@ -228,7 +228,7 @@ NO_PLANS = (
 
 def test_what_is_no_plan_counts_as_none_stored():
     shield, far = shield_of("cart-pole, polytope"), shield_of("cruise")
-    cases = situations(shield, np.random.default_rng(6), 60)
+    cases = situations(shield, np.random.default_rng(6), 40)
     expected = decisions(shield, cases)
     assert "projected" in {one.reason for one in expected}
     for stored in NO_PLANS:

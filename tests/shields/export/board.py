@@ -94,8 +94,10 @@ class Boards:
     """N filters of a folder; arrays have the filter as the first axis."""
 
     def __init__(self, folder: Path, count: int, n: int, m: int) -> None:
-        (folder / "shim.c").write_text(SHIM)
-        self._c = ctypes.CDLL(str(compiled(folder, "shim.c", out=f"shim{count}.so", flags=("-shared", "-fPIC"))))
+        if not (library := folder / "shim.so").exists():
+            (folder / "shim.c").write_text(SHIM)
+            compiled(folder, "shim.c", out="shim.so", flags=("-shared", "-fPIC"))
+        self._c = ctypes.CDLL(str(library))
         self._memory = ctypes.create_string_buffer(self._c.size() * count)
         self.count, self._n, self._m = count, n, m
 

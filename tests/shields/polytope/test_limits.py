@@ -50,8 +50,8 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), plant.mixed_rows])
     low = np.concatenate([P.low + reach, plant.mixed_ends[0] + own])
     high = np.concatenate([P.high - reach, plant.mixed_ends[1] - own])
-    estimates = P.center + (P.sample_boundary(rng, 80) - P.center) * rng.uniform(0.3, 1.1, (80, 1))
-    for estimate, proposed in zip(estimates, rng.uniform(*plant.input_ends, (80, plant.m)), strict=True):
+    estimates = P.center + (P.sample_boundary(rng, 50) - P.center) * rng.uniform(0.3, 1.1, (50, 1))
+    for estimate, proposed in zip(estimates, rng.uniform(*plant.input_ends, (50, plant.m)), strict=True):
         decision = shield.decide(estimate, shape, proposed)
         values = rows @ np.concatenate([estimate, proposed])
         left = min((values - low).min(), (high - values).min())

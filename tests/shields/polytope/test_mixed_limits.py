@@ -18,7 +18,6 @@ from tests.product import (
     gym_env,
     gym_vector_env,
     linear_plant,
-    rate_limited,
     safe_loop,
     safety_shield,
     sampled_plant,
@@ -118,26 +117,6 @@ def test_stable_plant_with_limits_of_rates_needs_no_contract():
     np.testing.assert_array_less(np.sqrt(found.error_shapes[:, 2, 2]), 1e-4)  # the past input is known
 
 
-def test_limits_of_rates_may_be_given_to_the_constructor():
-    model = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "dt": 0.1, **ONE_INPUT, **QUIET}
-    plant, other = linear_plant(**model, du_max=0.3), rate_limited(linear_plant(**model), 0.3)
-    assert plant.fingerprint == other.fingerprint
-    assert plant.state_names == other.state_names == ("x1", "x2", "u1 of 1 step ago")
-    with pytest.raises(ValueError, match="rate must be a positive number"):
-        linear_plant(**model, du_max=-1.0)
-
-
-def test_rates_may_be_given_per_second_and_for_a_plant_that_is_made():
-    plant = sampled_plant(MODEL, 0.1, **ONE_INPUT, **QUIET)
-    assert rate_limited(plant, 0.3).fingerprint == PLANTS["rates"].fingerprint
-    assert rate_limited(plant, 2.5, per="second").fingerprint == rate_limited(plant, 0.25).fingerprint
-    late = sampled_plant(MODEL, 0.1, input_delay=2, **ONE_INPUT, **QUIET)
-    assert rate_limited(late, 0.3).fingerprint == PLANTS["rates of a late input"].fingerprint
-    assert rate_limited(late, 0.3).n == late.n == plant.n + 2
-    assert "|u1 - u1 of 1 step ago| <= 0.3" in str(PLANTS["rates"])
-    assert "u1 of 1 step ago <= " not in str(PLANTS["rates"]).replace("|u1 - u1 of 1 step ago| <= 0.3", "")
-
-
 def test_limit_of_a_late_input_is_one_of_the_input_that_acts():
     limit = [([-0.5, -1.0], [1.0], -0.6, 0.4)]
     plant = sampled_plant(MODEL, 0.1, input_delay=2, mixed_limits=limit, **ONE_INPUT, **QUIET)
@@ -164,7 +143,7 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     both = replace(CONTRACT, max_age=CONTRACT.max_age + contract_of(downlink).max_age)
     shield = safety_shield(env, certificate_of(plant, both, "polytope"), mode)
     rng, guaranteed = np.random.default_rng(0), 0
-    for seed in range(5):
+    for seed in range(3):
         _, info = shield.reset(seed=seed)
         for _ in range(60):
             before = info["input"]
@@ -173,7 +152,7 @@ def test_limit_of_rates_is_kept_behind_a_downlink(mode):
                 assert info["cost"] == 0.0
                 assert np.abs(info["input"] - before).max() <= 0.3
             guaranteed += info["shield_guaranteed"]
-    assert guaranteed > 200
+    assert guaranteed > 120
 
 
 @pytest.mark.parametrize("name", ["rates", "rates of a late input"])
@@ -216,36 +195,6 @@ def test_plant_with_such_limits_has_none_that_are_only_symmetric():
     for name in ("u_max", "box_rows"):
         with pytest.raises(ValueError, match="the limits of this plant are not"):
             getattr(PLANTS["coupled"], name)
-
-
-REFUSED = {
-    "three of four": ([([0.0, 0.0], [1.0, 1.0], 1.0)], "rows of limits must be a list of"),
-    "a row too short": ([([0.0], [1.0, 1.0], -1.0, 1.0)], "c_x of a row of limits must have shape"),
-    "no input": ([([1.0, 0.0], [0.0, 0.0], -1.0, 9.0)], "with c_u None or not 0"),
-    "operating point beyond": ([([0.0, 0.0], [1.0, 1.0], -1.0, 1.0)], "operating point"),
-    "ends the wrong way": ([([0.0, 0.0], [1.0, 1.0], 9.0, 1.0)], "low < high"),
-    "not finite": ([([0.0, np.nan], [1.0, 1.0], -1.0, 1.0)], "finite"),
-}
-
-
-@pytest.mark.parametrize("what", REFUSED)
-def test_what_is_no_such_limit_is_refused(what):
-    given, sentence = REFUSED[what]
-    with pytest.raises(ValueError, match=sentence):
-        linear_plant(mixed_limits=given, **TWO_INPUTS)
-
-
-def test_what_is_no_limit_of_rates_is_refused():
-    plant = sampled_plant(MODEL, 0.1, **ONE_INPUT, **QUIET)
-    for given, sentence in (
-        (0.0, "rate must be a positive number"),
-        ([1.0, 2.0], "rate must"),
-        (9.0, "limits nothing"),
-    ):
-        with pytest.raises(ValueError, match=sentence):
-            rate_limited(plant, given)
-    with pytest.raises(ValueError, match="between_samples is for plants without"):
-        sampled_plant(MODEL, 0.1, between_samples=4, du_max=0.3, **ONE_INPUT, **QUIET)
 
 
 def test_only_a_polytope_is_sought_and_a_limit_that_nothing_keeps_has_a_reason():

@@ -183,17 +183,14 @@ def slow_plant():
     )
 
 
-@pytest.mark.parametrize(("rows", "coarser", "share"), [(40, 1, 0.959), (20, 2, 0.959), (12, 3, 0.956)])
-def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(
-    monkeypatch, rows, coarser, share
-):
+def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(monkeypatch):
     plant, lines = slow_plant(), []
-    monkeypatch.setattr(search, "MOST_ROWS", rows)
+    monkeypatch.setattr(search, "MOST_ROWS", 12)
     found = certify_polytope(plant, np.zeros((1, 3)), progress=lines.append)
-    assert sum(f"more than {rows} rows" in line for line in lines) == coarser
-    assert len(found.polytope.rows) <= rows
+    assert sum("more than 12 rows" in line for line in lines) == 3
+    assert len(found.polytope.rows) <= 12
     assert verified(found, plant).valid
-    assert found.provenance["polytope_share_of_box"] == pytest.approx(share, abs=0.002)
+    assert found.provenance["polytope_share_of_box"] == pytest.approx(0.956, abs=0.002)
 
 
 def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
@@ -205,15 +202,6 @@ def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
     assert verified(found, plant).valid
     # Disturbances of 1e-3 alone take the second state to 5e-3.
     np.testing.assert_array_less([0.999, 0.01], found.polytope.support(np.eye(2)))
-
-
-@pytest.mark.slow
-def test_chain_that_needs_too_many_rows_says_so_within_a_minute_and_keeps_the_ellipsoid():
-    begin = time.process_time()
-    narrow = synthesize(chain(4, 0.5), contract=ChannelContract(1))
-    assert time.process_time() - begin < 60.0
-    assert "more than 400 rows, fewer with longer steps or less disturbance" in narrow.provenance["no_polytope"]
-    assert narrow.safe_set is narrow.ellipsoid
 
 
 def test_errors_that_leave_a_face_alone_leave_no_polytope():

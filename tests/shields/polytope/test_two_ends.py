@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from fractions import Fraction
 
@@ -15,10 +14,7 @@ from benchmarks.published import channel_of, contract_of_plant, plant_of, publis
 from ncs_gym import AdversarialDisturbance, ChannelContract, MovedOperatingPointWarning, contract_of
 from shields import CertificateError, Infeasible
 from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
-from shields.synthesis.polytope_certificates import fallbacks_around, more_tolerant
-from shields.synthesis.polytope_gain import HOPELESS, needs_of
-from shields.synthesis.resting_point import farthest_equilibrium
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
@@ -267,12 +263,12 @@ def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
     P, rng = found.polytope, np.random.default_rng(0)
     names = {"plant": plant, "channel": CHANNEL, "contract": CONTRACT, "disturbance": AdversarialDisturbance()}
     for mode in ("project", "lookahead"):
-        env = vector_shield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=30, **names), found, mode)
+        env = vector_shield(gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=60, **names), found, mode)
         _, info = env.reset(seed=1)
         seen = info["shield_guaranteed"].copy()
-        for k in range(80):
-            ends = np.ones((30, 1)) if k % 40 < 20 else -np.ones((30, 1))
-            _, _, _, _, info = env.step(np.where(rng.random((30, 1)) < 0.1, -ends, ends).astype(np.float32))
+        for k in range(40):
+            ends = np.ones((60, 1)) if k % 20 < 10 else -np.ones((60, 1))
+            _, _, _, _, info = env.step(np.where(rng.random((60, 1)) < 0.1, -ends, ends).astype(np.float32))
             assert not (info["shield_guaranteed"] & (info["cost"] > 0.0)).any()
             seen |= info["shield_guaranteed"]
         assert seen.all()
@@ -349,13 +345,6 @@ def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
         assert "polytope: its first rows are those of the safe box" in broken(forged, plant)
 
 
-def test_operating_point_that_a_disturbance_moves_is_told():
-    with pytest.warns(MovedOperatingPointWarning, match=r"deviations are counted from the state \[.*\] and the input"):
-        linear_plant(
-            A=[[0.9]], B=[[0.2]], dt=1.0, box=1.0, u_max=1.0, disturbance_bound=([[1.0]], [0.0], [0.02]), **QUIET
-        )
-
-
 def test_what_an_offset_lacks_of_an_equilibrium_by_rounding_is_in_the_bound():
     state, A, B = 101325.0, 0.5, 0.25
     offset = (1.0 - A) * state * (1.0 + 5e-13)
@@ -393,34 +382,10 @@ def test_resting_state_is_taken_where_it_is_one():
         with pytest.raises(ValueError, match=words):
             synthesize(plant, contract=CONTRACT, resting_state=wrong)
     rough = altered(plant, disturbance_bound=0.3)
-    with pytest.raises(Infeasible, match="this is around the resting_state that was given"):
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match="around the resting_state that was given"):
         synthesize(rough, contract=CONTRACT, resting_state=state)
     with pytest.raises(ValueError, match="resting_state is given"):
         synthesize(within_symmetric(plant), contract=CONTRACT, resting_state=[0.05, 0.0], safe_set="ellipsoid")
-
-
-def test_offset_and_a_disturbance_with_two_ends_may_both_be_given():
-    limits = {"state_limits": (90.0, 120.0), "input_limits": (-4.0, 6.0), "operating_state": 100.0} | QUIET
-    settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "offset": [0.1 * 100.0]}
-    for low in (-0.1, -0.02):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MovedOperatingPointWarning)
-            plant = linear_plant(**settings, **limits, disturbance_bound=([[1.0]], [low], [0.1]))
-        assert plant.disturbance.shape_matrix[0, 0] >= (0.5 * (0.1 - low)) ** 2
-
-
-@pytest.mark.slow
-def test_share_of_the_largest_ellipsoid_is_said_of_boxes_with_a_center_alone():
-    quiet = {"u_max": 1.0, "dt": 1.0, "disturbance_bound": 0.001, "sensor_bound": 0.002, "initial_bound": 0.005}
-    one, two = {"A": [[0.9]], "B": [[0.1]]} | quiet, {"A": np.diag([0.9, 0.8]), "B": 0.2 * np.eye(2)} | quiet
-    for plant in (
-        linear_plant(**one, state_limits=(-0.7, np.inf)),
-        linear_plant(**two, state_limits=(-1.0, 1.0), output_limits=[([1.0, 1.0], -1.9, 0.1)]),
-    ):
-        assert "volume_of_box_ellipsoid" not in synthesize(plant).provenance
-    aside = synthesize(linear_plant(**one, state_limits=(-0.7, 2.1)))
-    half = np.sqrt(aside.L[0, 0])  # of the largest ellipsoid, an interval, 1.4
-    assert aside.provenance["volume_of_box_ellipsoid"] == pytest.approx(half / 1.4, rel=1e-3)
 
 
 def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monkeypatch):
@@ -429,7 +394,7 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
 
     monkeypatch.setattr("shields.synthesis.polytope_certificates._certified_polytope", failing)
     said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
-    with pytest.raises(Infeasible, match=said):
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match=said):
         synthesize(ANGLE, contract=CONTRACT)
 
 
@@ -447,19 +412,6 @@ def test_state_that_only_follows_needs_no_limit():
         initial_bound=0.01,
     )
     assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize(("disturbance", "count"), [(1.0, 1), (1.7, 0)])
-def test_of_gains_that_bear_just_too_little_a_search_finds_one_that_bears_more(disturbance, count):
-    crane = plant_of("port_crane")
-    given = fallbacks_around(crane, contract_of_plant("port_crane"), lambda line: None)
-    given = [each._replace(D=disturbance**2 * each.D) for each in given]
-    found = list(more_tolerant(given, crane, lambda line: None, None))
-    assert len(found) == count
-    tolerated = [farthest_equilibrium(crane, needs_of(each, crane)).distance for each in given + found]
-    assert max(tolerated[: len(given)]) < (1.002, HOPELESS)[count == 0]
-    assert all(each > 1.01 for each in tolerated[len(given) :])
 
 
 @pytest.mark.slow

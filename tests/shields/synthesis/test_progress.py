@@ -1,10 +1,14 @@
 """Long syntheses: what they say, and what an interrupted one leaves."""
 
+from contextlib import nullcontext
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 
+from experiments.settings import SynthesizeSettings
+from shields import Certificate
 from shields.errors import SynthesisInterrupted
 from tests.plants import random_plant
 from tests.product import synthesize
@@ -66,3 +70,12 @@ def test_solution_of_the_program_meets_the_conditions():
     used = np.einsum("ij,jk,ik->i", K, L, K) / inputs + np.einsum("ij,jk,ik->i", K, Sigma, K) / (1.0 - inputs)
     assert used.max() <= 1.0
     assert (np.einsum("ij,jk,ik->i", problem.C, L, problem.C) <= 1.0).all()
+
+
+def test_command_saves_the_best_certificate_when_it_is_interrupted(loaded, tmp_path, monkeypatch):
+    loaded.save(tmp_path / "plant.json")
+    command = import_module("experiments.commands.synthesize")
+    monkeypatch.setattr(command, "synthesis_status", lambda: nullcontext(interrupting_at("exact verification")))
+    with pytest.raises(SynthesisInterrupted, match=r"the best certificate so far, which verifies .* was saved to"):
+        command.synthesize(SynthesizeSettings(plant=tmp_path / "plant.json", out=tmp_path / "c.json"))
+    assert verified(Certificate.load(tmp_path / "c.json"), loaded).valid
