@@ -217,6 +217,5 @@ def _agent(
         seed=seed,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
-        is_filtered=loop.filter is not None,
         kwargs=loop.other_kwargs,
     )

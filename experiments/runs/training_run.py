@@ -9,12 +9,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from math import nan
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.agent_file import AGENT_FILES, write_files
+from agents.agent_file import AGENT_FILES
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
@@ -265,9 +264,9 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 def _agent_of(run: TrainingRun) -> Agent | None:
     """Returns the agent that a run does not train: that of its files, or one with initial weights; None for none."""
     if run.agent_files:
-        with TemporaryDirectory() as folder:
-            write_files(Path(folder), run.agent_files)
-            return _loaded(Path(folder))
+        from agents.agent import Agent  # imports torch
+
+        return Agent.of_files(run.agent_files)
     if run.policy_kind != "untrained":
         return None
     from agents.training import untrained

@@ -204,32 +204,23 @@ class EvaluateSettings:
 
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`; or "pretrained", for the agent of --env that comes with the package; or the zip that
-            `model.save` of stable-baselines3 wrote, with --env, --algorithm, --vec-normalize and --trust.
+            `ncs train`; or "pretrained", for the agent of --env that comes with the package.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
-        algorithm: Algorithm of a zip.
-        vec_normalize: For a zip: the file that `VecNormalize.save` of stable-baselines3 wrote, or "none" if the agent
-            saw observations as they are.
-        trust: Load a zip and its statistics although they may run code.
-        shield: Mode of the shield, by default that of the agent's training, which a zip does not tell: none then;
-            "none" for no shield; "monitor" changes nothing and counts what it would have done.
+        shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
+            nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
         between_samples: Times per step at which the safe box counts, 1 for the sampling instants; by default the
             plant's own.
-        channel: Changes of the channel that the agent was trained with (of an agent in a ZIP file, of that of the id),
-            by the names that `ncs compare` lists.
+        channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
         smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
     """
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
-    algorithm: Algorithm | None = None
-    vec_normalize: Path | None = None
-    trust: bool = False
     shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
     horizon: int | None = None
     episodes: int = 200
