@@ -49,7 +49,6 @@ LAYERS = {
         {"hyperparams"},
         {"loop", "results", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
-        {"normalization"},
         {"agent"},
         {"training"},
     ),

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import tyro
 
 from experiments.analysis.stalls import broken_contracts, how_often, rate_text, silences_text
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import ChannelSettings
+from experiments.settings import require_limits
 from experiments.terminal import text_table, wrapped
 from ncs_gym import ChannelContract, LinearPlant, PacketLog, contract_of
 from ncs_gym.network.channel import in_time
@@ -21,6 +24,42 @@ from ncs_gym.validation import counted
 from shields import Certificate, silence_of
 from shields.atomic_write import write_atomically
 from shields.packaged_certificates import certificate_of_package
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelSettings:
+    """Reads recorded packets, and says how often each channel contract would have been broken.
+
+    Attributes:
+        file: A table with the columns sent and received in seconds, received empty where a packet was lost, or the
+            output of Linux `ping -D` (docs/requirements.md has recipes for others).
+        sampling_period: Duration of a control step [s]; by default that of --env or --plant, or the time between
+            packets.
+        env: Id of an environment whose contract is compared with the record.
+        certificate: File of a certificate whose contract is compared with the record, in place of an environment's.
+        plant: File of the plant that it is for (`LinearPlant.save`); alone it gives the sampling period.
+        committed_ahead: Steps by which inputs are committed ahead behind a downlink, of --certificate, whose contract
+            counts them, too: samples may be so many steps less old (docs/contracts.md).
+        out: File for the numbers (JSON).
+    """
+
+    file: tyro.conf.Positional[Path]
+    sampling_period: float | None = None
+    env: str | None = None
+    certificate: Path | None = None
+    plant: Path | None = None
+    committed_ahead: int = 0
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        require_limits(self, committed_ahead=0)
+        if self.committed_ahead and self.certificate is None:
+            raise ValueError("--committed-ahead is of --certificate: an environment knows its own")
+        if (self.certificate and not self.plant) or (self.env and self.plant):
+            raise ValueError("give --certificate and --plant, or --env, whose contract and certificate are known")
+        period = self.sampling_period
+        if not (period is None or 0.0 < period < math.inf):
+            raise ValueError(f"--sampling-period must be a number > 0, got {period}")
 
 
 class _Promise(NamedTuple):

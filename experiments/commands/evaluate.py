@@ -3,25 +3,66 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
 
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary
-from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
 from experiments.runs.loops import certificate_of, registered_env, with_channel
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import agent_named, certificate_file
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
-from experiments.settings import EvaluateSettings
-from experiments.settings.arguments import id_alone, require_horizon
+from experiments.settings import Assignments, id_alone, require_horizon, require_limits, short_version
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields.atomic_write import write_atomically
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSettings:
+    """Evaluates a trained agent, behind a shield or not, on any channel.
+
+    Attributes:
+        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
+            `ncs train`; or "pretrained", for the agent of --env that comes with the package.
+        env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
+        shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
+            nothing and counts what it would have done.
+        horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
+        episodes: Number of evaluation episodes.
+        seed: Seed of the episodes.
+        certificate: Certificate file to use instead of that of the training, or of synthesizing one.
+        between_samples: Times per step at which the safe box counts, 1 for the sampling instants; by default the
+            plant's own.
+        channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
+        smoke: Evaluate a few episodes only, to see that everything works.
+        out: File for the summary (JSON).
+    """
+
+    model: tyro.conf.Positional[Path]
+    env: str | None = None
+    shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
+    horizon: int | None = None
+    episodes: int = 200
+    seed: int = 0
+    certificate: Path | None = None
+    between_samples: int | None = None
+    channel: Assignments = field(default_factory=dict)
+    smoke: bool = False
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        require_limits(self, episodes=1, seed=0)
+        if self.shield != "as-trained":  # otherwise the agent knows
+            require_horizon(self, self.shield)
+
 
 # Budget of `--smoke`.
 _SMOKE = {"episodes": 5}
@@ -65,7 +106,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     print(summary_text(arms, {}))
     if mode is not None:
         (arm,) = arms.values()
-        print(wrapped(_proof_text(arm)))
+        held = f"{arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}"
+        print(wrapped(f"The guarantee held after {held}."))
     if settings.out is not None:
         content = {
             "arms": arms,
@@ -81,8 +123,3 @@ def evaluate(settings: EvaluateSettings) -> None:
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
-
-
-def _proof_text(arm: dict[str, Any]) -> str:
-    """Returns after how many steps the guarantee held."""
-    return f"The guarantee held after {arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}."

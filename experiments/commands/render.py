@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import gymnasium as gym
 import numpy as np
 from tqdm import tqdm
 
-from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_frames
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
-from experiments.settings import RenderSettings
-from experiments.settings.arguments import id_alone
+from experiments.runs.policies import policy_by_name
+from experiments.settings import id_alone, require_horizon, require_limits, short_version
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields import Certificate, SafetyShield
@@ -26,6 +27,48 @@ _GAP = 8
 _GRAY = 120
 
 
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
+
+    Attributes:
+        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
+            your own (`ncs_gym.register_plant`).
+        out: File to write: .gif, or .png for the last frame alone.
+        policy: "lqr", "mpc", "zero", "random", "pretrained" (the small agent of the package), or the folder of a
+            trained agent.
+        shield: Mode of the shield; "none" for no shield.
+        horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
+        side_by_side: Draw the same episode without a shield at the left, with it at the right.
+        certificate: Certificate file to use instead of synthesizing one.
+        seed: Seed of the episode (of both, side by side) and of the random policy.
+        steps: Largest number of steps.
+        fps: Frames per second; one frame per step.
+        scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, sharp on dense screens, and
+            1 for a .gif, whose file would be several times as large.
+        smoke: Draw a few steps only, to see that everything works; into episode-smoke.gif unless `--out` differs.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    out: Path = Path("episode.gif")
+    policy: str = "lqr"
+    shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
+    horizon: int | None = None
+    side_by_side: bool = False
+    certificate: Path | None = None
+    seed: int = 0
+    steps: int = 200
+    fps: int = 10
+    scale: int | None = None
+    smoke: bool = False
+
+    def __post_init__(self) -> None:
+        require_horizon(self, self.shield)
+        require_limits(self, seed=0, steps=1, fps=(1, 50), scale=(1, 4))
+        if self.side_by_side and self.shield == "none":
+            raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
+
+
 def render(settings: RenderSettings) -> None:
     """Runs `ncs render`."""
     settings = short_version(settings, **_SMOKE)
@@ -33,8 +76,6 @@ def render(settings: RenderSettings) -> None:
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in {' or '.join(FORMATS)}, got {settings.out}")
     require_place(settings.out)
-    if settings.policy not in UNTRAINED_POLICIES:
-        require_extra("train", "stable_baselines3", "torch")
     modes = ("none", settings.shield) if settings.side_by_side else (settings.shield,)
     renderers = [_EpisodeRenderer(settings, mode) for mode in modes]
     frames = map(_side_by_side, _frames(renderers, settings.steps))

@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from experiments.paper.paper_example import PaperExample
 from experiments.plots.figure_style import STYLE, CaptionedFigure, with_unit
-from experiments.settings.certificates import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
 from ncs_gym.registration import CASE_STUDY_BOX
 from shields import paper, synthesize
@@ -100,23 +99,23 @@ def designs() -> list[StateFeedback]:
     ]
 
 
-def simulate(design: StateFeedback, settings: ReproduceSettings, bar: tqdm) -> Simulation:
+def simulate(design: StateFeedback, starts: int, steps: int, seed: int, bar: tqdm) -> Simulation:
     """Returns the simulation of a design from random initial states."""
     env = gym.make(
         _ENV,
         plant=design.plant,
         disturbance=design.box,
         initial_set=Ellipsoid(design.L),
-        max_episode_steps=settings.steps,
+        max_episode_steps=steps,
     )
     limit = design.plant.u_max[0]
-    states = np.empty((settings.starts, settings.steps + 1, 2))
-    inputs = np.empty((settings.starts, settings.steps))
-    errors = np.empty((settings.starts, settings.steps, 2))
-    for start in range(settings.starts):
-        _, info = env.reset(seed=settings.seed * 1_000_003 + start)
+    states = np.empty((starts, steps + 1, 2))
+    inputs = np.empty((starts, steps))
+    errors = np.empty((starts, steps, 2))
+    for start in range(starts):
+        _, info = env.reset(seed=seed * 1_000_003 + start)
         states[start, 0] = info["state"]
-        for step in range(settings.steps):
+        for step in range(steps):
             u = design.K @ info["estimate"]
             inputs[start, step], errors[start, step] = u[0], info["estimation_error"]
             *_, info = env.step(u / limit)
