@@ -15,7 +15,6 @@ from experiments.commands.channel import ChannelSettings
 from experiments.commands.compare import CompareSettings
 from experiments.commands.render import RenderSettings
 from experiments.commands.sweep import SweepSettings
-from experiments.plots.figure_style import ArmStyle
 from experiments.runs.arms import Arm
 from experiments.runs.loops import changed_channel, scenario_named, worse_channel
 from experiments.settings import BackendSettings
@@ -60,7 +59,6 @@ BURSTS = [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, NAN), (0.3, INF
 
 CALLS = [
     *(((Arm.of, name), "unknown arm .*known are unshielded") for name in ARMS),
-    ((ArmStyle.of, "hoped"), "unknown arm"),
     ((scenario_named, "worse"), "unknown scenario 'worse'; known are as trained, worst-case disturbance"),
     ((worse_channel, Channel(), ChannelContract(max_age=0)), "no channel within the contract is worse"),
     ((best_period, Channel(0.5), ChannelContract(3)), "any number of packets"),
