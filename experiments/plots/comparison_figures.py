@@ -117,8 +117,8 @@ def _draw_evaluated(axis: Axes, style: ArmStyle, arm: dict[str, Any]) -> None:
 
 _TRAINING_CAPTION = (
     "Training. Lines are means over the runs of an arm, bands reach from the lowest to the highest run. Returns are"
-    " those of recent finished episodes, with the penalties of arms that get some. Interventions are rates over the last"
-    f" {RATE_WINDOW:,} steps (over all, before there are as many); a monitor's are what the shield would have"
+    " those of recent finished episodes, with the penalties of arms that get some. Interventions are rates over the"
+    f" last {RATE_WINDOW:,} steps (over all, before there are as many); a monitor's are what the shield would have"
     " overridden, its agent is the unshielded one. Episodes begin together: where those of all environments take more"
     " steps, rates rise and fall with them."
 )

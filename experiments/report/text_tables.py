@@ -117,7 +117,7 @@ def sweep_table(cells: list[dict[str, Any]]) -> str:
             held, played = arm["guaranteed_episodes"], arm["eval_episodes"]
             if arm["shielded"] and held < played:
                 lost.append(f"{name} at loss {cell['loss']:g}, delay {cell['delay']} ({held:,} of {played:,})")
-    table = text_table(rows, rules=(2,), left_columns=0, keys=3)
+    table = text_table(rows, rules=(2,), left_columns=0)
     if not lost:
         return table
     more = f" and {counted(len(lost) - _MOST_LOST, 'other')}" if len(lost) > _MOST_LOST else ""
