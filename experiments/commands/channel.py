@@ -68,13 +68,14 @@ def channel(settings: ChannelSettings) -> None:
         plant, contract = env.plant, env.contract
         certificate = certificate_of_package(plant, env.certificate_contract)
     silence = certificate and plant and silence_of(certificate, plant)  # raises unless they belong together
-    log = PacketLog.load(settings.file)
-    dt = settings.sampling_period or (log.period if plant is None else plant.dt)
-    if plant is not None and dt != plant.dt:
+    given = settings.sampling_period or (plant and plant.dt)
+    if plant is not None and given != plant.dt:
         raise ValueError(
-            f"--sampling-period {dt:g} s: a control step of the plant takes {plant.dt:g} s, and its contract counts "
+            f"--sampling-period {given:g} s: a control step of the plant takes {plant.dt:g} s, and its contract counts "
             "these: leave the option out, or --env, --plant and --certificate"
         )
+    log = PacketLog.load(settings.file)
+    dt = given or log.period
     asked = [] if contract is None else [contract.max_age]
     if contract is not None and silence:
         asked.append(contract.max_age + silence.anywhere)

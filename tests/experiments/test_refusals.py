@@ -47,8 +47,7 @@ SETTINGS = [
     *((ChannelSettings, {"file": Path("packets.csv"), "sampling_period": period},
        "--sampling-period must be a number > 0") for period in (0.0, -0.02, NAN, INF)),
     *((RenderSettings, {name: value}, words)
-      for name, value, words in [("steps", 0, "--steps must be at least 1"), ("seed", -1, "--seed must be at least 0"),
-                                 ("fps", 0, "--fps must be at least 1 and at most 50")]),
+      for name, value, words in [("steps", 0, "--steps must be at least 1"), ("scale", 5, "--scale must be at")]),
 ]  # fmt: skip
 
 ARMS = ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor", "penalized:", "penalized:-1"]
